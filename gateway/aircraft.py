@@ -54,6 +54,25 @@ from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_signing import SigningClock, SigningTimestamps
 
+Order = ClientInterval | LogWarning | RecordingRequest | SaveSettings | SavePlan
+DEPRECATED: Final = {"complementary": "eskf"}
+"""Names of estimators that another one has replaced."""
+FORMER_SECTIONS: Final = ("complementary", "compass", "rest")
+FORMER_KEYS: Final = frozenset(
+    {
+        "accel_roughness",
+        "gps_height_wander_m",
+        "gps_wander_m",
+        "gps_wander_s",
+        "gyro_roughness",
+        "mag_bias_ut",
+        "mag_bias_walk_utprs",
+        "unaided_velocity_mps",
+    }
+)
+"""Sections and keys of earlier versions."""
+FILTER_KEYS: Final = frozenset(PaperSettings.__struct_fields__)
+
 
 @dataclass(frozen=True, slots=True)
 class SettingsChanged:
@@ -63,7 +82,6 @@ class SettingsChanged:
 
 
 Recorded = FusedSample | BaroRaw | GpsFix | NodeStatus | SettingsChanged
-Order = ClientInterval | LogWarning | RecordingRequest | SaveSettings | SavePlan
 
 
 class Outputs(msgspec.Struct):
@@ -301,10 +319,6 @@ def with_passphrase(settings: AircraftSettings, passphrase: str) -> AircraftSett
     return msgspec.structs.replace(settings, vehicle=vehicle)
 
 
-DEPRECATED: Final = {"complementary": "eskf"}
-"""Names of estimators that another one has replaced."""
-
-
 def migrate_sections(sections: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Convert settings of earlier versions to present ones.
 
@@ -347,20 +361,3 @@ def migrate_sections(sections: Mapping[str, Any]) -> tuple[dict[str, Any], list[
     if estimation:
         present["estimation"] = estimation
     return present, remarks
-
-
-FORMER_SECTIONS: Final = ("complementary", "compass", "rest")
-FORMER_KEYS: Final = frozenset(
-    {
-        "accel_roughness",
-        "gps_height_wander_m",
-        "gps_wander_m",
-        "gps_wander_s",
-        "gyro_roughness",
-        "mag_bias_ut",
-        "mag_bias_walk_utprs",
-        "unaided_velocity_mps",
-    }
-)
-"""Sections and keys of earlier versions."""
-FILTER_KEYS: Final = frozenset(PaperSettings.__struct_fields__)

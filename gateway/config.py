@@ -57,6 +57,15 @@ MAX_ERRORS: Final = 20
 """Errors of a file that are listed; to find the meant name of each unknown one takes a while."""
 
 log = logging.getLogger(__name__)
+KINDS: Final = {
+    "float": "a number",
+    "int": "a whole number",
+    "str": "a text in quotes",
+    "bool": "true or false",
+    "array": "a list in brackets",
+    "object": "a table",
+}
+"""What msgspec expected, in the words of TOML."""
 
 
 class GatewaySettings(Settings, frozen=True):
@@ -336,17 +345,6 @@ def _wrong_value(path: str, value: Any, field: Field, error: msgspec.ValidationE
     text = f"{path} = {tomlkit.item(value).as_string()}: {reason}"
     hint = "; ".join(filter(None, (_choice_hint(value, field), _uncapital(field.meaning))))
     return f"{text} ({hint})" if hint else text
-
-
-KINDS: Final = {
-    "float": "a number",
-    "int": "a whole number",
-    "str": "a text in quotes",
-    "bool": "true or false",
-    "array": "a list in brackets",
-    "object": "a table",
-}
-"""What msgspec expected, in the words of TOML."""
 
 
 def _wanted(field: Field, error: str) -> str:

@@ -6,11 +6,6 @@ import os
 from collections.abc import Iterable
 from typing import Final
 
-
-class UserError(Exception):
-    """An error whose text names the fault and the remedy; it ends a command without a traceback."""
-
-
 _CONTROL: Final = (*range(0x20), *range(0x7F, 0xA0))
 """C0 and C1 control characters move the cursor, rename the window, or type for the user."""
 _INVISIBLE: Final = (
@@ -23,6 +18,16 @@ _INVISIBLE: Final = (
 """Unicode controls of direction and line breaks, and invisible format characters: a name with
 U+202E is read backwards. The joiners U+200C and U+200D are left, since scripts need them."""
 _KEPT: Final = frozenset(map(ord, "\n\t"))
+LONGEST: Final = 2000
+"""Letters of a log line; an address requested from the panel may have 60,000."""
+UNKNOWN: Final = "—"
+"""In place of a number that is unknown."""
+FEW_BYTES: Final = 200
+"""The end of a frame, or what an adapter still held."""
+
+
+class UserError(Exception):
+    """An error whose text names the fault and the remedy; it ends a command without a traceback."""
 
 
 def _escape(code: int) -> str:
@@ -39,8 +44,6 @@ def _json_escape(code: int) -> str:
 _ESCAPES: Final = {code: _escape(code) for code in (*_CONTROL, *_INVISIBLE) if code not in _KEPT}
 _JSON_ESCAPES: Final = {code: _json_escape(code) for code in (*_CONTROL[0x20:], *_INVISIBLE)}
 """Characters that JSON allows unescaped in a string; it escapes those below U+0020 itself."""
-LONGEST: Final = 2000
-"""Letters of a log line; an address requested from the panel may have 60,000."""
 
 
 def printable(text: str) -> str:
@@ -82,19 +85,11 @@ class PrintableFormatter(logging.Formatter):
         return printable(super().format(record))
 
 
-UNKNOWN: Final = "—"
-"""In place of a number that is unknown."""
-
-
 def figure(value: float | None, form: str, unit: str = "") -> str:
     """Return a number in a format with its unit; `UNKNOWN` alone for None, NaN and infinity."""
     if value is None or not math.isfinite(value):
         return UNKNOWN
     return f"{value:{form}} {unit}" if unit else f"{value:{form}}"
-
-
-FEW_BYTES: Final = 200
-"""The end of a frame, or what an adapter still held."""
 
 
 def reason_of(error: Exception) -> str:

@@ -23,6 +23,25 @@ UNKNOWN_VEC3: Vec3 = (NAN, NAN, NAN)
 
 RECORDED_ONLY = -1
 """Client id of an outgoing frame that is written to the recording and sent to nobody."""
+NODE_IMU: Final = 1 << 0
+NODE_GPS: Final = 1 << 3
+"""Bits of `NodeStatus.sensors_present`."""
+LORA_CHANNEL: Final = 0xFF
+SOURCE_NODE: Final = 8
+"""Node id of a vehicle's first source other than the receiver; boards have 0 to 7."""
+START_V2: Final = 0xFD
+PAYLOAD_V1: Final = 6
+PAYLOAD_V2: Final = 10
+"""Where the payload of a MAVLink frame begins."""
+EVERYBODY: Final = (0, 0)
+"""Target of a message without one."""
+HEARTBEAT_TYPE_OFFSET: Final = 4
+_TYPE_GCS: Final = bytes((6,))
+"""MAV_TYPE_GCS."""
+_NO_AUTOPILOT: Final = bytes((8,))
+"""MAV_AUTOPILOT_INVALID."""
+TXBUF_OFFSET: Final = 6
+"""Of RADIO_STATUS, behind its two counters and the two signal strengths."""
 
 
 class ImuFlags(IntFlag):
@@ -188,11 +207,6 @@ class RadioState(IntEnum):
                 return ""
 
 
-NODE_IMU: Final = 1 << 0
-NODE_GPS: Final = 1 << 3
-"""Bits of `NodeStatus.sensors_present`."""
-
-
 def node_role(sensors_present: int) -> str:
     """Name a node's role by its sensors."""
     if sensors_present & NODE_IMU:
@@ -227,9 +241,6 @@ class PipeCounters(msgspec.Struct, frozen=True, gc=False):
     received: int
     lost: int
     overruns: int
-
-
-LORA_CHANNEL: Final = 0xFF
 
 
 def channel_name(channel: int) -> str:
@@ -379,10 +390,6 @@ class VehicleReport(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     """Other measurements by name, such as temperatures."""
 
 
-SOURCE_NODE: Final = 8
-"""Node id of a vehicle's first source other than the receiver; boards have 0 to 7."""
-
-
 class NodeLink(msgspec.Struct, frozen=True, gc=False):
     """Counts of the gateway for one node since it started."""
 
@@ -440,21 +447,6 @@ class SourceReport(msgspec.Struct, frozen=True, gc=False):
     newest_fault: str
     last_time_us: int | None
     """Of the newest record."""
-
-
-START_V2: Final = 0xFD
-PAYLOAD_V1: Final = 6
-PAYLOAD_V2: Final = 10
-"""Where the payload of a MAVLink frame begins."""
-EVERYBODY: Final = (0, 0)
-"""Target of a message without one."""
-HEARTBEAT_TYPE_OFFSET: Final = 4
-_TYPE_GCS: Final = bytes((6,))
-"""MAV_TYPE_GCS."""
-_NO_AUTOPILOT: Final = bytes((8,))
-"""MAV_AUTOPILOT_INVALID."""
-TXBUF_OFFSET: Final = 6
-"""Of RADIO_STATUS, behind its two counters and the two signal strengths."""
 
 
 class MavFrame(msgspec.Struct, frozen=True, gc=False):

@@ -37,6 +37,20 @@ if TYPE_CHECKING:
 
 MAX_GAP_S: Final = 2.0
 """Across a longer gap a straight line is no reference for a curved flight."""
+ENDING: Final = 0.2
+"""The part of a span in which a fix ends it."""
+PAPER_ERRORS: Final = (
+    (0.1, 0.1, 2.036, 2.652),
+    (0.1, 0.5, 4.412, 5.497),
+    (0.1, 0.9, 12.866, 19.465),
+    (0.5, 0.1, 3.896, 4.729),
+    (0.5, 0.5, 7.477, 8.277),
+    (0.5, 0.9, 20.816, 24.115),
+    (0.9, 0.1, 6.191, 7.179),
+    (0.9, 0.5, 11.372, 11.957),
+    (0.9, 0.9, 30.411, 31.506),
+)
+"""The paper's Table I: alpha, beta, mean error in latitude and longitude, in metres."""
 
 
 def interpolate(fixes: Fixes, time_us: IntArray) -> FlightTrack:
@@ -71,10 +85,6 @@ def thin(flight: Flight, interval_s: float) -> BoolArray:
         else:
             last_us = fix.time_us
     return keep
-
-
-ENDING: Final = 0.2
-"""The part of a span in which a fix ends it."""
 
 
 def withhold(flight: Flight, every: int) -> BoolArray:
@@ -119,20 +129,6 @@ def error_at_fixes_m(track: FlightTrack, fixes: Fixes) -> FloatArray:
     return np.column_stack(
         [np.radians(lat - fixes.lat_deg) * meridian, np.radians(away_deg) * parallel]
     )
-
-
-PAPER_ERRORS: Final = (
-    (0.1, 0.1, 2.036, 2.652),
-    (0.1, 0.5, 4.412, 5.497),
-    (0.1, 0.9, 12.866, 19.465),
-    (0.5, 0.1, 3.896, 4.729),
-    (0.5, 0.5, 7.477, 8.277),
-    (0.5, 0.9, 20.816, 24.115),
-    (0.9, 0.1, 6.191, 7.179),
-    (0.9, 0.5, 11.372, 11.957),
-    (0.9, 0.9, 30.411, 31.506),
-)
-"""The paper's Table I: alpha, beta, mean error in latitude and longitude, in metres."""
 
 
 def paper_table() -> "pd.DataFrame":

@@ -36,6 +36,11 @@ ESTIMATORS: Final[tuple[str, ...]] = tuple(
 
 SMOOTHED: Final = "smoothed"
 """Name of the smoothed track, which uses the whole flight."""
+HOLD_OUT: Final = 5
+"""Every n-th fix is withheld for comparison."""
+OUTAGE_S: Final = 10.0
+OUTAGE_EVERY_S: Final = 30.0
+"""Two thirds of the time are left for the estimator to settle again."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +97,6 @@ def make_case(
     return Case(flight, fusion, tracks, local_frame(flight), latency_s)
 
 
-HOLD_OUT: Final = 5
-"""Every n-th fix is withheld for comparison."""
-
-
 def summarise(case: Case) -> dict[str, float]:
     """Summarise a flight."""
     flight, track = case.flight, case.track
@@ -132,11 +133,6 @@ def summarise(case: Case) -> dict[str, float]:
 def withheld_error_m(case: Case, estimator: str) -> float:
     """Fuse without every n-th fix, and measure the horizontal RMS error at those."""
     return _held_m(case, estimator, make_judge(case.flight, withhold(case.flight, HOLD_OUT)))
-
-
-OUTAGE_S: Final = 10.0
-OUTAGE_EVERY_S: Final = 30.0
-"""Two thirds of the time are left for the estimator to settle again."""
 
 
 def outage_error_m(case: Case, estimator: str) -> float:

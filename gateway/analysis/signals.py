@@ -29,6 +29,13 @@ RESPONSE_POINTS: Final = 400
 STEP_S: Final = 0.5
 TIMED_SAMPLES: Final = 5_000
 TIMED_RUNS: Final = 3
+SEGMENT_S: Final = 8.0
+ALLAN_POINTS: Final = 40
+MIN_CLUSTERS: Final = 4
+"""With fewer averages the deviation is a guess."""
+REST_GYRO_RADPS: Final = 0.02
+REST_ACCEL_MPS2: Final = 0.15
+"""Greatest standard deviation within a second at rest."""
 
 
 def design_lowpass(
@@ -141,15 +148,6 @@ def _time_ns(kind: Kind, settings: PaperSettings, rate_hz: float) -> float:
     low_pass.run(x)
     seconds = min(timeit.repeat(lambda: low_pass.run(x), number=1, repeat=TIMED_RUNS))
     return 1e9 / TIMED_SAMPLES * seconds
-
-
-SEGMENT_S: Final = 8.0
-ALLAN_POINTS: Final = 40
-MIN_CLUSTERS: Final = 4
-"""With fewer averages the deviation is a guess."""
-REST_GYRO_RADPS: Final = 0.02
-REST_ACCEL_MPS2: Final = 0.15
-"""Greatest standard deviation within a second at rest."""
 
 
 def power_density(x: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:

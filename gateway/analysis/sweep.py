@@ -37,6 +37,26 @@ LARGEST_GRID: Final = 100_000
 
 Value = float | int | str | bool
 Values = tuple[Value, ...]
+Metric = Literal["held", "interpolated", "reference", "attitude"]
+COLUMN_OF: Final[dict[Metric, str]] = {
+    "held": "held_m",
+    "interpolated": "interpolated_m",
+    "reference": "reference_m",
+    "attitude": "attitude_deg",
+}
+_LACKING: Final[dict[Metric, str]] = {
+    "held": "withheld fixes",
+    "interpolated": "GPS",
+    "reference": "reference of the position",
+    "attitude": "reference of the attitude",
+}
+SEED: Final = 1
+Scores = dict[str, float]
+Trial = tuple[Values, Scores]
+"""The values that were tried, and their scores."""
+WEIGHTS: Final = (0.1, 0.5, 0.9)
+"""Values of alpha and of beta in Table I of the paper."""
+Run = Callable[[Sequence[Values]], Iterator[tuple[int, Scores]]]
 
 
 class SweepError(UserError, ValueError):
@@ -140,26 +160,6 @@ def _value(text: str) -> Value:
         return {"true": True, "false": False}.get(text, text)
 
 
-Metric = Literal["held", "interpolated", "reference", "attitude"]
-COLUMN_OF: Final[dict[Metric, str]] = {
-    "held": "held_m",
-    "interpolated": "interpolated_m",
-    "reference": "reference_m",
-    "attitude": "attitude_deg",
-}
-_LACKING: Final[dict[Metric, str]] = {
-    "held": "withheld fixes",
-    "interpolated": "GPS",
-    "reference": "reference of the position",
-    "attitude": "reference of the attitude",
-}
-SEED: Final = 1
-
-Scores = dict[str, float]
-Trial = tuple[Values, Scores]
-"""The values that were tried, and their scores."""
-
-
 @dataclass(frozen=True, slots=True)
 class Contest:
     """The data shared by all trials; each process gets a copy."""
@@ -200,10 +200,6 @@ def score_of(contest: Contest, fusion: FusionSettings) -> Scores:
 def run_trial(contest: Contest, values: Sequence[Value]) -> Scores:
     """Fuse the flight with these values, and score it; see `COLUMN_OF` for the scores."""
     return score_of(contest, with_values(contest.fusion, contest.keys, values))
-
-
-WEIGHTS: Final = (0.1, 0.5, 0.9)
-"""Values of alpha and of beta in Table I of the paper."""
 
 
 def blend_table(flight: Flight, fusion: FusionSettings, interval_s: float) -> "pd.DataFrame":
@@ -297,9 +293,6 @@ def optimise(
         updating="deferred", workers=many, callback=report_progress, tol=1e-3,
     )  # fmt: skip
     return tuple(float(v) for v in found.x)
-
-
-Run = Callable[[Sequence[Values]], Iterator[tuple[int, Scores]]]
 
 
 def pool(contest: Contest, jobs: int | None = None) -> AbstractContextManager[Run]:

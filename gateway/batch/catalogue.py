@@ -89,6 +89,14 @@ _WAYS_OUT: Final = {
 """By SQLite's code of the error."""
 
 Row = dict[str, Any]
+ENDINGS: Final = (".tlog", ".csv")
+"""Files of other endings are looked at where a format knows their first bytes."""
+LATEST_NS: Final = 2**63 - 1
+"""The greatest number that SQLite keeps; a file's time may lie beyond it."""
+KEEP_S: Final = 1.0
+"""Interval of storing the files that were read: an interruption loses no more."""
+Wanted = tuple[str, str]
+"""Path from the folder on, and the digest that is known of it or nothing."""
 
 
 class CatalogueError(UserError):
@@ -357,17 +365,6 @@ def _unpacked(packed: bytes) -> Segments:
         at = TrackPoint(0, lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, alt_m)
         segments[-1].append(at)
     return segments
-
-
-ENDINGS: Final = (".tlog", ".csv")
-"""Files of other endings are looked at where a format knows their first bytes."""
-LATEST_NS: Final = 2**63 - 1
-"""The greatest number that SQLite keeps; a file's time may lie beyond it."""
-KEEP_S: Final = 1.0
-"""Interval of storing the files that were read: an interruption loses no more."""
-
-Wanted = tuple[str, str]
-"""Path from the folder on, and the digest that is known of it or nothing."""
 
 
 @dataclass(frozen=True, slots=True)

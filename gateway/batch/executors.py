@@ -28,6 +28,16 @@ LOOK_S: Final = 1.0
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+CONNECT_S: Final = 10.0
+WORKERS_S: Final = 30.0
+"""How long to wait for the first worker."""
+M_TRIM_THRESHOLD: Final = -1
+M_MMAP_THRESHOLD: Final = -3
+"""Of malloc.h."""
+KEPT_BYTES: Final = 256 << 20
+LARGEST_KEPT_BYTES: Final = 32 << 20
+"""Larger blocks are freed at once; glibc takes no more."""
+_SAME: Final = f"install mavgate[batch]=={__version__} on every worker"
 
 
 class WorkError(UserError):
@@ -152,17 +162,6 @@ def _begin(stop: Event, parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-CONNECT_S: Final = 10.0
-WORKERS_S: Final = 30.0
-"""How long to wait for the first worker."""
-M_TRIM_THRESHOLD: Final = -1
-M_MMAP_THRESHOLD: Final = -3
-"""Of malloc.h."""
-KEPT_BYTES: Final = 256 << 20
-LARGEST_KEPT_BYTES: Final = 32 << 20
-"""Larger blocks are freed at once; glibc takes no more."""
-
-
 class ClusterError(UserError):
     """A cluster that cannot be used; the text says why."""
 
@@ -241,9 +240,6 @@ class DaskCluster:
         if other:
             listed = ", ".join(f"{name} has {version}" for name, version in sorted(other.items()))
             raise ClusterError(f"here is mavgate {__version__}, but {listed}; {_SAME}")
-
-
-_SAME: Final = f"install mavgate[batch]=={__version__} on every worker"
 
 
 def prepare_worker() -> str:

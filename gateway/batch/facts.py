@@ -47,6 +47,19 @@ MAX_POSITIONS: Final = 400
 
 Segments = list[list[TrackPoint]]
 """A track; it is broken between two of them."""
+POINT_US: Final = US_PER_S // 10
+"""Positions nearer in time than this add nothing new of a flight."""
+EARLIEST_US: Final = 315_532_800 * US_PER_S
+"""1980, when GPS began: an earlier time counts from the start of a clock."""
+SYS_STATUS_ID: Final = MESSAGE_IDS["SYS_STATUS"]
+USED_IDS: Final = frozenset({SYS_STATUS_ID, PARAM_VALUE_ID, AUTOPILOT_VERSION_ID, *GPS_IDS})
+ERROR: Final = 3
+"""MAV_SEVERITY_ERROR; lower numbers are more severe."""
+CHECKSUM_DIGITS: Final = 12
+_POSITION_AND_SPEED: Final = [
+    *(COLUMNS.index(name) for name in ("time_us", "nav_lat_deg", "nav_lon_deg", "nav_alt_amsl_m")),
+    *(COLUMNS.index(name) for name in ("nav_vel_north_mps", "nav_vel_east_mps")),
+]
 
 
 def simplified(points: Sequence[TrackPoint]) -> list[TrackPoint]:
@@ -86,12 +99,6 @@ def _distances_m(
     length2 = float(line @ line)
     share = ((points - begin) @ line / length2).clip(0.0, 1.0) if length2 else np.zeros(len(points))
     return np.asarray(np.linalg.norm(points - begin - share[:, np.newaxis] * line, axis=1))
-
-
-POINT_US: Final = US_PER_S // 10
-"""Positions nearer in time than this add nothing new of a flight."""
-EARLIEST_US: Final = 315_532_800 * US_PER_S
-"""1980, when GPS began: an earlier time counts from the start of a clock."""
 
 
 class FlightFacts(msgspec.Struct, frozen=True, kw_only=True):
@@ -227,17 +234,6 @@ def _longitudes(lon_deg: NDArray[np.float64]) -> tuple[float, float]:
     west, east = float(turned.min()), float(turned.max())
     return (wrap_180(west), wrap_180(east))
 
-
-SYS_STATUS_ID: Final = MESSAGE_IDS["SYS_STATUS"]
-USED_IDS: Final = frozenset({SYS_STATUS_ID, PARAM_VALUE_ID, AUTOPILOT_VERSION_ID, *GPS_IDS})
-ERROR: Final = 3
-"""MAV_SEVERITY_ERROR; lower numbers are more severe."""
-CHECKSUM_DIGITS: Final = 12
-
-_POSITION_AND_SPEED: Final = [
-    *(COLUMNS.index(name) for name in ("time_us", "nav_lat_deg", "nav_lon_deg", "nav_alt_amsl_m")),
-    *(COLUMNS.index(name) for name in ("nav_vel_north_mps", "nav_vel_east_mps")),
-]
 
 Flown = tuple[FlightFacts, Segments]
 """The facts of a flight, and its track."""

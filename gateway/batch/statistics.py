@@ -22,6 +22,16 @@ SEED: Final = 1
 CONFIDENCE: Final = 0.95
 CHANCE: Final = 0.05
 """A smaller p is more than chance."""
+FOLDS: Final = 10
+WORSE: Final = 1.05
+WORSE_M: Final = 0.05
+"""A flight counts as worse if its error grew by more than 5 % and 5 cm."""
+ALL: Final = "all"
+REASONS: Final = {
+    "eskf": "it distinguishes manoeuvres from gravity by the GPS velocity, which keeps it level",
+    "paper": "it follows the newest fix closely",
+}
+"""Of the estimators: where their lead comes from."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +98,6 @@ def lead_of(errors: FloatArray, others: FloatArray, groups: Sequence[str]) -> Le
     return Lead(len(logs), len(units), ratio, low, high, p)
 
 
-FOLDS: Final = 10
-
-
 @dataclass(frozen=True, slots=True)
 class Choice:
     """Result of a season's sweep."""
@@ -155,11 +162,6 @@ def folds_of(groups: Sequence[str]) -> NDArray[np.int64]:
     return np.array([fold[label] for label in labels], np.int64)
 
 
-WORSE: Final = 1.05
-WORSE_M: Final = 0.05
-"""A flight counts as worse if its error grew by more than 5 % and 5 cm."""
-
-
 @dataclass(frozen=True, slots=True)
 class Versus:
     """A season against the same flights of another version."""
@@ -178,9 +180,6 @@ def group_of(result: FlightResult) -> str:
     A flight without a day is a group of its own.
     """
     return f"{result.vehicle} {result.began[:10] if result.began else result.digest}"
-
-
-ALL: Final = "all"
 
 
 def errors_by_group(results: Sequence[FlightResult]) -> pd.DataFrame:
@@ -203,13 +202,6 @@ def errors_by_group(results: Sequence[FlightResult]) -> pd.DataFrame:
         ],
         columns=["aircraft", "estimator", "flights", "median, m", "9 in 10 below, m", "worst, m"],
     )
-
-
-REASONS: Final = {
-    "eskf": "it distinguishes manoeuvres from gravity by the GPS velocity, which keeps it level",
-    "paper": "it follows the newest fix closely",
-}
-"""Of the estimators: where their lead comes from."""
 
 
 def why_leads(results: Sequence[FlightResult]) -> str:

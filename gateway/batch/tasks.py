@@ -41,6 +41,14 @@ HELD: Final = "held_m"
 """Errors at the withheld fixes, by estimator."""
 DRIFT: Final = "drift_m"
 """Errors after 10 s without GPS, by estimator."""
+Files = Mapping[str, bytes]
+RESULTS: Final = "results"
+PARTIAL: Final = ".partial"
+"""Where files are written before they are put in their place."""
+Report = Callable[[str, int, int], None]
+"""Called with the item that was done last, how many are done, and of how many."""
+LOOKING: Final = "looking for changes"
+"""The first step: it decides which recordings are to be worked on."""
 
 
 class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,9 +69,6 @@ class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
     """JSON alone."""
     files: tuple[str, ...] = ()
     """Files that were written, relative to the folder of the results."""
-
-
-Files = Mapping[str, bytes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,11 +266,6 @@ def _figures(case: Case) -> dict[str, Any]:
     }
 
 
-RESULTS: Final = "results"
-PARTIAL: Final = ".partial"
-"""Where files are written before they are put in their place."""
-
-
 class ResultFolder:
     """Results of many recordings; raises OSError if it cannot be written."""
 
@@ -349,12 +349,6 @@ def _read(path: Path) -> FlightResult | None:
         return msgspec.json.decode(path.read_bytes(), type=FlightResult)
     except (FileNotFoundError, msgspec.DecodeError):
         return None
-
-
-Report = Callable[[str, int, int], None]
-"""Called with the item that was done last, how many are done, and of how many."""
-LOOKING: Final = "looking for changes"
-"""The first step: it decides which recordings are to be worked on."""
 
 
 def run_season(

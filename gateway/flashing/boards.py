@@ -39,6 +39,34 @@ _LAYOUT_1: Final = struct.Struct("<7s9BH2BI6B2x")
 _CRC: Final = struct.Struct("<H")
 SIZE: Final = _LAYOUT.size + _CRC.size
 PIPES_PER_VEHICLE: Final = 2
+Radio = Literal["nrf24", "sx1276"]
+RADIOS: Final[tuple[Radio, ...]] = get_args(Radio)
+NRF24: Final = ("radio_channel", "radio_kbps", "radio_address", "radio_power_dbm")
+SX1276: Final = (
+    "lora_frequency_khz",
+    "lora_bandwidth_khz",
+    "lora_spreading",
+    "lora_coding",
+    "lora_power_dbm",
+    "lora_sync_word",
+)
+_NODE: Final = ("vehicle_id", "node_id", "radio_pipe", "soft_restart")
+IMU_SEND_HZ: Final[dict[Radio, tuple[int, int]]] = {"nrf24": (60, 250), "sx1276": (4, 20)}
+"""Least and most IMU samples per second, by radio."""
+IMAGES: Final = Path(__file__).resolve().parent / "images"
+"""Built by `make firmware`, part of the package."""
+CLOCKS_MHZ: Final = (16, 8)
+CHIP: Final = "atmega328p"
+GET_SYNC: Final = b"\x30\x20"
+IN_SYNC: Final = b"\x14\x10"
+"""STK500 version 1: the request, and the answer of a bootloader."""
+RESET_PULSE_S: Final = 0.05
+SYNC_TRIES: Final = 12
+SYNC_WAIT_S: Final = 0.1
+"""Optiboot flashes its LED for 0.3 s before it listens, and waits 1 s for a request."""
+AVRDUDE_LIMIT_S: Final = 180.0
+AVRDUDE_TRIES: Final = 3
+"""A board that restarts slowly can miss the first requests."""
 
 
 class FlashError(Exception):
@@ -51,10 +79,6 @@ class Program(IntEnum):
     IMU = 1
     GPS = 2
     RECEIVER = 3
-
-
-Radio = Literal["nrf24", "sx1276"]
-RADIOS: Final[tuple[Radio, ...]] = get_args(Radio)
 
 
 class BoardSettings(Settings, frozen=True):
@@ -109,25 +133,11 @@ class BoardSettings(Settings, frozen=True):
     ] = False
 
 
-NRF24: Final = ("radio_channel", "radio_kbps", "radio_address", "radio_power_dbm")
-SX1276: Final = (
-    "lora_frequency_khz",
-    "lora_bandwidth_khz",
-    "lora_spreading",
-    "lora_coding",
-    "lora_power_dbm",
-    "lora_sync_word",
-)
-_NODE: Final = ("vehicle_id", "node_id", "radio_pipe", "soft_restart")
 _OF_PROGRAM: Final[dict[Program, tuple[str, ...]]] = {
     Program.IMU: (*_NODE, "imu_send_hz", "accel_range_g", "gyro_range_dps"),
     Program.GPS: (*_NODE, "gps_rate_hz", "gps_dynamic_model"),
     Program.RECEIVER: ("soft_restart",),
 }
-
-
-IMU_SEND_HZ: Final[dict[Radio, tuple[int, int]]] = {"nrf24": (60, 250), "sx1276": (4, 20)}
-"""Least and most IMU samples per second, by radio."""
 
 
 def used_by(program: Program, radio: Radio) -> tuple[str, ...]:
@@ -211,23 +221,6 @@ def _encode(block: SettingsBlock, settings: BoardSettings) -> bytes:
     head = (VERSION, block.program, block.clock_mhz, *block.firmware_version)
     content = _LAYOUT.pack(MAGIC, *head, *found.values())
     return content + _CRC.pack(crc16(content))
-
-
-IMAGES: Final = Path(__file__).resolve().parent / "images"
-"""Built by `make firmware`, part of the package."""
-CLOCKS_MHZ: Final = (16, 8)
-CHIP: Final = "atmega328p"
-
-GET_SYNC: Final = b"\x30\x20"
-IN_SYNC: Final = b"\x14\x10"
-"""STK500 version 1: the request, and the answer of a bootloader."""
-RESET_PULSE_S: Final = 0.05
-SYNC_TRIES: Final = 12
-SYNC_WAIT_S: Final = 0.1
-"""Optiboot flashes its LED for 0.3 s before it listens, and waits 1 s for a request."""
-AVRDUDE_LIMIT_S: Final = 180.0
-AVRDUDE_TRIES: Final = 3
-"""A board that restarts slowly can miss the first requests."""
 
 
 @dataclass(frozen=True, slots=True)

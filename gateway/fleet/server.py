@@ -34,6 +34,8 @@ from gateway.vehicle.telemetry.announcements import TEXT_BYTES, utf8
 from gateway.wire.mavlink_signing import WindowVerifier, key_from_passphrase
 from gateway.wire.mavlink_splitter import MavFrame, SplitFault, frame_of, split_datagram
 
+log = logging.getLogger(__name__)
+
 NO_BROADCASTS: Final = frozenset({1 << 24})
 """No message has this number. No site receives the telemetry of another: it gets frames addressed
 to its vehicles, and broadcasts of ground stations."""
@@ -43,6 +45,14 @@ MAX_SESSIONS: Final = 16
 
 CAUSES: Final = ("unknown", "signed", "unsigned", "forged", "replayed", "looped")
 """Why frames of a site are dropped; see `FrameTranslation.counters`."""
+POLL_S: Final = 1.0
+"""Interval of writing changed ids, updating rates, and looking for the router."""
+ONBOARD: Final = 191
+"""MAV_COMP_ID_ONBOARD_COMPUTER: its sequence numbers are independent of the autopilot's."""
+MAX_SITES: Final = 2000
+"""Site names that are remembered; more are forged."""
+ABANDONED_US: Final = 3600 * US_PER_S
+"""After so long without a frame a vehicle may lose its id, and a site is removed."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -140,18 +150,6 @@ def site_endpoint(site: str) -> Endpoint:
         url=url, kind="site", host=site, port=0, location=url, name=site, allow=NO_BROADCASTS,
         trusted=True, site=site,
     )  # fmt: skip
-
-
-log = logging.getLogger(__name__)
-
-POLL_S: Final = 1.0
-"""Interval of writing changed ids, updating rates, and looking for the router."""
-ONBOARD: Final = 191
-"""MAV_COMP_ID_ONBOARD_COMPUTER: its sequence numbers are independent of the autopilot's."""
-MAX_SITES: Final = 2000
-"""Site names that are remembered; more are forged."""
-ABANDONED_US: Final = 3600 * US_PER_S
-"""After so long without a frame a vehicle may lose its id, and a site is removed."""
 
 
 class FleetServer:

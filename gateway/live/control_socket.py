@@ -55,6 +55,16 @@ STARTERS: Final = {
 
 _CREDENTIALS: Final = struct.Struct("3i")
 """Linux `struct ucred`: process, user, group."""
+Handler = Callable[..., Awaitable[object] | object]
+Verbs = Mapping[str, Handler]
+"""Handlers by verb, which is words joined by dots.
+
+A handler takes the verb's parameters by their names and annotated types. It returns, or awaits,
+JSON, a msgspec structure or a dataclass; it refuses by ControlError, ValueError or OSError.
+"""
+SOCKETS: Final = Path("/proc/self/net/unix")
+ACCEPTS: Final = "00010000"
+"""The flag of a socket that takes connections, see proc_net(5)."""
 
 
 class ControlError(UserError):
@@ -70,15 +80,6 @@ class _Answer(msgspec.Struct, frozen=True):
     ok: bool
     result: Any = None
     error: str = ""
-
-
-Handler = Callable[..., Awaitable[object] | object]
-Verbs = Mapping[str, Handler]
-"""Handlers by verb, which is words joined by dots.
-
-A handler takes the verb's parameters by their names and annotated types. It returns, or awaits,
-JSON, a msgspec structure or a dataclass; it refuses by ControlError, ValueError or OSError.
-"""
 
 
 class ControlServer:
@@ -326,11 +327,6 @@ def _plain(value: object) -> object:
     if isinstance(value, Path):
         return str(value)
     raise NotImplementedError(f"{type(value).__name__} is not JSON")
-
-
-SOCKETS: Final = Path("/proc/self/net/unix")
-ACCEPTS: Final = "00010000"
-"""The flag of a socket that takes connections, see proc_net(5)."""
 
 
 def find_socket(name: str) -> Path:

@@ -24,6 +24,14 @@ from gateway.status import RecorderStatus
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
 
+MAX_SAMPLES: Final = 400
+"""Between two requests: some seconds, and less than a line of the control socket may hold."""
+IDLE_US: Final = 5 * US_PER_S
+"""Without a request for so long nothing is collected any more."""
+Values = tuple[int, ...]
+"""Time, accelerometer, gyroscope and magnetometer counts, temperature, three ranges, flags."""
+VehicleId = Annotated[int, msgspec.Meta(ge=1, le=255)]
+
 
 class RecorderVerbs:
     """`record.*`."""
@@ -172,17 +180,6 @@ def client_verbs(hub: Hub) -> Verbs:
         return hub.endpoints()
 
     return {"clients.list": hub.clients, "clients.add": add, "clients.remove": remove}
-
-
-MAX_SAMPLES: Final = 400
-"""Between two requests: some seconds, and less than a line of the control socket may hold."""
-IDLE_US: Final = 5 * US_PER_S
-"""Without a request for so long nothing is collected any more."""
-
-Values = tuple[int, ...]
-"""Time, accelerometer, gyroscope and magnetometer counts, temperature, three ranges, flags."""
-
-VehicleId = Annotated[int, msgspec.Meta(ge=1, le=255)]
 
 
 class ImuTap:

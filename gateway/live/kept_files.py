@@ -21,8 +21,18 @@ from gateway.output import PRIVATE, write_new
 from gateway.printable import reason_of
 from gateway.vehicle.plan import StoredPlan, decode_plan, encode_plan
 
+log = logging.getLogger(__name__)
+
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
+NAME: Final = re.compile(r"(\d{1,3})\.places\.json")
+RETRY_S: Final = 10.0
+"""Soon for a person who has repaired a file or made room, and no load for a failing disk."""
+TIMESTAMPS_NAME: Final = "signing-stamps.json"
+_Stream = Annotated[str, msgspec.Meta(pattern=r"^\d{1,3}\.\d{1,3}\.\d{1,3}$")]
+_Timestamp = Annotated[int, msgspec.Meta(ge=0, lt=1 << 49)]
+Kept = Mapping[int, dict[str, dict[str, int]]]
+"""By vehicle id; see `SigningTimestamps`."""
 
 
 def begin_worker(name: str, most: int = 1) -> ThreadPoolExecutor:
@@ -41,13 +51,6 @@ async def done_by(
     """Return a job's result; the job is done even if the task that waits for it is cancelled."""
     job_alone = partial(job, *args, **kwargs)
     return await asyncio.shield(asyncio.get_running_loop().run_in_executor(worker, job_alone))
-
-
-log = logging.getLogger(__name__)
-
-NAME: Final = re.compile(r"(\d{1,3})\.places\.json")
-RETRY_S: Final = 10.0
-"""Soon for a person who has repaired a file or made room, and no load for a failing disk."""
 
 
 class PlanFiles:
@@ -158,14 +161,6 @@ class PlanFiles:
 
 def _broken(file: Path) -> str:
     return f"{file.name} is broken: repair or remove it"
-
-
-TIMESTAMPS_NAME: Final = "signing-stamps.json"
-
-_Stream = Annotated[str, msgspec.Meta(pattern=r"^\d{1,3}\.\d{1,3}\.\d{1,3}$")]
-_Timestamp = Annotated[int, msgspec.Meta(ge=0, lt=1 << 49)]
-Kept = Mapping[int, dict[str, dict[str, int]]]
-"""By vehicle id; see `SigningTimestamps`."""
 
 
 class TimestampFile:

@@ -58,6 +58,8 @@ KNOWN_ADAPTERS: Final = {
     (0x2341, 0x0001): "Arduino Uno",
 }
 """USB serial chips of Arduino-class boards and programming cables."""
+NO_RECEIVER: Final = "none"
+"""Setting `port` of a gateway that only routes."""
 
 
 class SerialSettings(Settings, frozen=True):
@@ -78,10 +80,6 @@ class SerialSettings(Settings, frozen=True):
         int,
         setting("Speed of the line; the receiver's firmware must match.", "baud", ge=9600, le=2e6),
     ] = 500_000
-
-
-NO_RECEIVER: Final = "none"
-"""Setting `port` of a gateway that only routes."""
 
 
 class PortNotFoundError(UserError):

@@ -23,6 +23,18 @@ from gateway.extras import how_to_add
 from gateway.units import NS_PER_US, US_PER_S
 
 log = logging.getLogger(__name__)
+STALL_US: Final = 500_000
+"""A delay that loses samples: the kernel buffers about 0.4 s of them."""
+SPAN_US: Final = 10 * US_PER_S
+MAX_SHARE: Final = 0.3
+"""Delays that add up to more of the span mean that the loop cannot keep up."""
+WARM_UP_US: Final = 5 * US_PER_S
+"""At the start, loading machine code takes 0.25 s of a PC, several times that of a small board."""
+RECOVERED_US: Final = 60 * US_PER_S
+MAX_DELAYS: Final = 1000
+"""In a span; the timer fires at most every millisecond, but only delays are kept."""
+LEAST_DELAY_US: Final = 20_000
+NEVER_US: Final = 1 << 62
 
 
 class ServiceNotifier:
@@ -103,20 +115,6 @@ def _watchdog_interval_s() -> float:
     if owner and owner != str(os.getpid()):
         return 0.0
     return int(os.environ.get("WATCHDOG_USEC", "0")) / US_PER_S / 2
-
-
-STALL_US: Final = 500_000
-"""A delay that loses samples: the kernel buffers about 0.4 s of them."""
-SPAN_US: Final = 10 * US_PER_S
-MAX_SHARE: Final = 0.3
-"""Delays that add up to more of the span mean that the loop cannot keep up."""
-WARM_UP_US: Final = 5 * US_PER_S
-"""At the start, loading machine code takes 0.25 s of a PC, several times that of a small board."""
-RECOVERED_US: Final = 60 * US_PER_S
-MAX_DELAYS: Final = 1000
-"""In a span; the timer fires at most every millisecond, but only delays are kept."""
-LEAST_DELAY_US: Final = 20_000
-NEVER_US: Final = 1 << 62
 
 
 @dataclass(frozen=True, slots=True)

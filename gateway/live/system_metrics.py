@@ -24,6 +24,7 @@ HEARD_US: Final = 60 * US_PER_S
 SYSTEM: Final = ("system",)
 HALF: Final = 128
 """A number that is further ahead is an older one, of a frame that came late or twice."""
+Value = Callable[[NewestState, int], float]
 
 
 @dataclass(slots=True)
@@ -41,9 +42,6 @@ class _Stream:
         self.lost += ahead - 1 if self.frames else 0
         self.frames += 1
         self.sequence = sequence
-
-
-Value = Callable[[NewestState, int], float]
 
 
 def _position(name: str) -> Value:

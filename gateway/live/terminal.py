@@ -24,6 +24,13 @@ from typing import Any, Final, TextIO
 
 READ_BYTES: Final = 1024
 """Nothing is meant to come; what comes is ignored."""
+MAX_TEXTS: Final = 256
+"""Lines of the log, or pictures of the live view, that wait: at most about a megabyte."""
+FLUSH_TIMEOUT_S: Final = 1.0
+"""Longest that the end waits for what is still to be written."""
+KEY_BYTES: Final = 64
+_SEQUENCE: Final = re.compile(r"\x1b(?:[\[O]([0-9;]*)([A-Za-z~]))?")
+_NAMES: Final = {"A": "up", "B": "down", "C": "right", "D": "left", "H": "home", "F": "end"}
 
 
 def on_parent_gone(end: Callable[[], None]) -> None:
@@ -56,12 +63,6 @@ def own_command(*words: str) -> list[str]:
     recordings would be imported instead of the library.
     """
     return [sys.executable, "-P", "-m", "gateway.cli", *words]
-
-
-MAX_TEXTS: Final = 256
-"""Lines of the log, or pictures of the live view, that wait: at most about a megabyte."""
-FLUSH_TIMEOUT_S: Final = 1.0
-"""Longest that the end waits for what is still to be written."""
 
 
 class DetachedStream(io.TextIOBase):
@@ -147,12 +148,6 @@ def _has_file(stream: TextIO) -> bool:
     except (OSError, ValueError):
         return False
     return True
-
-
-KEY_BYTES: Final = 64
-
-_SEQUENCE: Final = re.compile(r"\x1b(?:[\[O]([0-9;]*)([A-Za-z~]))?")
-_NAMES: Final = {"A": "up", "B": "down", "C": "right", "D": "left", "H": "home", "F": "end"}
 
 
 def keys_of(text: str) -> Iterator[str]:

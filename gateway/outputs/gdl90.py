@@ -45,6 +45,10 @@ ACCURACIES_M: Final = ((3, 11), (10, 10), (30, 9), (92.6, 8), (185.2, 7), (555.6
 """Bounds of the horizontal accuracy, and the categories for better ones; 0 is unknown."""
 PRESSURES: Final = ("SCALED_PRESSURE", "SCALED_PRESSURE2")
 LETTERS: Final = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 ")
+IDENTIFICATION: Final = (
+    bytes((EXTENDED, 0, 1)) + b"\xff" * 8 + b"mavgate\0" + b"mavgate".ljust(16, b"\0") + bytes(4)
+)
+"""Version 1, no serial number, names, and that geometric altitude is above the ellipsoid."""
 
 
 class Gdl90Output(Output):
@@ -106,12 +110,6 @@ def heartbeat(unix_us: int, *, is_valid: bool) -> bytes:
     second = at.hour * 3600 + at.minute * 60 + at.second
     status = (0x80 if is_valid else 0) | 0x01, (second >> 16) << 7 | 0x01
     return bytes((HEARTBEAT, *status)) + (second & 0xFFFF).to_bytes(2, "little") + bytes(2)
-
-
-IDENTIFICATION: Final = (
-    bytes((EXTENDED, 0, 1)) + b"\xff" * 8 + b"mavgate\0" + b"mavgate".ljust(16, b"\0") + bytes(4)
-)
-"""Version 1, no serial number, names, and that geometric altitude is above the ellipsoid."""
 
 
 def report(

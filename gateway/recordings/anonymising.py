@@ -120,6 +120,24 @@ MAX_NAMES: Final = 60_000
 """Different identifiers that are numbered; the others share a number."""
 MAX_PLACE_DEG: Final = 80.0
 """Greatest latitude of the place: nearer to a pole, a flight would not fit between meridians."""
+_COMMAND_FIELDS: Final[dict[int, dict[str, int]]] = {
+    number: axes
+    for number, entry in mavlink.enums["MAV_CMD"].items()
+    if (
+        axes := {
+            f"param{index}": int("ongitude" in text)
+            for index, text in entry.param.items()
+            if "atitude" in text or "ongitude" in text
+        }
+    )
+}
+"""By command: parameters that are coordinates, latitude 0 or longitude 1."""
+_SIZES: Final = np.full(1 << 16, -1, np.int64)
+"""Size of each known message's payload, by id."""
+_CHANGED: Final = np.zeros(1 << 16, np.bool_)
+"""Whether a message may have to change."""
+_SPECIAL: Final = {*OPAQUE, *LOCATED, *NAMED_VALUES, *GPS_WEEKS, *DRONE_ID_TIMES,
+                   *COMMANDS}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,24 +203,6 @@ def _plan_of(message_id: int) -> _Plan:
     )
 
 
-_COMMAND_FIELDS: Final[dict[int, dict[str, int]]] = {
-    number: axes
-    for number, entry in mavlink.enums["MAV_CMD"].items()
-    if (
-        axes := {
-            f"param{index}": int("ongitude" in text)
-            for index, text in entry.param.items()
-            if "atitude" in text or "ongitude" in text
-        }
-    )
-}
-"""By command: parameters that are coordinates, latitude 0 or longitude 1."""
-_SIZES: Final = np.full(1 << 16, -1, np.int64)
-"""Size of each known message's payload, by id."""
-_CHANGED: Final = np.zeros(1 << 16, np.bool_)
-"""Whether a message may have to change."""
-_SPECIAL: Final = {*OPAQUE, *LOCATED, *NAMED_VALUES, *GPS_WEEKS, *DRONE_ID_TIMES,
-                   *COMMANDS}  # fmt: skip
 for _message_id, _name in MESSAGE_NAMES.items():
     _SIZES[_message_id] = layout_of(_message_id).itemsize
     _CHANGED[_message_id] = _name in _SPECIAL or not _plan_of(_message_id).is_empty

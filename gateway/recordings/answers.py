@@ -32,6 +32,25 @@ from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 
+PARAM_VALUE_ID: Final = MESSAGE_IDS["PARAM_VALUE"]
+AUTOPILOT_VERSION_ID: Final = MESSAGE_IDS["AUTOPILOT_VERSION"]
+HOME_POSITION_ID: Final = MESSAGE_IDS["HOME_POSITION"]
+AVAILABLE_MODES_ID: Final = MESSAGE_IDS["AVAILABLE_MODES"]
+_VALUE: Final = struct.Struct("<4sHH16sB")
+"""PARAM_VALUE: value, count, index, name, type."""
+_SAME: Final = {HOME_POSITION_ID: 52}
+"""How much of the payload must be equal to be no change; the rest is the time of sending."""
+_PARAM_SET: Final = MESSAGE_IDS["PARAM_SET"]
+_SET_NAME: Final = slice(6, 22)
+"""Of PARAM_SET: behind the value and the target."""
+KINDS: Final = (0, 1, 2)
+"""Mission, fence, rally points."""
+ALL_KINDS: Final = 255
+MAX_KEPT: Final = 200_000
+"""Frames; some 10 MB. A vehicle has a thousand parameters that change now and then."""
+Items = tuple[bytes, ...]
+Value = TypeVar("Value")
+
 
 def _ids(*names: str) -> frozenset[int]:
     return frozenset(MESSAGE_IDS[name] for name in names)
@@ -96,16 +115,6 @@ def telemetry_of(batch: Batch, begin: int, senders: Senders) -> IntArray:
     return found
 
 
-PARAM_VALUE_ID: Final = MESSAGE_IDS["PARAM_VALUE"]
-AUTOPILOT_VERSION_ID: Final = MESSAGE_IDS["AUTOPILOT_VERSION"]
-HOME_POSITION_ID: Final = MESSAGE_IDS["HOME_POSITION"]
-AVAILABLE_MODES_ID: Final = MESSAGE_IDS["AVAILABLE_MODES"]
-
-_VALUE: Final = struct.Struct("<4sHH16sB")
-"""PARAM_VALUE: value, count, index, name, type."""
-
-_SAME: Final = {HOME_POSITION_ID: 52}
-"""How much of the payload must be equal to be no change; the rest is the time of sending."""
 _KEPT: Final = _ids(
     "PARAM_VALUE", "GPS_GLOBAL_ORIGIN", "AUTOPILOT_VERSION", "HOME_POSITION", "PROTOCOL_VERSION",
     "AVAILABLE_MODES",
@@ -113,19 +122,7 @@ _KEPT: Final = _ids(
 _MISSION: Final = _ids(
     "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_ACK"
 )
-_PARAM_SET: Final = MESSAGE_IDS["PARAM_SET"]
-_SET_NAME: Final = slice(6, 22)
-"""Of PARAM_SET: behind the value and the target."""
 _READ: Final = np.array(sorted(_KEPT | _MISSION | {_PARAM_SET}))
-
-KINDS: Final = (0, 1, 2)
-"""Mission, fence, rally points."""
-ALL_KINDS: Final = 255
-MAX_KEPT: Final = 200_000
-"""Frames; some 10 MB. A vehicle has a thousand parameters that change now and then."""
-
-Items = tuple[bytes, ...]
-Value = TypeVar("Value")
 
 
 @dataclass(slots=True)

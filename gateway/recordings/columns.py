@@ -60,6 +60,28 @@ _KINDS: Final = {
 }
 
 Read = TypeVar("Read")
+HEAD_COLUMNS: Final = ("time_us", "node_id", "node_time_us", "imu_flags")
+"""Shared by the counts and the calibrated values of a sample."""
+UNITS: Final = {
+    "_mps2": "m/s^2", "_mps": "m/s", "_radps": "rad/s", "_rad": "rad", "_ut": "uT",
+    "_degc": "degC", "_deg": "deg", "_dege7": "1e-7 deg", "_us": "us", "_ms": "ms", "_pa": "Pa",
+    "_m": "m", "_raw": "counts", "_range_g": "g", "_dps": "deg/s", "_per_gauss": "counts/gauss",
+}  # fmt: skip
+"""Unit of a column, by the ending of its name."""
+LARGEST_WHOLE: Final = 1 << 53
+"""Up to here every whole number is a float. As a time in us it is three centuries; a greater one is
+invalid, and other programs round such a number."""
+Imported = ImuCalibrated | BaroRaw | GpsFix | NavState
+"""Records of another program's log."""
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+_HEAD: Final = slice(1, len(HEAD_COLUMNS))
+_OF_NUMBERS: Final = b"0123456789.,-+eE\n"
+_COMMA, _NEWLINE = b",\n"
+_LEAST_FIXED: Final = 1e-4
+"""Smaller ones, and those from the next on, Python writes with an exponent, which JSON's writer
+does from other sizes on and in another form."""
+_LEAST_LARGE: Final = 1e16
 
 
 class Codec(Generic[Read]):
@@ -170,8 +192,6 @@ NAV_CODEC: Final = Codec(
     ("flags", "flags"),
 )
 
-HEAD_COLUMNS: Final = ("time_us", "node_id", "node_time_us", "imu_flags")
-"""Shared by the counts and the calibrated values of a sample."""
 _GROUPS: Final = (RAW_CODEC, SI_CODEC, BARO_CODEC, GPS_CODEC, NAV_CODEC)
 COLUMNS: Final[tuple[str, ...]] = (
     *HEAD_COLUMNS,
@@ -182,12 +202,6 @@ WHOLE_COLUMNS: Final = frozenset((*HEAD_COLUMNS, *(n for group in _GROUPS for n 
 """Those that hold whole numbers."""
 TRUTHS: Final = frozenset(name for group in _GROUPS for name in group.truths)
 """Those of them that are 1 or 0: true or false."""
-UNITS: Final = {
-    "_mps2": "m/s^2", "_mps": "m/s", "_radps": "rad/s", "_rad": "rad", "_ut": "uT",
-    "_degc": "degC", "_deg": "deg", "_dege7": "1e-7 deg", "_us": "us", "_ms": "ms", "_pa": "Pa",
-    "_m": "m", "_raw": "counts", "_range_g": "g", "_dps": "deg/s", "_per_gauss": "counts/gauss",
-}  # fmt: skip
-"""Unit of a column, by the ending of its name."""
 
 
 def unit_of(name: str) -> str:
@@ -203,11 +217,6 @@ def span_of(*names: str) -> slice:
 
 RAW, SI, BARO, GPS, NAV = (span_of(*group.columns) for group in _GROUPS)
 MAG: Final = span_of("mag_x_b_ut", "mag_y_b_ut", "mag_z_b_ut")
-
-
-LARGEST_WHOLE: Final = 1 << 53
-"""Up to here every whole number is a float. As a time in us it is three centuries; a greater one is
-invalid, and other programs round such a number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,10 +271,6 @@ def row_of_cells(cells: Sequence[float], vehicle_id: int) -> TableRow:
         imu=SI_CODEC.read(cells[SI], **head) if has_si else None,
         state=NAV_CODEC.read(cells[NAV]) if has_nav else None,
     )
-
-
-Imported = ImuCalibrated | BaroRaw | GpsFix | NavState
-"""Records of another program's log."""
 
 
 class RowBuilder:
@@ -334,9 +339,6 @@ def _calibrated(fused: FusedSample) -> ImuCalibrated:
     )
 
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
 IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in COLUMNS])
 _WHOLE: Final = np.flatnonzero(IS_WHOLE)
 _AT: Final = {name: index for index, name in enumerate(COLUMNS)}
@@ -353,18 +355,10 @@ TIMES: Final = [
     k for k, name in enumerate(COLUMNS) if name.endswith("time_us") and "node" not in name
 ]
 """Times on the gateway's clock."""
-_HEAD: Final = slice(1, len(HEAD_COLUMNS))
 NODE_ID, NODE_TIME, FLAGS = (_AT[n] for n in ("node_id", "node_time_us", "imu_flags"))
 FIX_TYPE, FIX_OK = _AT["gps_fix_type"], _AT["gps_fix_ok"]
 FIX_LAT, FIX_LON, FIX_ALT = (_AT[f"gps_{n}"] for n in ("lat_dege7", "lon_dege7", "alt_amsl_m"))
 NAV_LAT, NAV_LON, NAV_FLAGS = _AT["nav_lat_deg"], _AT["nav_lon_deg"], _AT["nav_flags"]
-
-_OF_NUMBERS: Final = b"0123456789.,-+eE\n"
-_COMMA, _NEWLINE = b",\n"
-_LEAST_FIXED: Final = 1e-4
-"""Smaller ones, and those from the next on, Python writes with an exponent, which JSON's writer
-does from other sizes on and in another form."""
-_LEAST_LARGE: Final = 1e16
 
 
 def has_group(cells: FloatArray, group: slice) -> BoolArray:

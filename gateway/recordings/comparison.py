@@ -29,6 +29,9 @@ KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally points"}
 VIBRATION: Final = ("vibration_x", "vibration_y", "vibration_z")
 _IDS: Final = {name: MESSAGE_IDS[name] for name in ("BATTERY_STATUS", "VIBRATION", "GPS_RAW_INT")}
 UNKNOWN_U8: Final = 0xFF
+QGC_CELLS: Final = ("vehicle", "component", "name", "value", "type")
+SECTIONS: Final = {"parameters": "parameter", "plans": "item", "figures": "figure", "texts": "text"}
+"""Sections of a comparison, and the heading of their first column."""
 
 
 @dataclass(slots=True)
@@ -107,9 +110,6 @@ def read_param_file(path: Path) -> Contents:
     if not found.parameters:
         raise FlightError(f"{path}: holds no parameters")
     return found
-
-
-QGC_CELLS: Final = ("vehicle", "component", "name", "value", "type")
 
 
 def single_text(value: float) -> str:
@@ -229,10 +229,6 @@ def _versions(plan: RecordedPlan) -> dict[str, str]:
         "firmware": f"{version >> 24}.{version >> 16 & 0xFF}.{version >> 8 & 0xFF}",
         "hardware": f"{fields['vendor_id']}:{fields['product_id']}, {fields['board_version']}",
     }
-
-
-SECTIONS: Final = {"parameters": "parameter", "plans": "item", "figures": "figure", "texts": "text"}
-"""Sections of a comparison, and the heading of their first column."""
 
 
 def as_html(found: Comparison) -> Iterator[str]:

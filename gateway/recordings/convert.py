@@ -53,6 +53,13 @@ from gateway.recordings.tlog_editing import TlogEditor, TlogEdits, first_positio
 from gateway.recordings.trimming import NOTHING_WITHIN, Limits, trimmed
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 
+NOT_FUSED: Final = "raw samples, settings and the states' digits"
+NOT_IN_TABLE: Final = "all but samples, fixes and states of one vehicle"
+NOT_DRAWN: Final = (
+    "samples, velocities and settings",
+    "all MAVLink messages but positions, attitude and texts",
+)
+
 
 class FlightToWrite:
     """Recordings that become one file: as MAVLink or as rows, whichever its format needs.
@@ -298,13 +305,6 @@ def _packaged(module: str, name: str) -> Write:
 
     return write
 
-
-NOT_FUSED: Final = "raw samples, settings and the states' digits"
-NOT_IN_TABLE: Final = "all but samples, fixes and states of one vehicle"
-NOT_DRAWN: Final = (
-    "samples, velocities and settings",
-    "all MAVLink messages but positions, attitude and texts",
-)
 
 add_writer(".tlog", FlightToWrite.tlog, Lacks(of_tables=NOT_FUSED))
 add_writer(".csv", _write_csv, Lacks(of_tlogs=NOT_IN_TABLE))

@@ -79,20 +79,8 @@ Estimates = Literal["own", "fused", "both"]
 NO_RECORDING: Final = (
     "unknown file format; readable: tlog, raw MAVLink, CSV, ULog, DataFlash, MCAP, Parquet"
 )
-
-
-class FlightError(UserError):
-    """A file without the data that a command needs; the text names the data and the file."""
-
-
 TLOG, TABLE, CSV, PARQUET = "tlog", "table", "csv", "Parquet"
 """Formats; a CSV is that of another program, with columns of its own."""
-
-
-def _begins(*heads: bytes) -> Callable[[bytes], bool]:
-    return lambda head: head.startswith(heads)
-
-
 ULOG_HEAD: Final = b"ULog\x01\x12\x35"
 ULOG_BEGIN: Final = re.compile(
     rb"\A[^\xfd\xfe]*?(?=ULog\x01\x12\x35|..F[a-z0-9_]+:uint64_t timestamp;)", re.DOTALL
@@ -104,6 +92,30 @@ DATAFLASH_BEGIN: Final = re.compile(
 )
 """The same of a binary DataFlash log: its first message, or behind other bytes its first format."""
 _DATAFLASH_LINE: Final = re.compile(rb"^FMT, ?\d", re.MULTILINE)
+LINE_BPS: Final = 57_600
+"""The usual telemetry radio; ten bits a byte."""
+LAST_CIVIL_US: Final = 4_102_444_800 * US_PER_S
+"""The year 2100."""
+_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "time_unix_usec": 1}
+"""Fields with the sender's time, and their unit."""
+_TIMES: Final = {
+    message_id: names
+    for message_id, kind in DEFINITIONS.items()
+    if (names := [name for name in _UNITS_US if name in kind.fieldnames])
+}
+"""Fields of each message with a time."""
+PIECE: Final = 1 << 12
+SHOWN_JUMPS: Final = 3
+_DAY_S: Final = 86_400
+
+
+class FlightError(UserError):
+    """A file without the data that a command needs; the text names the data and the file."""
+
+
+def _begins(*heads: bytes) -> Callable[[bytes], bool]:
+    return lambda head: head.startswith(heads)
+
 
 OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {
     "ULog": lambda head: ULOG_BEGIN.search(head) is not None,
@@ -332,20 +344,6 @@ def read_blocks(path: Path, reader: TableReader, progress: Progress | None) -> I
     yield reader.feed_block(b"", final=True)
 
 
-LINE_BPS: Final = 57_600
-"""The usual telemetry radio; ten bits a byte."""
-LAST_CIVIL_US: Final = 4_102_444_800 * US_PER_S
-"""The year 2100."""
-_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "time_unix_usec": 1}
-"""Fields with the sender's time, and their unit."""
-_TIMES: Final = {
-    message_id: names
-    for message_id, kind in DEFINITIONS.items()
-    if (names := [name for name in _UNITS_US if name in kind.fieldnames])
-}
-"""Fields of each message with a time."""
-
-
 class FrameClock:
     """The time of each frame, counted from the first one."""
 
@@ -381,11 +379,6 @@ class FrameClock:
             base_us = self._now_us - own_us
         self._now_us = max(self._now_us, base_us + own_us)
         self._bases_us[key] = (base_us, own_us)
-
-
-PIECE: Final = 1 << 12
-SHOWN_JUMPS: Final = 3
-_DAY_S: Final = 86_400
 
 
 class Layout(IntEnum):

@@ -59,6 +59,18 @@ from gateway.sensing.chain import ImuLog, IntArray, SensorChain
 from gateway.settings import Settings
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 
+VALID: Final = int(
+    NavFlags.ATTITUDE_VALID
+    | NavFlags.HEADING_VALID
+    | NavFlags.POSITION_VALID
+    | NavFlags.VELOCITY_VALID
+    | NavFlags.ALTITUDE_VALID
+)
+SMOOTHED_ESTIMATOR: Final = "eskf"
+"""The filter that the smoother goes over."""
+Correct = Callable[[IntArray, FloatArray], FloatArray]
+"""Changes the states of given times."""
+
 
 class FusionSettings(Settings, frozen=True):
     """The settings that affect the fusion of calibrated samples."""
@@ -80,17 +92,6 @@ def with_reference(settings: Chosen, **changes: object) -> Chosen:
     reference = msgspec.structs.replace(settings.estimation.reference, **changes)
     estimation = msgspec.structs.replace(settings.estimation, reference=reference)
     return msgspec.structs.replace(settings, estimation=estimation)
-
-
-VALID: Final = int(
-    NavFlags.ATTITUDE_VALID
-    | NavFlags.HEADING_VALID
-    | NavFlags.POSITION_VALID
-    | NavFlags.VELOCITY_VALID
-    | NavFlags.ALTITUDE_VALID
-)
-SMOOTHED_ESTIMATOR: Final = "eskf"
-"""The filter that the smoother goes over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,10 +276,6 @@ def samples_of_cells(cells: FloatArray, chain: SensorChain) -> Samples:
         found.append((row, 1, GPS_CODEC.read(values)))
     found.sort(key=lambda placed: placed[:2])
     return Samples(imu, [(int(before[row]), record) for row, _, record in found])
-
-
-Correct = Callable[[IntArray, FloatArray], FloatArray]
-"""Changes the states of given times."""
 
 
 class Fusion:

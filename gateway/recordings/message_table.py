@@ -58,6 +58,14 @@ _EKF_FLAGS: Final = 0x3FF
 """Bits of ArduPilot's filter status that EKF_STATUS_REPORT has in the same places."""
 _LANDED, _IN_AIR = 1, 2
 """MAV_LANDED_STATE."""
+WRAPPED: Final = frozenset({"compass", "course", "heading"})
+Values = Mapping[str, Any]
+_CALL: Final = re.compile(r"(?:(?P<kind>\w+): )?(?:(?P<function>\w+)\()?(?P<values>[^()]*)\)?")
+_VALUE: Final = re.compile(
+    r"(?P<topic>\w+)\.(?P<name>[\w\[\].#]+)(?: (?:\*(?P<factor>[-\d.e]+)|(?P<unit>\S+)))?"
+)
+UINT32, UINT64 = (1 << 32) - 1, (1 << 64) - 1
+TIMES: Final = ("time_boot_ms", "time_usec")
 
 
 def _quaternion(part: int) -> Callable[..., float]:
@@ -92,9 +100,6 @@ FUNCTIONS: Final[dict[str, Callable[..., float]]] = {
     "minus": lambda value, other: value - other,
 }  # fmt: skip
 """Of values in SI; `compass`, `course` and `heading` are angles from north, from 0 to a turn."""
-WRAPPED: Final = frozenset({"compass", "course", "heading"})
-
-Values = Mapping[str, Any]
 
 
 class Context(Protocol):
@@ -122,11 +127,6 @@ class LogFacts(Protocol):
 
 
 Read = Callable[[Context], float]
-
-_CALL: Final = re.compile(r"(?:(?P<kind>\w+): )?(?:(?P<function>\w+)\()?(?P<values>[^()]*)\)?")
-_VALUE: Final = re.compile(
-    r"(?P<topic>\w+)\.(?P<name>[\w\[\].#]+)(?: (?:\*(?P<factor>[-\d.e]+)|(?P<unit>\S+)))?"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,10 +250,6 @@ class BoundMessage:
 
     timed: tuple[tuple[int, str, int], ...] = ()
     """Places of the fields with the time of the row, and the greatest value of their types."""
-
-
-UINT32, UINT64 = (1 << 32) - 1, (1 << 64) - 1
-TIMES: Final = ("time_boot_ms", "time_usec")
 
 
 @dataclass(frozen=True, slots=True)

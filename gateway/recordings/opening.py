@@ -36,7 +36,11 @@ from gateway.recordings.senders import FIRST_GROUND_STATION
 from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.recordings.tlog_index import TlogIndex
 
+log = logging.getLogger(__name__)
+
 READ_SIZE: Final = 1 << 20
+PIECE: Final = 8
+"""Frames generated at once: one or two milliseconds."""
 
 
 class TlogFile:
@@ -100,12 +104,6 @@ class TlogFile:
     def close(self) -> None:
         """Close the file; its tracks end."""
         os.close(self._file)
-
-
-log = logging.getLogger(__name__)
-
-PIECE: Final = 8
-"""Frames generated at once: one or two milliseconds."""
 
 
 class FusedTlog:

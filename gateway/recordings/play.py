@@ -49,6 +49,12 @@ CONTEXT_IDS: Final = [
 ]  # fmt: skip
 """The messages that show the state of a vehicle."""
 _CONTEXT: Final = frozenset(CONTEXT_IDS)
+LEAST_SPEED: Final = 0.1
+GREATEST_SPEED: Final = 100.0
+AS_FAST_AS_POSSIBLE: Final = math.inf
+END_OF_TIME_US: Final = 1 << 64
+CLOCK_JUMP_US: Final = 86_400 * US_PER_S
+"""A longer gap means that a clock was set; it is skipped."""
 
 
 class Source(Protocol):
@@ -202,14 +208,6 @@ class Track:
             offset += len(data)
             size = BLOCK_BYTES
         yield timeline.apply(scanner.feed(b"", final=True))
-
-
-LEAST_SPEED: Final = 0.1
-GREATEST_SPEED: Final = 100.0
-AS_FAST_AS_POSSIBLE: Final = math.inf
-END_OF_TIME_US: Final = 1 << 64
-CLOCK_JUMP_US: Final = 86_400 * US_PER_S
-"""A longer gap means that a clock was set; it is skipped."""
 
 
 class PlayState(StrEnum):

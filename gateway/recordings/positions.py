@@ -26,6 +26,22 @@ FIX_2D: Final = 2
 """GPS_FIX_TYPE_2D_FIX."""
 UNKNOWN_U16: Final = 65535
 MAX_LAT_DEGE7, MAX_LON_DEGE7 = 900_000_000, 1_800_000_000
+GPS_IDS: Final = (MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["GPS2_RAW"])
+"""Of the first and of the second GPS receiver."""
+GLOBAL_POSITION_INT_ID: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
+LOCAL_POSITION_NED_ID: Final = MESSAGE_IDS["LOCAL_POSITION_NED"]
+ORIGIN_ID: Final = MESSAGE_IDS["GPS_GLOBAL_ORIGIN"]
+INTERRUPTION_US: Final = 60 * US_PER_S
+"""A longer time without a position breaks a track; those of narrow links come every 10 s."""
+RESTART_US: Final = 5 * US_PER_S
+"""Time since boot that falls by more is a restart; two links may be out of order by less."""
+JUMP_M: Final = 200.0
+JUMP_MPS: Final = 400.0
+"""A step that is longer than `JUMP_M` and faster than this is a jump, not a motion."""
+STEP_US: Final = US_PER_S // 2
+"""Interval of the positions between which the distance is summed."""
+LEAST_STEP_M: Final = 1.0
+"""Shorter steps are not summed: at rest the noise of positions would be a distance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +77,6 @@ _SOURCES: Final = {
 POSITION_SOURCES: Final = {MESSAGE_IDS[name]: source for name, source in _SOURCES.items()}
 """By message id, the best first: estimates of the vehicle, receivers, narrow links."""
 RANKS: Final = {message_id: rank for rank, message_id in enumerate(POSITION_SOURCES)}
-GPS_IDS: Final = (MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["GPS2_RAW"])
-"""Of the first and of the second GPS receiver."""
-GLOBAL_POSITION_INT_ID: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
-LOCAL_POSITION_NED_ID: Final = MESSAGE_IDS["LOCAL_POSITION_NED"]
-ORIGIN_ID: Final = MESSAGE_IDS["GPS_GLOBAL_ORIGIN"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,15 +177,6 @@ def named_position(fields: Mapping[str, Any]) -> Position | None:
     return Position(lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, fields["altitude"] * M_PER_MM)
 
 
-INTERRUPTION_US: Final = 60 * US_PER_S
-"""A longer time without a position breaks a track; those of narrow links come every 10 s."""
-RESTART_US: Final = 5 * US_PER_S
-"""Time since boot that falls by more is a restart; two links may be out of order by less."""
-JUMP_M: Final = 200.0
-JUMP_MPS: Final = 400.0
-"""A step that is longer than `JUMP_M` and faster than this is a jump, not a motion."""
-
-
 class Continuity:
     """Find where a track is broken, position by position."""
 
@@ -208,12 +210,6 @@ class Continuity:
             return False
         step_m = math.hypot(*displacement_m(last[1], last[2], lat_deg, lon_deg, 0.0))
         return step_m > JUMP_M + JUMP_MPS * step_us / US_PER_S
-
-
-STEP_US: Final = US_PER_S // 2
-"""Interval of the positions between which the distance is summed."""
-LEAST_STEP_M: Final = 1.0
-"""Shorter steps are not summed: at rest the noise of positions would be a distance."""
 
 
 class GroundDistance:

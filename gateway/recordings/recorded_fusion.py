@@ -81,6 +81,18 @@ PIECE: Final = 200
 """Rows that are fused at once for a playback: some milliseconds, in which it sends nothing."""
 LONGEST_GAP_US: Final = 1_000_000
 """In a longer gap the pipeline's timers are not run one by one."""
+HEAD_LINES: Final = 20
+LATENCY_TOLERANCE_S: Final = 0.03
+"""The position may lag the velocity of the same fix by this much; only the velocity is compared."""
+_KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
+USUAL: Final = ReferenceSettings()
+LINES: Final = 2000
+"""Lines that are written at once."""
+WRITTEN: Final = ("time_us", *NAV_COLUMNS)
+IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in WRITTEN])
+LEAST_RATE_HZ: Final = 10.0
+"""A hand-held or flying tracker turns within a tenth of a second."""
+NOT_RESTORED: Final = "the state stored at the start is not used: {}; the estimator has to converge"
 
 
 class Replay:
@@ -126,13 +138,6 @@ class Replay:
             if self._pipeline.next_due_us() <= due_us:
                 break
         self._now_us = now_us
-
-
-HEAD_LINES: Final = 20
-LATENCY_TOLERANCE_S: Final = 0.03
-"""The position may lag the velocity of the same fix by this much; only the velocity is compared."""
-_KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
-USUAL: Final = ReferenceSettings()
 
 
 def aircraft_for(
@@ -247,23 +252,12 @@ def with_facts(aircraft: AircraftSettings, facts: dict[str, float]) -> AircraftS
     return with_reference(aircraft, **changes)
 
 
-LINES: Final = 2000
-"""Lines that are written at once."""
-WRITTEN: Final = ("time_us", *NAV_COLUMNS)
-IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in WRITTEN])
-
-
 def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
     """Write a table of states only; unknown values are left blank."""
     yield f"{FORMAT_LINE}\n{encode_line(header)}{','.join(WRITTEN)}\n".encode()
     table = np.column_stack([time_us, time_us, states])
     for begin in range(0, len(table), LINES):
         yield write_lines(table[begin : begin + LINES], IS_WHOLE)
-
-
-LEAST_RATE_HZ: Final = 10.0
-"""A hand-held or flying tracker turns within a tenth of a second."""
-NOT_RESTORED: Final = "the state stored at the start is not used: {}; the estimator has to converge"
 
 
 class RecordedFusion:

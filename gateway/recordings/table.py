@@ -54,6 +54,12 @@ MAX_LINE: Final = 1 << 20
 
 TimeUs = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
 """A time in µs; the sum of two fits 64 bits."""
+IntArray = NDArray[np.int64]
+REMARK: Final = "Mark: "
+"""Begin of the STATUSTEXT with an operator's remark."""
+NO_ROWS: Final = np.empty((0, len(COLUMNS)))
+BLOCK_ROWS: Final = 1000
+"""Of another program's file that are laid out as columns at once."""
 
 
 class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
@@ -73,12 +79,6 @@ class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
     """The settings, as in the settings file."""
     calibration: dict[str, Any] = {}
     """The calibration of the aircraft's IMU node."""
-
-
-IntArray = NDArray[np.int64]
-
-REMARK: Final = "Mark: "
-"""Begin of the STATUSTEXT with an operator's remark."""
 
 
 class TableMark(msgspec.Struct, frozen=True):
@@ -180,11 +180,6 @@ def encode_block(block: TableBlock) -> bytes:
         if comment is not None and not isinstance(comment, TableFault):
             text += encode_line(comment).encode()
     return text
-
-
-NO_ROWS: Final = np.empty((0, len(COLUMNS)))
-BLOCK_ROWS: Final = 1000
-"""Of another program's file that are laid out as columns at once."""
 
 
 class TableReader:

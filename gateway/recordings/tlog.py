@@ -34,6 +34,26 @@ ORDER_US: Final = 2 * US_PER_S
 """A time that is further before the record before, or behind the next one, is damaged."""
 
 Times = TypeVar("Times", int, NDArray[np.int64])
+STRIDE: Final = 256
+"""Records between two entries of the index: a seek scans at most this many, some 15 kB."""
+SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
+BACK_US: Final = 60 * US_PER_S
+"""Frames of two links may be out of order by seconds; a clock that was set back shows more."""
+FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
+"""The year 2000: an earlier time counts from the start of a clock."""
+MAX_JUMPS: Final = 1000
+HEARTBEAT_ID: Final = MESSAGE_IDS["HEARTBEAT"]
+LENGTH_AT: Final = 1
+"""Offset of the payload's length in a frame."""
+UNRECORDED: Final = ids_of("HIGH_LATENCY2")
+"""For links too narrow for the rest: next to these in a recording a ground station
+would take each one for another state of the vehicle."""
+JUMP_US: Final = 2 * US_PER_S
+"""Larger differences between the known time and the true one are worth a new file. GPS arrival
+lags by up to a second, and NTP slews smaller errors away."""
+STEP_US: Final = 4
+"""Least distance of two stamps: readers take the low two bits for a link's number."""
+_LINK_BITS: Final = 3
 
 
 def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDArray[np.bool_]:
@@ -42,24 +62,6 @@ def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDAr
     is_in_order = (gap_us >= -ORDER_US) & (gap_us <= DAY_US)
     is_outside = (time_us < before_us - ORDER_US) | (time_us > after_us + ORDER_US)
     return is_in_order & is_outside
-
-
-STRIDE: Final = 256
-"""Records between two entries of the index: a seek scans at most this many, some 15 kB."""
-SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
-
-BACK_US: Final = 60 * US_PER_S
-"""Frames of two links may be out of order by seconds; a clock that was set back shows more."""
-FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
-"""The year 2000: an earlier time counts from the start of a clock."""
-MAX_JUMPS: Final = 1000
-
-HEARTBEAT_ID: Final = MESSAGE_IDS["HEARTBEAT"]
-LENGTH_AT: Final = 1
-"""Offset of the payload's length in a frame."""
-UNRECORDED: Final = ids_of("HIGH_LATENCY2")
-"""For links too narrow for the rest: next to these in a recording a ground station
-would take each one for another state of the vehicle."""
 
 
 def _crc_extra_table() -> ExtraArray:
@@ -325,14 +327,6 @@ class Timeline:
         at = np.searchsorted(self._begins, batch.starts + batch.offset, side="right") - 1
         corrected: IntArray = batch.time_us + shifts_us[np.maximum(at, 0)]
         return replace(batch, time_us=corrected)
-
-
-JUMP_US: Final = 2 * US_PER_S
-"""Larger differences between the known time and the true one are worth a new file. GPS arrival
-lags by up to a second, and NTP slews smaller errors away."""
-STEP_US: Final = 4
-"""Least distance of two stamps: readers take the low two bits for a link's number."""
-_LINK_BITS: Final = 3
 
 
 class CivilClock:

@@ -98,6 +98,12 @@ MAX_TILT_RAD: Final = 30.0 * RAD_PER_DEG
 
 IN_BODY_AXES: Final = NodeCalibration(mounting=IDENTITY3, mag_mounting=IDENTITY3)
 """Calibration of samples that are calibrated already."""
+_PARTS: Final = (
+    ("mounting", "accel_matrix", "accel_bias_mps2", "accel_residual_mps2"),
+    ("mounting", "", "gyro_bias_radps", "gyro_residual_radps"),
+    ("mag_mounting", "mag_soft_iron", "mag_hard_iron_ut", "mag_residual_ut"),
+)
+"""Rotation, matrix, bias and residual of each sensor."""
 
 
 class CalibrationError(ValueError):
@@ -508,14 +514,6 @@ def corrected_by(calibration: NodeCalibration, correction: NodeCalibration) -> N
         if getattr(correction, residual):
             changes[residual] = getattr(correction, residual)
     return msgspec.structs.replace(calibration, **changes)
-
-
-_PARTS: Final = (
-    ("mounting", "accel_matrix", "accel_bias_mps2", "accel_residual_mps2"),
-    ("mounting", "", "gyro_bias_radps", "gyro_residual_radps"),
-    ("mag_mounting", "mag_soft_iron", "mag_hard_iron_ut", "mag_residual_ut"),
-)
-"""Rotation, matrix, bias and residual of each sensor."""
 
 
 def sides_of(samples: Sequence[NodeSamples]) -> set[int]:

@@ -40,6 +40,7 @@ _Rows = tuple[
 ]
 _FLAT: Final = 1e-3
 """Determinant below which a matrix counts as singular."""
+Number = TypeVar("Number", float, FloatArray)
 
 
 class NodeCalibration(Settings, frozen=True):
@@ -185,9 +186,6 @@ def mag_from_counts(raw: Int3, lsb_per_gauss: int) -> Vec3 | None:
         return None
     scale = mag_scale(lsb_per_gauss)
     return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
-
-
-Number = TypeVar("Number", float, FloatArray)
 
 
 def temperature_from_counts(raw: Number) -> Number:

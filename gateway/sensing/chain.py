@@ -30,6 +30,12 @@ from gateway.sensing.calibration import (
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BLANK: Final = (0, 0, 0)
+"""The accelerometer's counts after a reset of the MPU6050; its gyroscope gives none then either."""
+NEW_FIELD: Final = int(ImuFlags.MAG_NEW)
+FIELD_FLAGS: Final = NEW_FIELD | int(ImuFlags.MAG_ABSENT)
+ALL_FLAGS: Final = sum(map(int, ImuFlags))
+"""Plain numbers: a test with them costs a sixth, and hashing an enumeration calls Python."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +70,6 @@ class ImuLog:
                 strict=True,
             )
         ]
-
-
-BLANK: Final = (0, 0, 0)
-"""The accelerometer's counts after a reset of the MPU6050; its gyroscope gives none then either."""
-NEW_FIELD: Final = int(ImuFlags.MAG_NEW)
-FIELD_FLAGS: Final = NEW_FIELD | int(ImuFlags.MAG_ABSENT)
-ALL_FLAGS: Final = sum(map(int, ImuFlags))
-"""Plain numbers: a test with them costs a sixth, and hashing an enumeration calls Python."""
 
 
 class SensorChain:

@@ -33,6 +33,51 @@ from gateway.units import STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 
 AXES: Final = 3
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+Matrix3 = tuple[Vec3, Vec3, Vec3]
+FACE_UP: Final = np.array([1.0, -1.0, -1.0])
+ACCEL_RANGE: Final = 2
+"""+-8 g."""
+GYRO_RANGE: Final = 2
+"""+-1000 deg/s."""
+MAG_GAIN: Final = 1
+GYRO_LSB_PER_DPS: Final = (131.0, 65.5, 32.8, 16.4)
+INT16_MIN: Final = -32768
+INT16_MAX: Final = 32767
+ACCEL_DENSITY: Final = 400e-6 * STANDARD_GRAVITY_MPS2
+"""m/s2 per root hertz [1]_."""
+GYRO_DENSITY: Final = math.radians(0.005)
+"""rad/s per root hertz [1]_."""
+FILTER_HZ: Final = 94.0
+"""Noise bandwidth of the chip's own low-pass in the firmware's setting."""
+ACCEL_BIAS_MPS2: Final = 0.10
+GYRO_BIAS_RADPS: Final = math.radians(1.5)
+"""Spread of the constant biases; those left after the user has picked a usable chip."""
+ACCEL_WALK: Final = 0.001
+GYRO_WALK: Final = math.radians(0.004)
+"""Bias random walks, per root second."""
+SCALE_SPREAD: Final = 0.006
+MISALIGNMENT_RAD: Final = math.radians(0.4)
+GYRO_SHAKING: Final = 0.02
+"""rad/s of shaking for each m/s2 of it."""
+START_DEGC: Final = 29.0
+WARMING_DEGC: Final = 7.0
+WARMING_S: Final = 240.0
+MAG_RATE_HZ: Final = 75
+MAG_NOISE_UT: Final = 0.25
+HARD_IRON_UT: Final = 14.0
+SOFT_IRON_SPREAD: Final = 0.05
+MAG_LIMIT: Final = 2047
+MAG_OVERFLOW: Final = -4096
+FIELD_YEAR: Final = 2026.5
+SEA_LEVEL_SPREAD_PA: Final = 300.0
+BARO_NOISE_PA: Final = 3.0
+BARO_DRIFT_PA: Final = 8.0
+BARO_DRIFT_S: Final = 300.0
+IMU_BOOT_US: Final = 2_718_281
+"""The node's clock at the start of the simulation."""
+BARO_PHASE_US: Final = 3_300
 
 
 class White:
@@ -92,55 +137,6 @@ class Walk:
         values = np.cumsum(np.vstack([self._last, steps]), axis=0)
         self._last = values[-1]
         return values[1:]
-
-
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
-Matrix3 = tuple[Vec3, Vec3, Vec3]
-
-FACE_UP: Final = np.array([1.0, -1.0, -1.0])
-
-ACCEL_RANGE: Final = 2
-"""+-8 g."""
-GYRO_RANGE: Final = 2
-"""+-1000 deg/s."""
-MAG_GAIN: Final = 1
-GYRO_LSB_PER_DPS: Final = (131.0, 65.5, 32.8, 16.4)
-INT16_MIN: Final = -32768
-INT16_MAX: Final = 32767
-
-ACCEL_DENSITY: Final = 400e-6 * STANDARD_GRAVITY_MPS2
-"""m/s2 per root hertz [1]_."""
-GYRO_DENSITY: Final = math.radians(0.005)
-"""rad/s per root hertz [1]_."""
-FILTER_HZ: Final = 94.0
-"""Noise bandwidth of the chip's own low-pass in the firmware's setting."""
-ACCEL_BIAS_MPS2: Final = 0.10
-GYRO_BIAS_RADPS: Final = math.radians(1.5)
-"""Spread of the constant biases; those left after the user has picked a usable chip."""
-ACCEL_WALK: Final = 0.001
-GYRO_WALK: Final = math.radians(0.004)
-"""Bias random walks, per root second."""
-SCALE_SPREAD: Final = 0.006
-MISALIGNMENT_RAD: Final = math.radians(0.4)
-GYRO_SHAKING: Final = 0.02
-"""rad/s of shaking for each m/s2 of it."""
-START_DEGC: Final = 29.0
-WARMING_DEGC: Final = 7.0
-WARMING_S: Final = 240.0
-
-MAG_RATE_HZ: Final = 75
-MAG_NOISE_UT: Final = 0.25
-HARD_IRON_UT: Final = 14.0
-SOFT_IRON_SPREAD: Final = 0.05
-MAG_LIMIT: Final = 2047
-MAG_OVERFLOW: Final = -4096
-FIELD_YEAR: Final = 2026.5
-
-SEA_LEVEL_SPREAD_PA: Final = 300.0
-BARO_NOISE_PA: Final = 3.0
-BARO_DRIFT_PA: Final = 8.0
-BARO_DRIFT_S: Final = 300.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,11 +307,6 @@ def _vec3(values: FloatArray) -> Vec3:
 def _inverse(matrix: FloatArray) -> Matrix3:
     a, b, c = np.linalg.inv(matrix).astype(np.float64)
     return (_vec3(a), _vec3(b), _vec3(c))
-
-
-IMU_BOOT_US: Final = 2_718_281
-"""The node's clock at the start of the simulation."""
-BARO_PHASE_US: Final = 3_300
 
 
 class Chance(IntEnum):

@@ -62,6 +62,12 @@ CLOSURE_M: Final = 1e-6
 MAX_ITERATIONS: Final = 30
 STEP_WEIGHT: Final = 1e-2
 """Weight of a second's change against a metre's gap: enough to choose the least change."""
+LIFT_OFF: Final = 2
+ROLL_RADPS: Final = 1.1
+YAW_RADPS: Final = 0.8
+PITCH_RAD: Final = 1.3
+PITCH_RADPS: Final = 0.47
+"""Rates without a common period: within a minute every side of the aircraft points everywhere."""
 
 
 class Leg(NamedTuple):
@@ -101,7 +107,6 @@ PLAN: Final = (
 )
 """Rest, take-off roll, climb, left-hand circuit with a figure of eight, a steep full circle,
 descent, landing, roll-out, rest."""
-LIFT_OFF: Final = 2
 TOUCH_DOWN: Final = len(PLAN) - 2
 """Legs at whose start the aircraft leaves and meets the ground."""
 
@@ -364,13 +369,6 @@ def _coloured(rng: np.random.Generator, size: int, bandwidth_hz: float) -> Float
     noise = np.fft.irfft(gain * np.fft.rfft(white, axis=0), len(white), axis=0)[settled:]
     # A third-order Butterworth passes pi / 3 of its bandwidth's noise power.
     return np.asarray(noise / math.sqrt(bandwidth_hz * math.pi / 3.0 / (0.5 * GRID_HZ)))
-
-
-ROLL_RADPS: Final = 1.1
-YAW_RADPS: Final = 0.8
-PITCH_RAD: Final = 1.3
-PITCH_RADPS: Final = 0.47
-"""Rates without a common period: within a minute every side of the aircraft points everywhere."""
 
 
 class Workbench:

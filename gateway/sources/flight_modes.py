@@ -28,6 +28,14 @@ OF_BETAFLIGHT: Final = frozenset({"ANGL", "HOR", "AIR", "RTH", "WAIT", "OK", "!E
 NOT_ARMED: Final = frozenset({"OK", "WAIT", "!ERR"})
 FAILSAFE: Final = "!FS!"
 MARKS: Final = "*!?"
+VTOL_TYPES: Final = range(19, 26)
+"""The MAV_TYPEs of aircraft that take off vertically, which fly with the modes of aeroplanes."""
+_CLASSES: Final = (
+    ("PLANE_MODE", {FIXED_WING, *VTOL_TYPES}),
+    ("ROVER_MODE", {mavlink.MAV_TYPE_GROUND_ROVER, mavlink.MAV_TYPE_SURFACE_BOAT}),
+    ("SUB_MODE", {mavlink.MAV_TYPE_SUBMARINE}),
+    ("TRACKER_MODE", {mavlink.MAV_TYPE_ANTENNA_TRACKER}),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,16 +64,6 @@ def mode_of_text(text: str) -> TextMode:
     if (copter, plane) != (None, None):
         kind = FIXED_WING if copter is None else QUADROTOR
     return TextMode(name or "unknown", copter, plane, armed, kind, name in OF_BETAFLIGHT)
-
-
-VTOL_TYPES: Final = range(19, 26)
-"""The MAV_TYPEs of aircraft that take off vertically, which fly with the modes of aeroplanes."""
-_CLASSES: Final = (
-    ("PLANE_MODE", {FIXED_WING, *VTOL_TYPES}),
-    ("ROVER_MODE", {mavlink.MAV_TYPE_GROUND_ROVER, mavlink.MAV_TYPE_SURFACE_BOAT}),
-    ("SUB_MODE", {mavlink.MAV_TYPE_SUBMARINE}),
-    ("TRACKER_MODE", {mavlink.MAV_TYPE_ANTENNA_TRACKER}),
-)
 
 
 def ardupilot_mode(vehicle_type: int | None, number: int) -> str:

@@ -78,6 +78,10 @@ TEXTS: Final = ("mode", "text")
 KEYS: Final = (*VECTORS, *NUMBERS, *TEXTS, "armed")
 _NOTICE: Final = 5
 """MAV_SEVERITY_NOTICE."""
+REPORTED: Final = frozenset(
+    {"attitude", "heading", "airspeed", "mode", "text", "armed", "rssi", "link"}
+    | {"battery_v", "battery_a", "battery_mah", "battery_percent"}
+)
 
 
 class LineSplitter:
@@ -238,12 +242,6 @@ def _fix(values: Mapping[str, Any], node: NodeId, time_us: int) -> SourceRecord 
         h_acc_m=get("h_acc", NAN),
         v_acc_m=get("v_acc", NAN),
     )
-
-
-REPORTED: Final = frozenset(
-    {"attitude", "heading", "airspeed", "mode", "text", "armed", "rssi", "link"}
-    | {"battery_v", "battery_a", "battery_mah", "battery_percent"}
-)
 
 
 def _report(values: Mapping[str, Any], node: NodeId, time_us: int) -> VehicleReport | None:

@@ -27,6 +27,48 @@ UINT8_MAX: Final = 2**8 - 1
 UINT16_MAX: Final = 2**16 - 1
 UINT32_MAX: Final = 2**32 - 1
 FLOAT32_MAX: Final = 3.402_823_4e38
+MAVLINK_MSG_ID_PROTOCOL_VERSION: Final = 300
+MAVLINK_MSG_ID_COMPONENT_METADATA: Final = 397
+MAVLINK_MSG_ID_CONTROL_STATUS: Final = 512
+_Base: Any = mavlink.MAVLink_message
+AUTOPILOT_COMPONENT: Final = 1
+"""MAV_COMP_ID_AUTOPILOT1: clients look for a vehicle under no other component id."""
+_pack_head: Final = struct.Struct("<BBBBB5s").pack
+"""Start, length, two flag bytes, sequence, and the key: system, component and message."""
+_KEY: Final = struct.Struct("<BBHB")
+_INTEGER_LIMITS: Final = {
+    "int8_t": (-(2**7), 2**7 - 1),
+    "int16_t": (-(2**15), 2**15 - 1),
+    "int32_t": (-(2**31), 2**31 - 1),
+    "int64_t": (-(2**63), 2**63 - 1),
+    "uint8_t": (0, 2**8 - 1),
+    "uint16_t": (0, 2**16 - 1),
+    "uint32_t": (0, 2**32 - 1),
+    "uint64_t": (0, 2**64 - 1),
+}
+CAPABILITIES: Final = (
+    mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_FTP
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
+)
+MODE_NAME: Final = "Tracking"
+MAX_MODE_NAME: Final = 34
+AUTOPILOTS: Final[dict[str, int]] = {
+    "generic": mavlink.MAV_AUTOPILOT_GENERIC,
+    "ardupilotmega": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+    "px4": mavlink.MAV_AUTOPILOT_PX4,
+}
+"""By the setting `autopilot`."""
+CUSTOM_MODES: Final[dict[int, int]] = {
+    mavlink.MAV_AUTOPILOT_GENERIC: 0,
+    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: 0,
+    mavlink.MAV_AUTOPILOT_PX4: 1 << 16,
+}
+"""The mode in which a pilot flies by hand: MANUAL or STABILIZE of ArduPilot, main mode 1 of PX4."""
+UID_PREFIX: Final = int.from_bytes(b"mavgate")
 
 
 def whole(value: float, low: int, high: int, unknown: int) -> int:
@@ -75,13 +117,6 @@ def compass_cdeg(angle_rad: float) -> int:
 def compass_deg(angle_rad: float) -> int:
     """Turn an angle from north into 0 to 359 whole degrees; an unknown angle must not come here."""
     return round(math.degrees(angle_rad)) % 360
-
-
-MAVLINK_MSG_ID_PROTOCOL_VERSION: Final = 300
-MAVLINK_MSG_ID_COMPONENT_METADATA: Final = 397
-MAVLINK_MSG_ID_CONTROL_STATUS: Final = 512
-
-_Base: Any = mavlink.MAVLink_message
 
 
 class _Extra(_Base):  # type: ignore[misc]
@@ -180,24 +215,6 @@ class PackedMessage(msgspec.Struct, frozen=True, gc=False):
         return packed
 
 
-AUTOPILOT_COMPONENT: Final = 1
-"""MAV_COMP_ID_AUTOPILOT1: clients look for a vehicle under no other component id."""
-
-_pack_head: Final = struct.Struct("<BBBBB5s").pack
-"""Start, length, two flag bytes, sequence, and the key: system, component and message."""
-_KEY: Final = struct.Struct("<BBHB")
-_INTEGER_LIMITS: Final = {
-    "int8_t": (-(2**7), 2**7 - 1),
-    "int16_t": (-(2**15), 2**15 - 1),
-    "int32_t": (-(2**31), 2**31 - 1),
-    "int64_t": (-(2**63), 2**63 - 1),
-    "uint8_t": (0, 2**8 - 1),
-    "uint16_t": (0, 2**16 - 1),
-    "uint32_t": (0, 2**32 - 1),
-    "uint64_t": (0, 2**64 - 1),
-}
-
-
 class Encoder:
     """Frames of one system id; one sequence for all its messages."""
 
@@ -280,34 +297,6 @@ def _fit(value: float, kind: str) -> float:
     if math.isfinite(value) and kind == "float":
         return max(-FLOAT32_MAX, min(FLOAT32_MAX, value))
     return value
-
-
-CAPABILITIES: Final = (
-    mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
-    | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-    | mavlink.MAV_PROTOCOL_CAPABILITY_FTP
-    | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
-    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
-)
-
-MODE_NAME: Final = "Tracking"
-MAX_MODE_NAME: Final = 34
-
-AUTOPILOTS: Final[dict[str, int]] = {
-    "generic": mavlink.MAV_AUTOPILOT_GENERIC,
-    "ardupilotmega": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
-    "px4": mavlink.MAV_AUTOPILOT_PX4,
-}
-"""By the setting `autopilot`."""
-CUSTOM_MODES: Final[dict[int, int]] = {
-    mavlink.MAV_AUTOPILOT_GENERIC: 0,
-    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: 0,
-    mavlink.MAV_AUTOPILOT_PX4: 1 << 16,
-}
-"""The mode in which a pilot flies by hand: MANUAL or STABILIZE of ArduPilot, main mode 1 of PX4."""
-
-UID_PREFIX: Final = int.from_bytes(b"mavgate")
 
 
 def software_version(version: str) -> int:

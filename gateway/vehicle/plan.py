@@ -35,6 +35,23 @@ RELATIVE_FRAMES: Final = frozenset(
 )
 """Heights above home; the terrain, which is not known here, is taken to be as high as home."""
 GLOBAL_FRAMES: Final = ABSOLUTE_FRAMES | RELATIVE_FRAMES
+WANTED: Final = Geodesic.DISTANCE | Geodesic.AZIMUTH
+HomeSource = Literal["none", "gps", "operator"]
+LOCATED_FIXES = frozenset({GpsFixType.FIX_3D, GpsFixType.GNSS_AND_DEAD_RECKONING})
+"""Fix types whose latitude, longitude and height all come from satellites."""
+MISSION: Final[int] = mavlink.MAV_MISSION_TYPE_MISSION
+FENCE: Final[int] = mavlink.MAV_MISSION_TYPE_FENCE
+RALLY: Final[int] = mavlink.MAV_MISSION_TYPE_RALLY
+MAX_ITEMS: Final = {MISSION: 1000, FENCE: 500, RALLY: 100}
+"""More than a flight needs, with little memory for each aircraft."""
+ACCEPTED: Final[int] = mavlink.MAV_MISSION_ACCEPTED
+FLOAT_FRAMES: Final = {
+    mavlink.MAV_FRAME_GLOBAL_INT: mavlink.MAV_FRAME_GLOBAL,
+    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+    mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT: mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
+}
+"""The frames of MISSION_ITEM that correspond to those of integer coordinates."""
+KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally"}
 
 
 def is_on_earth(lat_deg: float, lon_deg: float) -> bool:
@@ -47,11 +64,6 @@ def height_amsl_m(height_m: float, frame: int, home_alt_m: float) -> float:
     relative = frame in RELATIVE_FRAMES
     height = height_m + home_alt_m if relative else height_m
     return height if math.isfinite(height) else math.nan
-
-
-WANTED: Final = Geodesic.DISTANCE | Geodesic.AZIMUTH
-
-HomeSource = Literal["none", "gps", "operator"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,10 +122,6 @@ class HomeParameters(Settings, frozen=True):
     ] = 0.0
 
 
-LOCATED_FIXES = frozenset({GpsFixType.FIX_3D, GpsFixType.GNSS_AND_DEAD_RECKONING})
-"""Fix types whose latitude, longitude and height all come from satellites."""
-
-
 def is_3d(fix: GpsFix) -> bool:
     """Return whether the receiver reports a three-dimensional fix."""
     return fix.fix_ok and fix.fix_type in LOCATED_FIXES
@@ -138,14 +146,6 @@ def distance_and_bearing(here: Location, there: Location) -> tuple[float, float]
     return (found["s12"], math.radians(found["azi1"]))
 
 
-MISSION: Final[int] = mavlink.MAV_MISSION_TYPE_MISSION
-FENCE: Final[int] = mavlink.MAV_MISSION_TYPE_FENCE
-RALLY: Final[int] = mavlink.MAV_MISSION_TYPE_RALLY
-
-MAX_ITEMS: Final = {MISSION: 1000, FENCE: 500, RALLY: 100}
-"""More than a flight needs, with little memory for each aircraft."""
-
-
 def _commands(*names: str) -> frozenset[int]:
     return frozenset(getattr(mavlink, f"MAV_CMD_{name}") for name in names)
 
@@ -165,15 +165,6 @@ LOCATED_COMMANDS: Final = (
     )
 )
 """Commands whose parameters 5 to 7 are a location, if their frame is a global one."""
-
-ACCEPTED: Final[int] = mavlink.MAV_MISSION_ACCEPTED
-
-FLOAT_FRAMES: Final = {
-    mavlink.MAV_FRAME_GLOBAL_INT: mavlink.MAV_FRAME_GLOBAL,
-    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-    mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT: mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
-}
-"""The frames of MISSION_ITEM that correspond to those of integer coordinates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,9 +241,6 @@ def check_item(item: Item, kind: int) -> int:
 def _integer(value: float) -> int:
     limit = 2**31 - 1
     return round(max(-limit, min(limit, value))) if math.isfinite(value) else limit
-
-
-KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally"}
 
 
 class StoredPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -11,6 +11,11 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Settings
 from gateway.vehicle.plan import StoredPlan
 
+CRITICAL: Final = mavlink.MAV_SEVERITY_CRITICAL
+WARNING: Final = mavlink.MAV_SEVERITY_WARNING
+NOTICE: Final = mavlink.MAV_SEVERITY_NOTICE
+INFO: Final = mavlink.MAV_SEVERITY_INFO
+
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
     """A message before it is encoded: to the client that asked, or to all."""
@@ -37,12 +42,6 @@ class Request:
     def reply(self, message: Any) -> Reply:
         """Answer the client that asked."""
         return Reply(message, self.client_id)
-
-
-CRITICAL: Final = mavlink.MAV_SEVERITY_CRITICAL
-WARNING: Final = mavlink.MAV_SEVERITY_WARNING
-NOTICE: Final = mavlink.MAV_SEVERITY_NOTICE
-INFO: Final = mavlink.MAV_SEVERITY_INFO
 
 
 @dataclass(frozen=True, slots=True)

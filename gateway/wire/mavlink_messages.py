@@ -13,6 +13,11 @@ from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
 _TYPES: Final = {"uint8_t": "B", "uint16_t": "H", "uint32_t": "I", "char": "c"}
+NO_TARGET: Final = -1
+MAX_ID_V1: Final = 255
+"""Messages with greater ids do not exist in MAVLink 1."""
+WIDEST: Final = 8
+"""Bytes of the widest type of a field."""
 
 
 class MissingMessage:
@@ -50,12 +55,6 @@ MISSING: Final = {
 
 DEFINITIONS: Final[dict[int, Any]] = {**dialect.mavlink_map, **MISSING}
 """Every message that is known here, by id: name and fields as pymavlink lays them out."""
-
-NO_TARGET: Final = -1
-MAX_ID_V1: Final = 255
-"""Messages with greater ids do not exist in MAVLink 1."""
-WIDEST: Final = 8
-"""Bytes of the widest type of a field."""
 
 
 @cache

@@ -56,6 +56,16 @@ BEHIND_S: Final = 2.0
 _TIMESTAMP: Final = slice(-12, -HASH_BYTES)
 """Between the link id and the hash."""
 _TIMESTAMP_BYTES: Final = 6
+RESERVE_TICKS: Final = 5 * TICKS_PER_S
+MAX_KEYS: Final = 16
+MAX_STREAMS: Final = 256
+"""Only holders of the key make streams, so untrusted clients never reach this."""
+KeptTimestamps = dict[str, dict[str, int]]
+"""By the id of the key, then by the stream as `link.system.component`."""
+WINDOW_TICKS: Final = 5 * TICKS_PER_S
+"""Zenoh gives up a message that has waited for 5 s, so none is overtaken for longer."""
+MAX_WINDOWS: Final = 1024
+"""Streams of one site; only a holder of the passphrase begins one."""
 
 
 def key_from_passphrase(passphrase: str) -> bytes:
@@ -153,15 +163,6 @@ class FrameSigner:
         return edit_frame(frame, sequence=sequence, sign=sign) or frame
 
 
-RESERVE_TICKS: Final = 5 * TICKS_PER_S
-MAX_KEYS: Final = 16
-MAX_STREAMS: Final = 256
-"""Only holders of the key make streams, so untrusted clients never reach this."""
-
-KeptTimestamps = dict[str, dict[str, int]]
-"""By the id of the key, then by the stream as `link.system.component`."""
-
-
 class SigningTimestamps:
     """The timestamps that one vehicle has accepted, also in earlier runs."""
 
@@ -235,12 +236,6 @@ class Verifier:
             # Two digits: one sender is one entry, whatever the delay of its frames.
             return f"its clock is {float(f'{behind_s:.2g}'):.0f} s behind"
         return "its signing timestamp was used before"
-
-
-WINDOW_TICKS: Final = 5 * TICKS_PER_S
-"""Zenoh gives up a message that has waited for 5 s, so none is overtaken for longer."""
-MAX_WINDOWS: Final = 1024
-"""Streams of one site; only a holder of the passphrase begins one."""
 
 
 @dataclass(slots=True)

@@ -53,6 +53,52 @@ _GPS_NAMES: Final = {
     9: "u-blox 9",
     10: "u-blox M10",
 }
+PROTOCOL_VERSION: Final = 1
+MAX_PAYLOAD: Final = 32
+"""One nRF24L01+ packet."""
+MAX_FOREIGN: Final = 60
+"""Of a packet of another program, its header included."""
+PIPES: Final = 6
+NO_PIPE: Final = 0xFF
+"""Of a frame that carries no radio payload."""
+ACCEL_RANGES_G: Final = (2, 4, 8, 16)
+GYRO_RANGES_DPS: Final = (250, 500, 1000, 2000)
+HMC5883L_LSB_PER_GAUSS: Final = (1370, 1090, 820, 660, 440, 390, 330, 230)
+MAG_LSB_PER_GAUSS: Final = (*HMC5883L_LSB_PER_GAUSS, 3000, 3750)
+"""Scale codes: 0 to 7 the HMC5883L's gains, 8 the QMC5883L and 9 the QMC5883P at +-8 G."""
+_FRAME_HEADER: Final = struct.Struct("<BBBI")
+_HEADER: Final = struct.Struct("<BBHI")
+_RADIO_HEAD: Final = struct.Struct("<BBBIBBHI")
+"""A frame's header and that of the payload in it."""
+_SIGNAL: Final = struct.Struct("<Bb")
+_SNR_PER_DB: Final = 4
+_unpack_head: Final = _RADIO_HEAD.unpack_from
+_IMU: Final = struct.Struct("<3h3h3hhHB")
+_BARO: Final = struct.Struct("<Ih")
+_GPS_FIX: Final = struct.Struct("<Iiii3hBB")
+_GPS_QUALITY: Final = struct.Struct("<IHHHHHhBBBBBBBB")
+_NODE_STATUS_1_0: Final = struct.Struct("<BBBBBHHHHHH")
+"""Of firmware 1.0: without the chips."""
+_NODE_STATUS: Final = struct.Struct("<BBBBBHHHHHHBBBBH")
+_RECEIVER_HEAD: Final = struct.Struct("<BBHB")
+_PIPE: Final = struct.Struct("<IIH")
+_NODES: Final = tuple(NodeId(address >> 3, address & 0x7) for address in range(256))
+"""Indexed by the address byte."""
+_LEAST_ADDRESS: Final = 1 << 3
+"""No vehicle has the id 0."""
+_imu_flags = cache(ImuFlags)
+"""They are the same for many samples; a lookup costs a tenth of making them."""
+_MAG_SHIFT: Final = 4
+_GYRO_SHIFT: Final = 2
+_RANGES: Final = tuple(
+    (byte & 3, byte >> _GYRO_SHIFT & 3, byte >> _MAG_SHIFT)
+    for byte in range(len(MAG_LSB_PER_GAUSS) << _MAG_SHIFT)
+)
+"""Codes of accelerometer, gyroscope and magnetometer by their byte; another byte is a fault."""
+_RADIO_SHIFT: Final = 4
+_RESET_MASK: Final = 0x0F
+_RADIO_STATES: Final = frozenset(RadioState)
+_Unpack = Callable[[bytes, int], tuple[int, ...]]
 
 
 class Chips(msgspec.Struct, frozen=True, gc=False):
@@ -93,22 +139,6 @@ def _gps_name(chips: Chips) -> str:
     return f"{name}, acknowledges nothing" if ignores_settings else name
 
 
-PROTOCOL_VERSION: Final = 1
-MAX_PAYLOAD: Final = 32
-"""One nRF24L01+ packet."""
-MAX_FOREIGN: Final = 60
-"""Of a packet of another program, its header included."""
-PIPES: Final = 6
-NO_PIPE: Final = 0xFF
-"""Of a frame that carries no radio payload."""
-
-ACCEL_RANGES_G: Final = (2, 4, 8, 16)
-GYRO_RANGES_DPS: Final = (250, 500, 1000, 2000)
-HMC5883L_LSB_PER_GAUSS: Final = (1370, 1090, 820, 660, 440, 390, 330, 230)
-MAG_LSB_PER_GAUSS: Final = (*HMC5883L_LSB_PER_GAUSS, 3000, 3750)
-"""Scale codes: 0 to 7 the HMC5883L's gains, 8 the QMC5883L and 9 the QMC5883P at +-8 G."""
-
-
 class FrameKind(IntEnum):
     """Kinds of the receiver's frames: low nibble of a frame's first byte."""
 
@@ -130,40 +160,7 @@ class PayloadKind(IntEnum):
     NODE_STATUS = 5
 
 
-_FRAME_HEADER: Final = struct.Struct("<BBBI")
-_HEADER: Final = struct.Struct("<BBHI")
-_RADIO_HEAD: Final = struct.Struct("<BBBIBBHI")
-"""A frame's header and that of the payload in it."""
-_SIGNAL: Final = struct.Struct("<Bb")
-_SNR_PER_DB: Final = 4
-_unpack_head: Final = _RADIO_HEAD.unpack_from
-_IMU: Final = struct.Struct("<3h3h3hhHB")
-_BARO: Final = struct.Struct("<Ih")
-_GPS_FIX: Final = struct.Struct("<Iiii3hBB")
-_GPS_QUALITY: Final = struct.Struct("<IHHHHHhBBBBBBBB")
-_NODE_STATUS_1_0: Final = struct.Struct("<BBBBBHHHHHH")
-"""Of firmware 1.0: without the chips."""
-_NODE_STATUS: Final = struct.Struct("<BBBBBHHHHHHBBBBH")
-_RECEIVER_HEAD: Final = struct.Struct("<BBHB")
-_PIPE: Final = struct.Struct("<IIH")
-
-_NODES: Final = tuple(NodeId(address >> 3, address & 0x7) for address in range(256))
-"""Indexed by the address byte."""
-_LEAST_ADDRESS: Final = 1 << 3
-"""No vehicle has the id 0."""
 _RADIO_FIRST: Final = PROTOCOL_VERSION << 4 | FrameKind.RADIO
-_imu_flags = cache(ImuFlags)
-"""They are the same for many samples; a lookup costs a tenth of making them."""
-
-_MAG_SHIFT: Final = 4
-_GYRO_SHIFT: Final = 2
-_RANGES: Final = tuple(
-    (byte & 3, byte >> _GYRO_SHIFT & 3, byte >> _MAG_SHIFT)
-    for byte in range(len(MAG_LSB_PER_GAUSS) << _MAG_SHIFT)
-)
-"""Codes of accelerometer, gyroscope and magnetometer by their byte; another byte is a fault."""
-_RADIO_SHIFT: Final = 4
-_RESET_MASK: Final = 0x0F
 
 
 class Header(msgspec.Struct, frozen=True, gc=False):
@@ -553,9 +550,7 @@ def _read_node_status(words: tuple[int, ...]) -> NodeStatusPayload:
 
 
 _KINDS: Final = frozenset(PayloadKind)
-_RADIO_STATES: Final = frozenset(RadioState)
 
-_Unpack = Callable[[bytes, int], tuple[int, ...]]
 _Read = Callable[[tuple[int, ...]], Payload]
 _BODIES: Final[dict[tuple[int, int], tuple[_Unpack, _Read]]] = {
     (PROTOCOL_VERSION << 4 | kind, layout.size): (layout.unpack_from, read)

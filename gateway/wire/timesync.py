@@ -56,6 +56,10 @@ clock was halted, or which restarted and is beyond its last stamp again."""
 AHEAD_US: Final = 50_000
 """More than the line can err by between two packets. Either the line was learned in a queue, and
 the next packets say the same, or a single stamp is wrong and must not move all that follow."""
+RECENT: Final = 15
+"""Number of newest fixes used of each aircraft: some seconds."""
+ENOUGH: Final = 3
+"""Number of fixes before an aircraft is used: the first may hold the time of the last flight."""
 
 
 class _Point(msgspec.Struct, frozen=True, gc=False):
@@ -242,12 +246,6 @@ def _turn(a: _Point, b: _Point, c: _Point) -> int:
 
 def _remote_us(point: _Point) -> int:
     return point.remote_us
-
-
-RECENT: Final = 15
-"""Number of newest fixes used of each aircraft: some seconds."""
-ENOUGH: Final = 3
-"""Number of fixes before an aircraft is used: the first may hold the time of the last flight."""
 
 
 class GpsTime:

@@ -71,6 +71,13 @@ BARS: Final = {
 }
 """Titles of the bars, by the column of the table."""
 TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
+SAME_POSITION_DEG: Final = 0.5
+"""Flights further apart do not fit on one map."""
+NAMES: Final = ("A", "B")
+AB_COLOURS: Final = (style.BLUE, style.RED)
+INTERVAL_S: Final = 1.0
+"""Fixes a second of the paper's receiver, by the gaps that its figure 13 shows."""
+COLOUR_MAP: Final = "cividis_r"
 
 
 def estimators(case: Case) -> Section | None:
@@ -203,12 +210,6 @@ def _draw_bars(axes: Axes, table: pd.DataFrame, column: str) -> None:
     axes.grid(visible=False, axis="y")
 
 
-SAME_POSITION_DEG: Final = 0.5
-"""Flights further apart do not fit on one map."""
-NAMES: Final = ("A", "B")
-AB_COLOURS: Final = (style.BLUE, style.RED)
-
-
 def comparison(a: Case, b: Case) -> Section:
     """Build the section."""
     same = np.array_equal(a.flight.time_us, b.flight.time_us)
@@ -299,11 +300,6 @@ def _draw_map(a: Case, b: Case, width_in: float) -> Figure:
     axes.set(xlabel="east of A's first fix (m)", ylabel="north of A's first fix (m)")
     style.legend_above(axes)
     return figure
-
-
-INTERVAL_S: Final = 1.0
-"""Fixes a second of the paper's receiver, by the gaps that its figure 13 shows."""
-COLOUR_MAP: Final = "cividis_r"
 
 
 def weights(case: Case) -> Section | None:

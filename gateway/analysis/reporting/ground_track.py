@@ -24,6 +24,8 @@ GYRO: Final = "gyroscope alone"
 COMPASS: Final = "gyroscope and compass"
 COLOURS: Final = (style.ORANGE, style.GREEN, style.BLUE)
 MAX_STEP_S: Final = 0.5
+EXCERPT_S: Final = 12.0
+ROUND_M: Final = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000)
 
 
 def orientation(case: Case) -> Section | None:
@@ -170,10 +172,6 @@ def continuous(q_nb: FloatArray) -> FloatArray:
     nearer = np.einsum("ij,ij->i", q_nb[1:], q_nb[:-1]) < 0.0
     signs = np.where(np.cumsum(np.concatenate([[False], nearer])) % 2 == 1, -1.0, 1.0)
     return np.asarray(q_nb * signs[:, np.newaxis])
-
-
-EXCERPT_S: Final = 12.0
-ROUND_M: Final = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000)
 
 
 def ground_track(case: Case) -> Section | None:

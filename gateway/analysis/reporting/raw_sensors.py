@@ -26,6 +26,9 @@ from gateway.recordings.figures import NODE_WRAP_US, lost_share, missing_samples
 EXCERPT_S: Final = 6.0
 COLOURS: Final = {"butterworth": style.BLUE, "chebyshev": style.RED}
 AXIS_NAMES: Final = "xyz"
+AXIS_COLOURS: Final = (style.BLUE, style.RED, style.GREEN)
+MIN_REST_S: Final = 5.0
+MAX_DOTS: Final = 800
 
 
 def acceleration(case: Case) -> Section:
@@ -138,11 +141,6 @@ def _draw_response(case: Case, width_in: float) -> Figure:
     axes[0].set_ylim(bottom=-60.0)
     style.legend_above(axes[0], 2)
     return figure
-
-
-AXIS_COLOURS: Final = (style.BLUE, style.RED, style.GREEN)
-MIN_REST_S: Final = 5.0
-MAX_DOTS: Final = 800
 
 
 def noise(case: Case) -> Section:

@@ -49,6 +49,16 @@ LATE_US: Final = 60 * US_PER_S
 
 MAX_LISTED: Final = 20
 """Unknown columns that are named."""
+_GROUPS_NEED: Final = [
+    (group, [COLUMNS.index(name) for name in names])
+    for group, names in (
+        (SI, NEEDED - {"time_us"}),
+        (MAG, VECTORS[2]),
+        (BARO, ("baro_pressure_pa",)),
+        (GPS, ("gps_lat_dege7", "gps_lon_dege7")),
+    )
+]
+"""Without these columns there is no such record."""
 
 
 class Column(Settings, frozen=True):
@@ -303,18 +313,6 @@ def _cells(values: dict[str, FloatArray]) -> FloatArray:
     for group, needed in _GROUPS_NEED:
         cells[np.isnan(cells[:, needed]).any(axis=1), group] = NAN
     return cells
-
-
-_GROUPS_NEED: Final = [
-    (group, [COLUMNS.index(name) for name in names])
-    for group, names in (
-        (SI, NEEDED - {"time_us"}),
-        (MAG, VECTORS[2]),
-        (BARO, ("baro_pressure_pa",)),
-        (GPS, ("gps_lat_dege7", "gps_lon_dege7")),
-    )
-]
-"""Without these columns there is no such record."""
 
 
 def _cells_of(line: str, delimiter: str) -> list[str]:

@@ -79,6 +79,13 @@ has lost count of the weeks, which begin again every 1024."""
 
 Message = Any
 """With the columns of its format as attributes, in the units of the format."""
+Item = TypeVar("Item")
+MAGIC: Final = b"\xa3\x95"
+MAX_LOOKED_AT: Final = 20_000
+"""Messages of a kind that are read to find the first sensor with data: an hour of GPS."""
+SYSTEM_IDS: Final = ("SYSID_THISMAV", "MAV_SYSID")
+_AS_TEXT: Final = bytes(range(128)) + b"?" * 128
+_SKIPPED: Final = re.compile(r"Skipped (\d+) bad bytes")
 
 
 def sensor_of(name: str, message: Message) -> int:
@@ -99,9 +106,6 @@ def own_us_of(name: str, message: Message) -> int:
     if time_us is not None:
         return int(time_us)
     return 1000 * int(message.T if KINDS.get(name) == "GPS" else message.TimeMS)
-
-
-Item = TypeVar("Item")
 
 
 class LogClock(Generic[Item]):
@@ -316,14 +320,6 @@ class ArdupilotReader:
         return [
             autopilot_state(time_us, from_euler(*angles_rad), position, vel_n_mps or UNKNOWN_VEC3)
         ]
-
-
-MAGIC: Final = b"\xa3\x95"
-MAX_LOOKED_AT: Final = 20_000
-"""Messages of a kind that are read to find the first sensor with data: an hour of GPS."""
-SYSTEM_IDS: Final = ("SYSID_THISMAV", "MAV_SYSID")
-_AS_TEXT: Final = bytes(range(128)) + b"?" * 128
-_SKIPPED: Final = re.compile(r"Skipped (\d+) bad bytes")
 
 
 class PrintedDamage(io.TextIOBase):

@@ -27,6 +27,22 @@ from gateway.vehicle.plan import is_good_enough
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
 """Of the vehicles' lines: alpha, blue, green, red."""
 _NOT_IN_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+FIRST_US: Final = 0
+LAST_US: Final = 253_402_300_799 * US_PER_S
+"""The ends of the calendar that other programs read: 1970 to 9999."""
+HALF_TURN_DEG = 180.0
+INFO: Final = 6
+"""MAV_SEVERITY_INFO; texts that are less severe are for programmers."""
+_MARKED: Final = re.compile(r"Marked (-?\d+\.\d+), (-?\d+\.\d+)")
+"""The gateway's STATUSTEXT for a marked position."""
+INTERVAL_US: Final = US_PER_S // 5
+"""A map shows no more than five points a second."""
+MAX_MARKERS: Final = 10_000
+"""Of one vehicle; a flood of texts must not fill the memory."""
+ATTITUDE_AGE_US: Final = US_PER_S
+"""An attitude counts for the positions of so much time before it."""
+DRAWN_IDS: Final = (HOME_POSITION_ID,)
+"""Messages that are drawn besides positions, attitude and texts."""
 
 
 class MarkerKind(StrEnum):
@@ -59,11 +75,6 @@ class VehicleTrack:
     def points(self) -> list[TrackPoint]:
         """All points of the track."""
         return [*chain.from_iterable(self.segments)]
-
-
-FIRST_US: Final = 0
-LAST_US: Final = 253_402_300_799 * US_PER_S
-"""The ends of the calendar that other programs read: 1970 to 9999."""
 
 
 def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
@@ -195,9 +206,6 @@ def iso_time(unix_us: int) -> str:
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{fraction_us // 1000:03d}Z"
 
 
-HALF_TURN_DEG = 180.0
-
-
 def to_geojson(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
     """Write a flight: a line per vehicle with `coordTimes`; home, marks and events as points."""
     yield f'{{"type":"FeatureCollection","name":{json.dumps(name)},"features":['
@@ -275,20 +283,6 @@ def _position(point: TrackPoint) -> list[float]:
     return [*position, round(point.alt_amsl_m, 2)] if math.isfinite(point.alt_amsl_m) else position
 
 
-INFO: Final = 6
-"""MAV_SEVERITY_INFO; texts that are less severe are for programmers."""
-_MARKED: Final = re.compile(r"Marked (-?\d+\.\d+), (-?\d+\.\d+)")
-"""The gateway's STATUSTEXT for a marked position."""
-INTERVAL_US: Final = US_PER_S // 5
-"""A map shows no more than five points a second."""
-MAX_MARKERS: Final = 10_000
-"""Of one vehicle; a flood of texts must not fill the memory."""
-
-
-ATTITUDE_AGE_US: Final = US_PER_S
-"""An attitude counts for the positions of so much time before it."""
-
-
 class _Drawing:
     """One vehicle while its flight is read."""
 
@@ -344,10 +338,6 @@ class _Drawing:
             kind = MarkerKind.MARK if marked or text.startswith(REMARK) else MarkerKind.EVENT
             self.track.markers.append(MapMarker(kind, text.removeprefix(REMARK), at))
         return self.track if points else None
-
-
-DRAWN_IDS: Final = (HOME_POSITION_ID,)
-"""Messages that are drawn besides positions, attitude and texts."""
 
 
 def tracks_of_messages(messages: Iterable[VehicleMessage]) -> list[VehicleTrack]:

@@ -46,6 +46,24 @@ _ATTITUDE_FLAGS: Final = int(NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID)
 _POSITION_FLAGS: Final = int(
     NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
 )
+VELOCITY_AGE_US: Final = US_PER_S // 2
+"""An older velocity down is not used."""
+ATTITUDE: Final = mavlink.MAVLINK_MSG_ID_ATTITUDE
+POSITION: Final = mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
+PRESSURE: Final = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
+FIX: Final = mavlink.MAVLINK_MSG_ID_GPS_RAW_INT
+IMU_RANK: Final = {
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 3,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: 2,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: 1,
+}
+_WANTED: Final = np.array([*IMU_RANK, ATTITUDE, POSITION, PRESSURE, FIX])
+_POSITION_LAYOUT: Final = layout_of(POSITION)
+_OWN_CLOCKS: Final = frozenset({FIX, PRESSURE, ATTITUDE})
+"""Kinds of messages that may have another clock than the IMU's."""
+_BARO, _GPS, _IMU = 1, 2, 3
+"""The order of a row: a record that is not behind its predecessor in it begins a row."""
+_HEAD: Final = slice(0, 4)
 
 
 def imu_cells(message_id: int, values: Fields, time_us: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -162,10 +180,6 @@ def _of_position(positions: Fields, position_at: IntArray, name: str, scale: flo
     return found
 
 
-VELOCITY_AGE_US: Final = US_PER_S // 2
-"""An older velocity down is not used."""
-
-
 def autopilot_state(
     time_us: int, q_nb: Quat, position: tuple[float, float, float] | None, vel_n_mps: Vec3
 ) -> NavState:
@@ -180,26 +194,6 @@ def autopilot_state(
     return NavState(
         time_us, q_nb, unknown, lat_deg, lon_deg, alt_m, vel_n_mps, unknown, unknown, unknown, flags
     )
-
-
-ATTITUDE: Final = mavlink.MAVLINK_MSG_ID_ATTITUDE
-POSITION: Final = mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
-PRESSURE: Final = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
-FIX: Final = mavlink.MAVLINK_MSG_ID_GPS_RAW_INT
-IMU_RANK: Final = {
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 3,
-    mavlink.MAVLINK_MSG_ID_RAW_IMU: 2,
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: 1,
-}
-_WANTED: Final = np.array([*IMU_RANK, ATTITUDE, POSITION, PRESSURE, FIX])
-_POSITION_LAYOUT: Final = layout_of(POSITION)
-
-_OWN_CLOCKS: Final = frozenset({FIX, PRESSURE, ATTITUDE})
-"""Kinds of messages that may have another clock than the IMU's."""
-
-_BARO, _GPS, _IMU = 1, 2, 3
-"""The order of a row: a record that is not behind its predecessor in it begins a row."""
-_HEAD: Final = slice(0, 4)
 
 
 class AutopilotReader:

@@ -50,6 +50,19 @@ debug."""
 COVARIANCE_UNKNOWN, COVARIANCE_APPROXIMATED, COVARIANCE_DIAGONAL = 0, 1, 2
 """foxglove.PositionCovarianceType."""
 UNKNOWN_U32: Final = 0xFFFFFFFF
+_TEXT: Final = {"type": "string"}
+_INTEGER: Final = {"type": "integer"}
+_TIME: Final = {
+    "title": "time",
+    "type": "object",
+    "properties": {"sec": _INTEGER, "nsec": _INTEGER},
+}
+_AXIS: Final = {"type": "number"}
+_NUMBERS: Final = {"float": "number", "double": "number", "char": "string"}
+GPS_ID: Final = MESSAGE_IDS["GPS_RAW_INT"]
+ESTIMATOR_ID: Final = MESSAGE_IDS["ESTIMATOR_STATUS"]
+LAST_US: Final = (2**64 - 1) // 1000
+"""Later times are written as this one, the last that the format holds, µs."""
 
 
 def _object(title: str, **fields: Any) -> dict[str, Any]:
@@ -60,14 +73,6 @@ def _number(description: str) -> dict[str, Any]:
     return {"type": "number", "description": description}
 
 
-_TEXT: Final = {"type": "string"}
-_INTEGER: Final = {"type": "integer"}
-_TIME: Final = {
-    "title": "time",
-    "type": "object",
-    "properties": {"sec": _INTEGER, "nsec": _INTEGER},
-}
-_AXIS: Final = {"type": "number"}
 _VECTOR3: Final = _object("foxglove.Vector3", x=_AXIS, y=_AXIS, z=_AXIS)
 _QUATERNION: Final = _object("foxglove.Quaternion", x=_AXIS, y=_AXIS, z=_AXIS, w=_AXIS)
 
@@ -125,8 +130,6 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     )
 }
 
-_NUMBERS: Final = {"float": "number", "double": "number", "char": "string"}
-
 
 @cache
 def schema_of_message(kind: Any) -> dict[str, Any]:
@@ -173,10 +176,6 @@ class _Vehicle:
     """Standard deviations along each level axis, and of the height, by the estimator."""
     gps_accuracy_m: tuple[float, float] | None = None
     """The same by the GPS receiver."""
-
-
-GPS_ID: Final = MESSAGE_IDS["GPS_RAW_INT"]
-ESTIMATOR_ID: Final = MESSAGE_IDS["ESTIMATOR_STATUS"]
 
 
 class FoxgloveView:
@@ -302,10 +301,6 @@ def _fix(
 def _time(time_us: int) -> dict[str, int]:
     seconds, us = divmod(time_us, US_PER_S)
     return {"sec": seconds, "nsec": us * 1000}
-
-
-LAST_US: Final = (2**64 - 1) // 1000
-"""Later times are written as this one, the last that the format holds, µs."""
 
 
 class _Topics:

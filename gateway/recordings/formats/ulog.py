@@ -92,6 +92,28 @@ Topic = Mapping[str, NDArray[Any]]
 Row = Mapping[str, Any]
 Instance = tuple[str, int]
 """Name of a topic, and which of its instances it is, counted from 0."""
+_WHOLE: Final = frozenset((
+    "time_utc_usec", "fix_type", "satellites_used", "timestamp", "timestamp_time_relative",
+    "magnetometer_timestamp_relative", "baro_timestamp_relative",
+))  # fmt: skip
+"""Fields that are whole numbers."""
+_GPS_FIELDS: Final = (
+    ("lat", "latitude_deg"), ("lon", "longitude_deg"), ("vel_n_m_s",), ("vel_e_m_s",),
+    ("vel_d_m_s",),
+)  # fmt: skip
+_BARO_DEGC: Final = ("ambient_temperature", "baro_temp_celcius", "temperature")
+_VELOCITY: Final = (("vx", "vel_n"), ("vy", "vel_e"), ("vz", "vel_d"))
+MS_PER_S: Final = 1000.0
+SYSTEM_ID: Final = "MAV_SYS_ID"
+HEADER: Final = 3
+"""Bytes before the content of a message."""
+MOST_VALUES: Final = 1 << 16
+"""In a row: a message has no more bytes."""
+BROKEN: Final = (
+    *(ValueError, TypeError, LookupError, AttributeError, OverflowError),
+    *(struct.error, RecursionError),
+)
+"""Exceptions of pyulog on a damaged log, in addition to its own."""
 
 
 def in_order(topic: Topic) -> tuple[Topic, int]:
@@ -294,21 +316,10 @@ class _Newest:
         return self._row if is_new else {}
 
 
-_WHOLE: Final = frozenset((
-    "time_utc_usec", "fix_type", "satellites_used", "timestamp", "timestamp_time_relative",
-    "magnetometer_timestamp_relative", "baro_timestamp_relative",
-))  # fmt: skip
-"""Fields that are whole numbers."""
-
-
 def _axes(name: str, count: int = 3) -> tuple[str, ...]:
     return tuple(f"{name}[{axis}]" for axis in range(count))
 
 
-_GPS_FIELDS: Final = (
-    ("lat", "latitude_deg"), ("lon", "longitude_deg"), ("vel_n_m_s",), ("vel_e_m_s",),
-    ("vel_d_m_s",),
-)  # fmt: skip
 _NEEDED: Final[dict[str, tuple[tuple[str, ...], ...]]] = {
     "sensor_combined": tuple(
         (axis,) for axis in (*_axes("accelerometer_m_s2"), *_axes("gyro_rad"))
@@ -350,10 +361,6 @@ def _has_data(kind: str, topic: Topic) -> bool:
     return any(bool((np.isfinite(values) & (values != 0)).any()) for values in fields)
 
 
-_BARO_DEGC: Final = ("ambient_temperature", "baro_temp_celcius", "temperature")
-_VELOCITY: Final = (("vx", "vel_n"), ("vy", "vel_e"), ("vz", "vel_d"))
-
-
 def _vector(row: Row, name: str) -> Vec3:
     return (row[f"{name}[0]"], row[f"{name}[1]"], row[f"{name}[2]"])
 
@@ -371,19 +378,6 @@ def _dege7(row: Row, degrees: str, dege7: str) -> int:
 def _metres(row: Row, metres: str, millimetres: str) -> float:
     value: float = row[metres] if metres in row else row.get(millimetres, NAN) * M_PER_MM
     return value
-
-
-MS_PER_S: Final = 1000.0
-SYSTEM_ID: Final = "MAV_SYS_ID"
-HEADER: Final = 3
-"""Bytes before the content of a message."""
-MOST_VALUES: Final = 1 << 16
-"""In a row: a message has no more bytes."""
-BROKEN: Final = (
-    *(ValueError, TypeError, LookupError, AttributeError, OverflowError),
-    *(struct.error, RecursionError),
-)
-"""Exceptions of pyulog on a damaged log, in addition to its own."""
 
 
 class _Content(io.BufferedReader):

@@ -57,6 +57,55 @@ SHORTHANDS: Final = {
     mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION: MAVLINK_MSG_ID_PROTOCOL_VERSION,
 }
 """Older commands for single messages."""
+Outcome = tuple[int, list[Answer]]
+"""Result of a command, and what is sent after its acknowledgement."""
+Explain = Callable[[str, int], list[Answer]]
+"""Announces a text to all at a time: why something was refused."""
+Build = Callable[[int, int], Any]
+"""Builds the message of an id at a time; None if there is nothing yet."""
+MAX_FAST_STREAMS: Final = 64
+"""Each costs an encoding of its own."""
+MIN_INTERVAL_US: Final = 1000
+MIN_TIMED_INTERVAL_US: Final = 20_000
+"""Of messages that no sample carries: faster they would only repeat themselves."""
+MAX_REQUESTED: Final = 1024
+"""Clients come and go; the oldest requested intervals are discarded first."""
+KEEPS_CLIENTS_US: Final = US_PER_S
+"""A client that gets fewer heartbeats loses the vehicle."""
+DEFAULT: Final = 0
+NONE: Final = -1
+HEARTBEAT: Final = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+_GROUPS: Final[dict[int, tuple[int, ...]]] = {
+    mavlink.MAV_DATA_STREAM_RAW_SENSORS: (
+        mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
+    ),
+    mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (
+        mavlink.MAVLINK_MSG_ID_SYS_STATUS,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+        mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
+    ),
+    mavlink.MAV_DATA_STREAM_POSITION: (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,),
+    mavlink.MAV_DATA_STREAM_EXTRA1: (
+        mavlink.MAVLINK_MSG_ID_ATTITUDE,
+        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+    ),
+    mavlink.MAV_DATA_STREAM_EXTRA2: (mavlink.MAVLINK_MSG_ID_VFR_HUD,),
+}
+DATA_STREAMS: Final = _GROUPS | {mavlink.MAV_DATA_STREAM_ALL: tuple(sum(_GROUPS.values(), ()))}
+"""REQUEST_DATA_STREAM's groups, as autopilots fill them."""
+RECORDER_TIMEOUT_US: Final = 10 * US_PER_S
+MAX_WAITING: Final = 16
+"""Ground stations that may wait for the recorder."""
+SIGNING_SETUP: Final = (
+    "Signing is not set up by MAVLink: set vehicle.signing_passphrase in the settings file "
+    "and run mavgate reload"
+)
+SINGLE: Final = {
+    "AUTOPILOT_VERSION_REQUEST": mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
+    "SET_GPS_GLOBAL_ORIGIN": mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+}
+"""Older requests of one message. The origin is the first home; the answer has the one in use."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,14 +136,7 @@ class Command:
         )
 
 
-Outcome = tuple[int, list[Answer]]
-"""Result of a command, and what is sent after its acknowledgement."""
-
 Handler = Callable[[Command, int], Outcome]
-Explain = Callable[[str, int], list[Answer]]
-"""Announces a text to all at a time: why something was refused."""
-Build = Callable[[int, int], Any]
-"""Builds the message of an id at a time; None if there is nothing yet."""
 
 
 def read_command(request: Request) -> Command:
@@ -116,42 +158,6 @@ def whole(value: float) -> int:
 def requested_message(command: Command) -> int:
     """Return the id of the message that a command requests."""
     return SHORTHANDS.get(command.number) or whole(command.params[0])
-
-
-MAX_FAST_STREAMS: Final = 64
-"""Each costs an encoding of its own."""
-MIN_INTERVAL_US: Final = 1000
-MIN_TIMED_INTERVAL_US: Final = 20_000
-"""Of messages that no sample carries: faster they would only repeat themselves."""
-MAX_REQUESTED: Final = 1024
-"""Clients come and go; the oldest requested intervals are discarded first."""
-KEEPS_CLIENTS_US: Final = US_PER_S
-"""A client that gets fewer heartbeats loses the vehicle."""
-
-DEFAULT: Final = 0
-NONE: Final = -1
-
-HEARTBEAT: Final = mavlink.MAVLINK_MSG_ID_HEARTBEAT
-
-_GROUPS: Final[dict[int, tuple[int, ...]]] = {
-    mavlink.MAV_DATA_STREAM_RAW_SENSORS: (
-        mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
-        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
-    ),
-    mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (
-        mavlink.MAVLINK_MSG_ID_SYS_STATUS,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
-        mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
-    ),
-    mavlink.MAV_DATA_STREAM_POSITION: (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,),
-    mavlink.MAV_DATA_STREAM_EXTRA1: (
-        mavlink.MAVLINK_MSG_ID_ATTITUDE,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
-    ),
-    mavlink.MAV_DATA_STREAM_EXTRA2: (mavlink.MAVLINK_MSG_ID_VFR_HUD,),
-}
-DATA_STREAMS: Final = _GROUPS | {mavlink.MAV_DATA_STREAM_ALL: tuple(sum(_GROUPS.values(), ()))}
-"""REQUEST_DATA_STREAM's groups, as autopilots fill them."""
 
 
 class IntervalService(Service):
@@ -337,11 +343,6 @@ class CommandService(Service):
         return (NOT_NOW, []) if message is None else (ACCEPTED, [Reply(message, client_id)])
 
 
-RECORDER_TIMEOUT_US: Final = 10 * US_PER_S
-MAX_WAITING: Final = 16
-"""Ground stations that may wait for the recorder."""
-
-
 class RecordingService(Service):
     """Start and stop the recording."""
 
@@ -402,18 +403,6 @@ class RecordingService(Service):
         self._waiting.clear()
         self._due_us = None
         return acks
-
-
-SIGNING_SETUP: Final = (
-    "Signing is not set up by MAVLink: set vehicle.signing_passphrase in the settings file "
-    "and run mavgate reload"
-)
-
-SINGLE: Final = {
-    "AUTOPILOT_VERSION_REQUEST": mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-    "SET_GPS_GLOBAL_ORIGIN": mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
-}
-"""Older requests of one message. The origin is the first home; the answer has the one in use."""
 
 
 def _no_extended_parameter(_request: Any) -> Any:

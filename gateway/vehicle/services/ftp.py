@@ -38,6 +38,9 @@ _SCHEME: Final = re.compile(r"mftp://(?:\[?;comp=\d+\]?)?", re.IGNORECASE)
 
 ACK: Final = mavlink.MAV_FTP_OPCODE_ACK
 NAK: Final = mavlink.MAV_FTP_OPCODE_NAK
+WRITING: Final = range(mavlink.MAV_FTP_OPCODE_CREATEFILE, mavlink.MAV_FTP_OPCODE_RENAME + 1)
+File = bytes | Callable[[Request, str], bytes]
+"""The content, or a function of the request and the query of its path, such as `withdefaults=1`."""
 
 
 class Opcode(IntEnum):
@@ -51,9 +54,6 @@ class Opcode(IntEnum):
     READ_FILE = 5
     CALC_FILE_CRC32 = 14
     BURST_READ_FILE = 15
-
-
-WRITING: Final = range(mavlink.MAV_FTP_OPCODE_CREATEFILE, mavlink.MAV_FTP_OPCODE_RENAME + 1)
 
 
 class FtpError(IntEnum):
@@ -108,10 +108,6 @@ class _Session:
     client_id: int
     may_change: bool
     content: bytes
-
-
-File = bytes | Callable[[Request, str], bytes]
-"""The content, or a function of the request and the query of its path, such as `withdefaults=1`."""
 
 
 class FtpService(TransferService):

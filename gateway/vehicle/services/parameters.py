@@ -88,6 +88,38 @@ ABBREVIATIONS: Final = {
 }
 
 VOWELS: Final = frozenset("AEIOU")
+AXES: Final = ("X", "Y", "Z")
+ANGLES: Final = (("ROLL", "Roll", 180.0), ("PIT", "Pitch", 90.0), ("YAW", "Yaw", 180.0))
+"""The angles of a rotation: in names, in texts, and how far each goes to either side."""
+RotationAngles = tuple[
+    Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)],
+    Annotated[float, msgspec.Meta(ge=-90.0, le=90.0)],
+    Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)],
+]
+PACKED: Final = 0x671B
+PACKED_WITH_DEFAULTS: Final = 0x671C
+PACKED_FLOAT: Final = 4
+PACKED_COMMON: Final = 15
+"""Magic numbers, type and longest shared name of the packed file."""
+INTEGER_CODES: Final = {
+    mavlink.MAV_PARAM_TYPE_UINT8: "<Bxxx",
+    mavlink.MAV_PARAM_TYPE_INT8: "<bxxx",
+    mavlink.MAV_PARAM_TYPE_UINT16: "<Hxx",
+    mavlink.MAV_PARAM_TYPE_INT16: "<hxx",
+    mavlink.MAV_PARAM_TYPE_UINT32: "<I",
+    mavlink.MAV_PARAM_TYPE_INT32: "<i",
+}
+GENERAL_PATH: Final = "/general.json"
+PARAMETER_PATH: Final = "/parameter.json.xz"
+"""Also for programs that know the names. Each vehicle announces names of its own, since programs
+download under the name: two vehicles would overwrite each other's file."""
+TYPE_PARAMETER: Final = 1
+"""COMP_METADATA_TYPE_PARAMETER."""
+MAX_SHORT: Final = 100
+"""Length of a short description in the specification's schema."""
+POSITION_PLACES: Final = 7
+PLACES: Final = 4
+"""Decimal places shown of a latitude or longitude, and of other numbers."""
 
 
 def without_unit(key: str) -> str:
@@ -117,32 +149,6 @@ def _shorten(word: str) -> str:
         if word[index] in VOWELS:
             return word[:index] + word[index + 1 :]
     return word[:-1]
-
-
-AXES: Final = ("X", "Y", "Z")
-ANGLES: Final = (("ROLL", "Roll", 180.0), ("PIT", "Pitch", 90.0), ("YAW", "Yaw", 180.0))
-"""The angles of a rotation: in names, in texts, and how far each goes to either side."""
-
-RotationAngles = tuple[
-    Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)],
-    Annotated[float, msgspec.Meta(ge=-90.0, le=90.0)],
-    Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)],
-]
-
-PACKED: Final = 0x671B
-PACKED_WITH_DEFAULTS: Final = 0x671C
-PACKED_FLOAT: Final = 4
-PACKED_COMMON: Final = 15
-"""Magic numbers, type and longest shared name of the packed file."""
-
-INTEGER_CODES: Final = {
-    mavlink.MAV_PARAM_TYPE_UINT8: "<Bxxx",
-    mavlink.MAV_PARAM_TYPE_INT8: "<bxxx",
-    mavlink.MAV_PARAM_TYPE_UINT16: "<Hxx",
-    mavlink.MAV_PARAM_TYPE_INT16: "<hxx",
-    mavlink.MAV_PARAM_TYPE_UINT32: "<I",
-    mavlink.MAV_PARAM_TYPE_INT32: "<i",
-}
 
 
 def decode_value(value: float, kind: int) -> float:
@@ -334,19 +340,6 @@ def _replaced(tree: Settings, path: tuple[str, ...], value: Any) -> Settings:
     key, *rest = path
     inner = _replaced(getattr(tree, key), tuple(rest), value) if rest else value
     return msgspec.structs.replace(tree, **{key: inner})
-
-
-GENERAL_PATH: Final = "/general.json"
-PARAMETER_PATH: Final = "/parameter.json.xz"
-"""Also for programs that know the names. Each vehicle announces names of its own, since programs
-download under the name: two vehicles would overwrite each other's file."""
-TYPE_PARAMETER: Final = 1
-"""COMP_METADATA_TYPE_PARAMETER."""
-MAX_SHORT: Final = 100
-"""Length of a short description in the specification's schema."""
-POSITION_PLACES: Final = 7
-PLACES: Final = 4
-"""Decimal places shown of a latitude or longitude, and of other numbers."""
 
 
 class Metadata:

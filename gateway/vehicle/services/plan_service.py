@@ -47,6 +47,12 @@ from gateway.vehicle.services.missions import MissionService
 from gateway.vehicle.telemetry.messages import has_position
 from gateway.vehicle.telemetry.telemetry import Telemetry
 
+NUMBERS: Final = {"lat_deg": "lat_deg", "lon_deg": "lon_deg", "alt_m": "alt_amsl_m"}
+"""Parameters of home, and the fields of `Location` that they set."""
+Say = Callable[[StatusText, int], list[Answer]]
+USE_CURRENT: Final = 1
+"""First parameter of MAV_CMD_DO_SET_HOME."""
+
 
 class Mark:
     """The marked location of one vehicle."""
@@ -97,15 +103,6 @@ class Mark:
             aspd_error=0.0,
             xtrack_error=NAN,
         )
-
-
-NUMBERS: Final = {"lat_deg": "lat_deg", "lon_deg": "lon_deg", "alt_m": "alt_amsl_m"}
-"""Parameters of home, and the fields of `Location` that they set."""
-
-Say = Callable[[StatusText, int], list[Answer]]
-
-USE_CURRENT: Final = 1
-"""First parameter of MAV_CMD_DO_SET_HOME."""
 
 
 class PlanService:

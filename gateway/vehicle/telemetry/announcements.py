@@ -32,6 +32,47 @@ REFILL_US: Final = US_PER_S // 2
 TEXT_BYTES: Final = 50
 """Length of STATUSTEXT's text; longer texts go out in chunks."""
 MAX_TEXT_BYTES: Final = 4 * TEXT_BYTES
+FlagTexts = tuple[tuple[NavFlags | ImuFlags, str, str], ...]
+"""A flag, the text when it rises, and the text when it falls."""
+FLAG_TEXTS: Final[FlagTexts] = (
+    (NavFlags.ATTITUDE_VALID, "Attitude valid", "Attitude not valid"),
+    (NavFlags.HEADING_VALID, "Heading valid", "Heading not valid"),
+    (NavFlags.DEAD_RECKONING, "Position is dead-reckoned", "Position follows GPS again"),
+    (NavFlags.GPS_REJECTED, "GPS fixes rejected", "GPS accepted again"),
+    (
+        NavFlags.MAG_MISPLACED,
+        "Compass axes wrong, not used: check CAL_MAG_MNT",
+        "Compass axes right again",
+    ),
+    (NavFlags.MAG_DISTURBED, "Magnetic field disturbed", "Magnetic field normal again"),
+    (NavFlags.SENSOR_FAULT, "Sensor fault", "Sensors OK again"),
+)
+"""Of the estimator. DEGRADED only repeats one of the others."""
+CAUSES: Final[dict[NavFlags | ImuFlags, tuple[str, ...]]] = {
+    NavFlags.ATTITUDE_VALID: ("SENSOR_FAULT",),
+    NavFlags.HEADING_VALID: ("ATTITUDE_VALID", "SENSOR_FAULT", "MAG_DISTURBED", "MAG_MISPLACED"),
+    NavFlags.MAG_DISTURBED: ("MAG_MISPLACED",),
+    NavFlags.DEAD_RECKONING: ("GPS", "GPS_REJECTED"),
+}
+"""Topics that a flag may follow from."""
+GOOD_FLAGS: Final = (NavFlags.ATTITUDE_VALID, NavFlags.HEADING_VALID)
+GPS_FIX: Final = Finding("GPS", True, StatusText(INFO, "GPS fix"))
+GPS_LOST: Final = Finding("GPS", False, StatusText(WARNING, "GPS fix lost"))
+CALIBRATION_TEXTS: Final[FlagTexts] = (
+    (ImuFlags.MAG_UNCALIBRATED, "Compass not calibrated", "Compass calibrated"),
+    (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer not calibrated", "Accelerometer calibrated"),
+)
+"""Of the sensors."""
+UNCALIBRATED: Final = sum(int(flag) for flag, _, _ in CALIBRATION_TEXTS)
+INERTIAL: Final = UNCALIBRATED & ~int(ImuFlags.MAG_UNCALIBRATED)
+LATENCY_PARAMETER: Final = "REF_GPS_LATENCY"
+LATENCY_SETTLED_US: Final = 60 * US_PER_S
+LATENCY_SPREAD_S: Final = 0.02
+"""A latency that has not changed by more for so long has converged; the first manoeuvres of a
+flight may show one that is 0.08 s off."""
+RESTART_REPORTS: Final = 10
+"""Reports of the link, one a second, in which restarts of a node are counted."""
+MANY_RESTARTS: Final = 3
 
 
 @dataclass(slots=True)
@@ -146,51 +187,6 @@ def chunks(text: StatusText, number: int = 1) -> list[Answer]:
         )
         for chunk, start in enumerate(starts)
     ]
-
-
-FlagTexts = tuple[tuple[NavFlags | ImuFlags, str, str], ...]
-"""A flag, the text when it rises, and the text when it falls."""
-
-FLAG_TEXTS: Final[FlagTexts] = (
-    (NavFlags.ATTITUDE_VALID, "Attitude valid", "Attitude not valid"),
-    (NavFlags.HEADING_VALID, "Heading valid", "Heading not valid"),
-    (NavFlags.DEAD_RECKONING, "Position is dead-reckoned", "Position follows GPS again"),
-    (NavFlags.GPS_REJECTED, "GPS fixes rejected", "GPS accepted again"),
-    (
-        NavFlags.MAG_MISPLACED,
-        "Compass axes wrong, not used: check CAL_MAG_MNT",
-        "Compass axes right again",
-    ),
-    (NavFlags.MAG_DISTURBED, "Magnetic field disturbed", "Magnetic field normal again"),
-    (NavFlags.SENSOR_FAULT, "Sensor fault", "Sensors OK again"),
-)
-"""Of the estimator. DEGRADED only repeats one of the others."""
-CAUSES: Final[dict[NavFlags | ImuFlags, tuple[str, ...]]] = {
-    NavFlags.ATTITUDE_VALID: ("SENSOR_FAULT",),
-    NavFlags.HEADING_VALID: ("ATTITUDE_VALID", "SENSOR_FAULT", "MAG_DISTURBED", "MAG_MISPLACED"),
-    NavFlags.MAG_DISTURBED: ("MAG_MISPLACED",),
-    NavFlags.DEAD_RECKONING: ("GPS", "GPS_REJECTED"),
-}
-"""Topics that a flag may follow from."""
-GOOD_FLAGS: Final = (NavFlags.ATTITUDE_VALID, NavFlags.HEADING_VALID)
-GPS_FIX: Final = Finding("GPS", True, StatusText(INFO, "GPS fix"))
-GPS_LOST: Final = Finding("GPS", False, StatusText(WARNING, "GPS fix lost"))
-CALIBRATION_TEXTS: Final[FlagTexts] = (
-    (ImuFlags.MAG_UNCALIBRATED, "Compass not calibrated", "Compass calibrated"),
-    (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer not calibrated", "Accelerometer calibrated"),
-)
-"""Of the sensors."""
-UNCALIBRATED: Final = sum(int(flag) for flag, _, _ in CALIBRATION_TEXTS)
-INERTIAL: Final = UNCALIBRATED & ~int(ImuFlags.MAG_UNCALIBRATED)
-
-LATENCY_PARAMETER: Final = "REF_GPS_LATENCY"
-LATENCY_SETTLED_US: Final = 60 * US_PER_S
-LATENCY_SPREAD_S: Final = 0.02
-"""A latency that has not changed by more for so long has converged; the first manoeuvres of a
-flight may show one that is 0.08 s off."""
-RESTART_REPORTS: Final = 10
-"""Reports of the link, one a second, in which restarts of a node are counted."""
-MANY_RESTARTS: Final = 3
 
 
 class Announcements(Announcer):

@@ -59,6 +59,23 @@ BATTERY_TIMEOUT_US: Final = 10 * US_PER_S
 """Autopilots report it every second or so, over links that lose many frames."""
 CELLS: Final = 10
 MV: Final = 1e3
+GYRO: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+ACCEL: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+MAG: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
+PRESSURE: Final = mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
+GPS: Final = mavlink.MAV_SYS_STATUS_SENSOR_GPS
+AHRS: Final = mavlink.MAV_SYS_STATUS_AHRS
+LOGGING: Final = mavlink.MAV_SYS_STATUS_LOGGING
+GEOFENCE: Final = mavlink.MAV_SYS_STATUS_GEOFENCE
+PREARM: Final = mavlink.MAV_SYS_STATUS_PREARM_CHECK
+SENSORS: Final = (GYRO, ACCEL, MAG, PRESSURE, GPS)
+NODE_SENSORS: Final = (
+    (NODE_IMU, GYRO | ACCEL),
+    (1 << 1, MAG),
+    (1 << 2, PRESSURE),
+    (NODE_GPS, GPS),
+)
+"""Bits of NodeStatus' masks, and the sensors they stand for."""
 
 
 class Finding(NamedTuple):
@@ -119,26 +136,6 @@ class _Board:
 
 def _finding(topic: str, name: str, is_bad: bool, bad: str, good: str) -> Finding:
     return Finding(topic, is_bad, status_text(is_bad, f"{name}: {bad}", f"{name}: {good}"))
-
-
-GYRO: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
-ACCEL: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-MAG: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_MAG
-PRESSURE: Final = mavlink.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
-GPS: Final = mavlink.MAV_SYS_STATUS_SENSOR_GPS
-AHRS: Final = mavlink.MAV_SYS_STATUS_AHRS
-LOGGING: Final = mavlink.MAV_SYS_STATUS_LOGGING
-GEOFENCE: Final = mavlink.MAV_SYS_STATUS_GEOFENCE
-PREARM: Final = mavlink.MAV_SYS_STATUS_PREARM_CHECK
-
-SENSORS: Final = (GYRO, ACCEL, MAG, PRESSURE, GPS)
-NODE_SENSORS: Final = (
-    (NODE_IMU, GYRO | ACCEL),
-    (1 << 1, MAG),
-    (1 << 2, PRESSURE),
-    (NODE_GPS, GPS),
-)
-"""Bits of NodeStatus' masks, and the sensors they stand for."""
 
 
 class Health:

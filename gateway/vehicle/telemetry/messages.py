@@ -85,6 +85,19 @@ VFR_HUD: Final = encoding.MessagePacker(mavlink.MAVLink_vfr_hud_message)
 HIGHRES_IMU: Final = encoding.MessagePacker(mavlink.MAVLink_highres_imu_message)
 SCALED_PRESSURE: Final = encoding.MessagePacker(mavlink.MAVLink_scaled_pressure_message)
 """The messages of samples, which are sent most often."""
+FAILURES: Final = (
+    (GPS, mavlink.HL_FAILURE_FLAG_GPS),
+    (PRESSURE, mavlink.HL_FAILURE_FLAG_ABSOLUTE_PRESSURE),
+    (ACCEL, mavlink.HL_FAILURE_FLAG_3D_ACCEL),
+    (GYRO, mavlink.HL_FAILURE_FLAG_3D_GYRO),
+    (MAG, mavlink.HL_FAILURE_FLAG_3D_MAG),
+)
+HALF_DEGREES: Final = 2.0
+FIFTHS: Final = 5.0
+"""Of a metre a second."""
+TENTHS: Final = 10.0
+INT8_MAX: Final = 127
+UNKNOWN_PERCENT: Final = -1
 
 
 def boot_ms(time_us: int) -> int:
@@ -418,21 +431,6 @@ def home_position(home: Home) -> Any:
 def system_time(now_us: int, unix_us: int | None) -> Any:
     """Encode the clocks; the Unix time is 0 until a GPS fix provides it."""
     return mavlink.MAVLink_system_time_message(unix_us or 0, boot_ms(now_us))
-
-
-FAILURES: Final = (
-    (GPS, mavlink.HL_FAILURE_FLAG_GPS),
-    (PRESSURE, mavlink.HL_FAILURE_FLAG_ABSOLUTE_PRESSURE),
-    (ACCEL, mavlink.HL_FAILURE_FLAG_3D_ACCEL),
-    (GYRO, mavlink.HL_FAILURE_FLAG_3D_GYRO),
-    (MAG, mavlink.HL_FAILURE_FLAG_3D_MAG),
-)
-HALF_DEGREES: Final = 2.0
-FIFTHS: Final = 5.0
-"""Of a metre a second."""
-TENTHS: Final = 10.0
-INT8_MAX: Final = 127
-UNKNOWN_PERCENT: Final = -1
 
 
 def high_latency2(

@@ -37,6 +37,14 @@ MAX_MODES: Final = 64
 OWN_MODE: Final = 1000
 """Number of the first mode that ArduPilot does not have; its own are below 100."""
 LOW_PERCENT: Final = 20.0
+_NUMBERS: Final = (
+    "heading_rad",
+    "climb_mps",
+    "airspeed_mps",
+    "alt_home_m",
+    "throttle_percent",
+    "link_quality_percent",
+)
 
 
 class Reported:
@@ -151,16 +159,6 @@ class Reported:
         """Return a battery unless its report is old."""
         time_us, battery = self.batteries.get(number, (0, None))
         return battery if battery is not None and now_us - time_us <= timeout_us else None
-
-
-_NUMBERS: Final = (
-    "heading_rad",
-    "climb_mps",
-    "airspeed_mps",
-    "alt_home_m",
-    "throttle_percent",
-    "link_quality_percent",
-)
 
 
 def battery_status(battery: BatteryReport) -> Any:

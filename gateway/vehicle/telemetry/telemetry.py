@@ -64,6 +64,58 @@ VELOCITY_VALID: Final = int(NavFlags.VELOCITY_VALID)
 ALTITUDE_VALID: Final = int(NavFlags.ALTITUDE_VALID)
 SLOW: Final = 0.5
 """Share of the take-off limits below which the vehicle has come down."""
+STATE_MESSAGES: Final = {
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: 0,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10_000,
+    mavlink.MAVLINK_MSG_ID_VFR_HUD: 30_000,
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 50_000,
+}
+"""Carried by IMU samples, each from so many µs after the first: at the usual rates no sample
+carries more than two. The quaternion comes first, because its latency is the visible one."""
+REQUESTED_MESSAGES: Final = (
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU,
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    mavlink.MAVLINK_MSG_ID_ODOMETRY,
+    mavlink.MAVLINK_MSG_ID_ALTITUDE,
+)
+"""Carried by IMU samples too, but sent only to clients that request them: QGroundControl that has
+received one ALTITUDE shows altitudes of no other message."""
+CARRIED_MESSAGES: Final = frozenset({*STATE_MESSAGES, *REQUESTED_MESSAGES})
+TIMED_MESSAGES: Final = (
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS,
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
+    mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
+    mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
+    mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2,
+    mavlink.MAVLINK_MSG_ID_RADIO_STATUS,
+    mavlink.MAVLINK_MSG_ID_RC_CHANNELS,
+)
+ATTITUDE_MESSAGES: Final = (
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE,
+)
+"""Carried by the attitudes that the vehicle's own autopilot reports."""
+POSITION_MESSAGES: Final = (
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    mavlink.MAVLINK_MSG_ID_VFR_HUD,
+)
+"""Carried by fixes where there is no IMU."""
+APART_US: Final = 13_000
+"""Between the first of one timed message and of the next: with equal intervals, they would else be
+due at the same moments for ever. No multiple of 10 ms: they would come with samples at 100 Hz."""
+HEARTBEAT_HZ: Final = 1.0
+"""Clients expect heartbeats at this rate, and take a vehicle without them for lost."""
+RADIO_STATUS_HZ: Final = 1.0
+"""As often as the links are counted."""
+RC_CHANNELS_HZ: Final = 5.0
+"""Only of a vehicle whose own autopilot reports its link or channels."""
+Builder = Callable[[int], Any]
 
 
 class Motion:
@@ -93,67 +145,6 @@ class Motion:
         hold_us = LANDING_US if self.landed_state == IN_AIR else HOLD_US
         if state.time_us - self._since_us >= hold_us:
             self.landed_state = candidate
-
-
-STATE_MESSAGES: Final = {
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: 0,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 10_000,
-    mavlink.MAVLINK_MSG_ID_VFR_HUD: 30_000,
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 50_000,
-}
-"""Carried by IMU samples, each from so many µs after the first: at the usual rates no sample
-carries more than two. The quaternion comes first, because its latency is the visible one."""
-
-REQUESTED_MESSAGES: Final = (
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU,
-    mavlink.MAVLINK_MSG_ID_RAW_IMU,
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-    mavlink.MAVLINK_MSG_ID_ODOMETRY,
-    mavlink.MAVLINK_MSG_ID_ALTITUDE,
-)
-"""Carried by IMU samples too, but sent only to clients that request them: QGroundControl that has
-received one ALTITUDE shows altitudes of no other message."""
-
-CARRIED_MESSAGES: Final = frozenset({*STATE_MESSAGES, *REQUESTED_MESSAGES})
-
-TIMED_MESSAGES: Final = (
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS,
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION,
-    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
-    mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
-    mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
-    mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2,
-    mavlink.MAVLINK_MSG_ID_RADIO_STATUS,
-    mavlink.MAVLINK_MSG_ID_RC_CHANNELS,
-)
-
-ATTITUDE_MESSAGES: Final = (
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE,
-)
-"""Carried by the attitudes that the vehicle's own autopilot reports."""
-POSITION_MESSAGES: Final = (
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-    mavlink.MAVLINK_MSG_ID_VFR_HUD,
-)
-"""Carried by fixes where there is no IMU."""
-
-APART_US: Final = 13_000
-"""Between the first of one timed message and of the next: with equal intervals, they would else be
-due at the same moments for ever. No multiple of 10 ms: they would come with samples at 100 Hz."""
-HEARTBEAT_HZ: Final = 1.0
-"""Clients expect heartbeats at this rate, and take a vehicle without them for lost."""
-
-RADIO_STATUS_HZ: Final = 1.0
-"""As often as the links are counted."""
-RC_CHANNELS_HZ: Final = 5.0
-"""Only of a vehicle whose own autopilot reports its link or channels."""
-
-Builder = Callable[[int], Any]
 
 
 class Telemetry:
