@@ -24,6 +24,8 @@ from gateway.cli.support.terminal import in_words, refuse, refusing
 from gateway.live.log_limit import LogLimit
 from gateway.printable import PrintableFormatter, printable, reason_of
 
+log = logging.getLogger(__name__)
+
 MODULES: Final = {
     "live.run": ("run",),
     "live.demo": ("demo",),
@@ -132,6 +134,7 @@ MOVED: Final = {
 
 SMALL: Final = frozenset({"ports", "flash", "record", *MODULES["live.clients"]})
 """Commands that mostly ask a gateway: the extensions are loaded if one reads the settings."""
+ISO: Final = "%Y-%m-%d %H:%M:%S"
 
 
 def load_command(name: str) -> Any:
@@ -254,8 +257,6 @@ class LazyGroup(TyperGroup):
         return found
 
 
-ISO: Final = "%Y-%m-%d %H:%M:%S"
-log = logging.getLogger(__name__)
 app = typer.Typer(
     name="mavgate",
     cls=LazyGroup,

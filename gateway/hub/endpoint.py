@@ -58,6 +58,49 @@ from gateway.wire.mavlink_messages import MESSAGE_IDS
 _HOST: Final = re.compile(r"[\w.-]+")
 NULL_ORIGIN: Final = "null"
 """The origin that a browser sends for a page opened as a file, and for any sandboxed page."""
+MAX_NAME: Final = 64
+MAX_MESSAGE_ID: Final = (1 << 24) - 1
+MIN_RATE_HZ: Final = 0.001
+NO_MESSAGES: Final = -1
+"""An interval that stops a message."""
+BITS_PER_BYTE: Final = 10
+"""On a serial line: start bit, eight data bits, stop bit."""
+MAX_BUDGET: Final = 1_000_000_000
+MS_PER_S: Final = 1000
+MAX_WAIT_MS: Final = 1000
+MAX_PACK_BYTES: Final = 1100
+"""Routers on the way cut or drop datagrams beyond 1120 bytes."""
+MAX_PORT: Final = 65535
+DEFAULT_BAUD: Final = 57600
+MIN_BAUD: Final = 300
+MAX_BAUD: Final = 12_000_000
+"""The fastest USB adapters."""
+SITE_KEYS: Final = "site"
+LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
+"""How Zenoh names an address."""
+RAW_KEYS: Final = "mavlink_raw"
+JSON_KEYS: Final = "mavlink_json"
+SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
+"""A segment of a Zenoh key or of a path without special characters."""
+COMMON_OPTIONS: Final = frozenset(
+    {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted", "monitor", "mavlink"}
+    | {*FILTER_OPTIONS, "as"}
+)
+ALIASES: Final = {
+    "udpin": "udp-listen",
+    "udps": "udp-listen",
+    "udpout": "udp",
+    "udpc": "udp",
+    "udpbcast": "udp-broadcast",
+    "udpb": "udp-broadcast",
+    "mcast": "udp-multicast",
+    "tcpin": "tcp-listen",
+    "tcps": "tcp-listen",
+    "tcpout": "tcp",
+    "tcpc": "tcp",
+    "wsserver": "ws-listen",
+}
+ANY_ADDRESS: Final = "0.0.0.0"
 
 
 def admits_page(origin: str, local_host: str, named: Collection[str]) -> bool:
@@ -120,34 +163,6 @@ def is_loopback(host: str) -> bool:
     return address is not None and address.is_loopback
 
 
-MAX_NAME: Final = 64
-MAX_MESSAGE_ID: Final = (1 << 24) - 1
-MIN_RATE_HZ: Final = 0.001
-
-NO_MESSAGES: Final = -1
-"""An interval that stops a message."""
-BITS_PER_BYTE: Final = 10
-"""On a serial line: start bit, eight data bits, stop bit."""
-MAX_BUDGET: Final = 1_000_000_000
-MS_PER_S: Final = 1000
-MAX_WAIT_MS: Final = 1000
-MAX_PACK_BYTES: Final = 1100
-"""Routers on the way cut or drop datagrams beyond 1120 bytes."""
-MAX_PORT: Final = 65535
-DEFAULT_BAUD: Final = 57600
-MIN_BAUD: Final = 300
-MAX_BAUD: Final = 12_000_000
-"""The fastest USB adapters."""
-
-SITE_KEYS: Final = "site"
-LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
-"""How Zenoh names an address."""
-RAW_KEYS: Final = "mavlink_raw"
-JSON_KEYS: Final = "mavlink_json"
-SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
-"""A segment of a Zenoh key or of a path without special characters."""
-
-
 class EndpointKind(StrEnum):
     """How an endpoint reaches its peers; the word before the URL's first colon."""
 
@@ -171,10 +186,6 @@ OPEN_TO_ALL: Final = LISTENING | {EndpointKind.UDP_BROADCAST, EndpointKind.UDP_M
 """Kinds that serve unknown peers. They bind to an address; looking up a name would block."""
 TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
 """Kinds that use TLS."""
-COMMON_OPTIONS: Final = frozenset(
-    {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted", "monitor", "mavlink"}
-    | {*FILTER_OPTIONS, "as"}
-)
 OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.WS: frozenset({"path"}),
     EndpointKind.WSS: frozenset({"path"}),
@@ -200,21 +211,6 @@ class AddedKind:
 
 
 ADDED_KINDS: Final[dict[str, AddedKind]] = {}
-ALIASES: Final = {
-    "udpin": "udp-listen",
-    "udps": "udp-listen",
-    "udpout": "udp",
-    "udpc": "udp",
-    "udpbcast": "udp-broadcast",
-    "udpb": "udp-broadcast",
-    "mcast": "udp-multicast",
-    "tcpin": "tcp-listen",
-    "tcps": "tcp-listen",
-    "tcpout": "tcp",
-    "tcpc": "tcp",
-    "wsserver": "ws-listen",
-}
-ANY_ADDRESS: Final = "0.0.0.0"
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,6 +28,8 @@ UNTRUSTED_BURST: Final = 200_000
 """The start-up traffic of three ground stations on tablets."""
 MAX_WAITING: Final = 64
 """Requests of a client; one that waits for its answers has one or two."""
+SLACK_SHIFT: Final = 2
+"""A limited frame may be a quarter of its interval early, or jitter would halve the rate."""
 
 
 @dataclass(slots=True)
@@ -117,10 +119,6 @@ class RequestQueue:
             self._turns[incoming.client_id] = line
         line.bucket.level -= REQUEST_COST
         return incoming
-
-
-SLACK_SHIFT: Final = 2
-"""A limited frame may be a quarter of its interval early, or jitter would halve the rate."""
 
 
 @dataclass(slots=True)

@@ -61,6 +61,13 @@ SAME_START_US: Final = 5 * US_PER_S
 at the same moment."""
 
 Note = TypeVar("Note")
+LINKED_US: Final = 60 * US_PER_S
+"""Without a further copy for so long, it was chance, or one of the two links has gone."""
+HEARTBEAT_ID, HOME_POSITION_ID = MESSAGE_IDS["HEARTBEAT"], MESSAGE_IDS["HOME_POSITION"]
+GREETING: Final = (HEARTBEAT_ID, HOME_POSITION_ID)
+"""In this order: a vehicle exists, and its home."""
+OWN_FRESH_US: Final = 5 * US_PER_S
+"""A system whose heartbeat we have not sent for so long is no longer ours: a playback ended."""
 
 
 @dataclass(slots=True)
@@ -373,10 +380,6 @@ class DuplicateFilter:
         return leader_lives and stream.is_behind(frame.sequence, limit_us)
 
 
-LINKED_US: Final = 60 * US_PER_S
-"""Without a further copy for so long, it was chance, or one of the two links has gone."""
-
-
 class RedundantLinks:
     """Pairs of clients that are links to one peer, because both brought copies of a frame recently.
 
@@ -426,13 +429,6 @@ class RedundantLinks:
             for client_id in joined:
                 groups[client_id] = joined
         self._groups = {client_id: tuple(sorted(group)) for client_id, group in groups.items()}
-
-
-HEARTBEAT_ID, HOME_POSITION_ID = MESSAGE_IDS["HEARTBEAT"], MESSAGE_IDS["HOME_POSITION"]
-GREETING: Final = (HEARTBEAT_ID, HOME_POSITION_ID)
-"""In this order: a vehicle exists, and its home."""
-OWN_FRESH_US: Final = 5 * US_PER_S
-"""A system whose heartbeat we have not sent for so long is no longer ours: a playback ended."""
 
 
 class OwnVehicles:

@@ -81,6 +81,35 @@ STEPS: Final = 20
 
 Key = bytes
 """System, component and message of a frame, as in `MavFrame.key`."""
+ANSWER_IDS: Final = ids_of("HEARTBEAT", "COMMAND_INT", "COMMAND_LONG", "COMMAND_ACK", "STATUSTEXT")
+"""The next one does not replace a lost one."""
+URGENT_IDS: Final = ids_of(
+    *("ATTITUDE", "ATTITUDE_QUATERNION", "ATTITUDE_QUATERNION_COV"),
+    *("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"),
+)
+COMPONENT_INFORMATION, COMPONENT_INFORMATION_BASIC, EVENT = 395, 396, 410
+"""Messages that the dialect lacks."""
+BULK_IDS: Final = ids_of(
+    *("PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "PARAM_VALUE", "PARAM_SET", "PARAM_MAP_RC"),
+    *("PARAM_EXT_REQUEST_READ", "PARAM_EXT_REQUEST_LIST", "PARAM_EXT_VALUE", "PARAM_EXT_SET"),
+    *("PARAM_EXT_ACK", "MISSION_REQUEST_PARTIAL_LIST", "MISSION_WRITE_PARTIAL_LIST"),
+    *("MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_REQUEST", "MISSION_REQUEST_INT"),
+    *("MISSION_SET_CURRENT", "MISSION_REQUEST_LIST", "MISSION_COUNT", "MISSION_CLEAR_ALL"),
+    *("MISSION_ITEM_REACHED", "MISSION_ACK", "SET_GPS_GLOBAL_ORIGIN", "GPS_GLOBAL_ORIGIN"),
+    *("FILE_TRANSFER_PROTOCOL", "LOG_REQUEST_LIST", "LOG_ENTRY", "LOG_REQUEST_DATA", "LOG_DATA"),
+    *("LOG_ERASE", "LOG_REQUEST_END", "AUTOPILOT_VERSION", "PROTOCOL_VERSION"),
+    *("COMPONENT_METADATA", "SERVO_OUTPUT_RAW"),
+) | {COMPONENT_INFORMATION, COMPONENT_INFORMATION_BASIC, EVENT}
+"""Parameters, mission transfers, files, logs, versions: requested, and waited for."""
+NOT_TELEMETRY_IDS: Final = ANSWER_IDS | BULK_IDS
+"""Messages that are never dropped while there is room, because they are not repeated."""
+BULK_BYTES: Final = 16_384
+"""Least room for bulk: the parameters of three aircraft."""
+URGENT_RUN: Final = 4
+"""Urgent frames in a row before a frame of another queue."""
+SEQUENCE_MASK: Final = 0xFF
+_Queue = deque[tuple[MavFrame, int | None, int]]
+"""Frames, their steps (see `Numbering`), and the time at which they were added."""
 
 
 class Bandwidth:
@@ -162,39 +191,6 @@ def _parts(
         used = sum(part * kinds[key][2] for key, part in at(middle).items())
         low, high = (middle, high) if used <= free else (low, middle)
     return at(low)
-
-
-ANSWER_IDS: Final = ids_of("HEARTBEAT", "COMMAND_INT", "COMMAND_LONG", "COMMAND_ACK", "STATUSTEXT")
-"""The next one does not replace a lost one."""
-URGENT_IDS: Final = ids_of(
-    *("ATTITUDE", "ATTITUDE_QUATERNION", "ATTITUDE_QUATERNION_COV"),
-    *("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"),
-)
-COMPONENT_INFORMATION, COMPONENT_INFORMATION_BASIC, EVENT = 395, 396, 410
-"""Messages that the dialect lacks."""
-BULK_IDS: Final = ids_of(
-    *("PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "PARAM_VALUE", "PARAM_SET", "PARAM_MAP_RC"),
-    *("PARAM_EXT_REQUEST_READ", "PARAM_EXT_REQUEST_LIST", "PARAM_EXT_VALUE", "PARAM_EXT_SET"),
-    *("PARAM_EXT_ACK", "MISSION_REQUEST_PARTIAL_LIST", "MISSION_WRITE_PARTIAL_LIST"),
-    *("MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_REQUEST", "MISSION_REQUEST_INT"),
-    *("MISSION_SET_CURRENT", "MISSION_REQUEST_LIST", "MISSION_COUNT", "MISSION_CLEAR_ALL"),
-    *("MISSION_ITEM_REACHED", "MISSION_ACK", "SET_GPS_GLOBAL_ORIGIN", "GPS_GLOBAL_ORIGIN"),
-    *("FILE_TRANSFER_PROTOCOL", "LOG_REQUEST_LIST", "LOG_ENTRY", "LOG_REQUEST_DATA", "LOG_DATA"),
-    *("LOG_ERASE", "LOG_REQUEST_END", "AUTOPILOT_VERSION", "PROTOCOL_VERSION"),
-    *("COMPONENT_METADATA", "SERVO_OUTPUT_RAW"),
-) | {COMPONENT_INFORMATION, COMPONENT_INFORMATION_BASIC, EVENT}
-"""Parameters, mission transfers, files, logs, versions: requested, and waited for."""
-NOT_TELEMETRY_IDS: Final = ANSWER_IDS | BULK_IDS
-"""Messages that are never dropped while there is room, because they are not repeated."""
-
-BULK_BYTES: Final = 16_384
-"""Least room for bulk: the parameters of three aircraft."""
-URGENT_RUN: Final = 4
-"""Urgent frames in a row before a frame of another queue."""
-
-SEQUENCE_MASK: Final = 0xFF
-_Queue = deque[tuple[MavFrame, int | None, int]]
-"""Frames, their steps (see `Numbering`), and the time at which they were added."""
 
 
 class Numbering:

@@ -9,6 +9,23 @@ from typing import Final, NamedTuple
 
 from gateway.units import US_PER_S
 
+WINDOW_US: Final = 60 * US_PER_S
+ALERT_AFTER_US: Final = 5 * US_PER_S
+"""A shorter outage is not announced."""
+SLOW_FOR_US: Final = 30 * US_PER_S
+"""A client that has dropped nothing for so long is no longer slow."""
+ALERT_STATES: Final = {
+    "unreachable": "unreachable",
+    "resolving": "its address is not known",
+    "connecting": "not connected",
+}
+"""Texts used without a reason. `refused` is not among them: a ground station that is not running
+is not unusual."""
+ALERTS_IN_FULL: Final = 3
+"""Alerts of listening ports' clients that are passed on one by one in a minute."""
+Key = int | str
+"""Id of a client, or URL of a listening port."""
+
 
 @dataclass(slots=True)
 class ClientCounters:
@@ -102,9 +119,6 @@ class HubCounters:
     """Requests dropped because their client exceeded its quota."""
 
 
-WINDOW_US: Final = 60 * US_PER_S
-
-
 class LogRateLimiter:
     """Lines of one kind: `in_full` of each minute as they are, the number of others with `rest`."""
 
@@ -126,24 +140,6 @@ class LogRateLimiter:
             return []
         suppressed, self._lines, self._begin_us = self._lines - self._in_full, 0, now_us
         return [f"{suppressed} {self._rest}"] if suppressed > 0 else []
-
-
-ALERT_AFTER_US: Final = 5 * US_PER_S
-"""A shorter outage is not announced."""
-SLOW_FOR_US: Final = 30 * US_PER_S
-"""A client that has dropped nothing for so long is no longer slow."""
-ALERT_STATES: Final = {
-    "unreachable": "unreachable",
-    "resolving": "its address is not known",
-    "connecting": "not connected",
-}
-"""Texts used without a reason. `refused` is not among them: a ground station that is not running
-is not unusual."""
-ALERTS_IN_FULL: Final = 3
-"""Alerts of listening ports' clients that are passed on one by one in a minute."""
-
-Key = int | str
-"""Id of a client, or URL of a listening port."""
 
 
 class ClientAlert(NamedTuple):

@@ -31,6 +31,7 @@ HARMLESS: Final = ids_of("TIMESYNC", "PING")
 MAX_NEIGHBOURS: Final = 64
 """Other systems and components of a link that are known by their heartbeats."""
 WAITS: Final = "as=: no autopilot has sent a heartbeat on this link so far"
+FILTER_OPTIONS: Final = ("systems", "not-systems", "components")
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +90,6 @@ class SystemFilter:
 
 
 NO_FILTER: Final = SystemFilter()
-FILTER_OPTIONS: Final = ("systems", "not-systems", "components")
 
 
 def commands(message_id: int) -> bool:

@@ -32,6 +32,8 @@ Record = Mapping[str, Any]
 app = typer.Typer()
 group = typer.Typer(help="List, add and remove clients and sources.", no_args_is_help=True)
 app.add_typer(group, name="clients")
+MOST_SYSTEMS: Final = 8
+"""Shown of a client; one that floods may send as thousands."""
 
 
 @app.command()
@@ -292,10 +294,6 @@ def _clients(clients: Sequence[Record], now_us: int) -> Table:
             figure(None if trip_us is None else trip_us / US_PER_MS, ".1f"),
         )
     return table
-
-
-MOST_SYSTEMS: Final = 8
-"""Shown of a client; one that floods may send as thousands."""
 
 
 def _first_systems(systems: Sequence[tuple[int, int]]) -> list[str]:

@@ -42,18 +42,20 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 
+log = logging.getLogger(__name__)
+
+NOT_RECORDED: Final = "not recording without --record or `mavgate record start`"
+app = typer.Typer()
+AT_ONCE: Final = 16
+"""Frames that cross at once; the pipe holds some hundreds, which are made ahead."""
+CHECKOUT: Final = Path(__file__).resolve().parents[3]
+
 
 class SourceName(StrEnum):
     """The kinds of sources that are simulated."""
 
     CRSF = "crsf"
     LINES = "lines"
-
-
-NOT_RECORDED: Final = "not recording without --record or `mavgate record start`"
-
-log = logging.getLogger(__name__)
-app = typer.Typer()
 
 
 @app.command()
@@ -180,10 +182,6 @@ def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings
     return found
 
 
-AT_ONCE: Final = 16
-"""Frames that cross at once; the pipe holds some hundreds, which are made ahead."""
-
-
 def made_ahead(frames: Iterator[TimedFrame]) -> Generator[TimedFrame]:
     """Let a background process make frames, so that the event loop that plays them need not."""
     return _take(begin_copy(_make, frames))
@@ -207,9 +205,6 @@ def _make(frames: Iterator[TimedFrame], sender: Connection) -> None:
         signal.signal(number, signal.SIG_IGN)
     while made := [(f.time_s, f.data, f.damaged) for f in islice(frames, AT_ONCE)]:
         sender.send(made)
-
-
-CHECKOUT: Final = Path(__file__).resolve().parents[3]
 
 
 class BenchError(RuntimeError):

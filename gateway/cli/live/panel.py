@@ -25,6 +25,17 @@ app = typer.Typer()
 
 NICENESS: Final = 5
 """The gateway has priority over the panel, from the panel's imports on."""
+LINK: Final = "panel: "
+"""Begin of the line with the page's address."""
+RESTART_S: Final = 5.0
+LONGEST_RESTART_S: Final = 300.0
+"""Longest pause between restarts, so that repeated failures do not fill the log."""
+LINE_BREAK: Final = "\x1e"
+"""Between the lines of one record of the panel's log, whose own control characters are escaped."""
+LONGEST_RECORD: Final = 15_000
+"""Characters of a record, which fit into a line of 64 kB; of a longer one the end is kept."""
+END_S: Final = 3.0
+"""Within which it ends by itself when asked to; the loop must not close before it has."""
 
 
 @app.command()
@@ -84,20 +95,6 @@ def panel(
         run_panel(wanted, folder, connect, SOCKET.get(), show_link, attached=attached)
     except (PanelError, ValueError) as error:
         refuse(str(error))
-
-
-LINK: Final = "panel: "
-"""Begin of the line with the page's address."""
-RESTART_S: Final = 5.0
-LONGEST_RESTART_S: Final = 300.0
-"""Longest pause between restarts, so that repeated failures do not fill the log."""
-
-LINE_BREAK: Final = "\x1e"
-"""Between the lines of one record of the panel's log, whose own control characters are escaped."""
-LONGEST_RECORD: Final = 15_000
-"""Characters of a record, which fit into a line of 64 kB; of a longer one the end is kept."""
-END_S: Final = 3.0
-"""Within which it ends by itself when asked to; the loop must not close before it has."""
 
 
 def launched_panel(*, wanted: bool) -> "PanelProcess | None":

@@ -22,6 +22,18 @@ from gateway.printable import UNKNOWN, figure
 from gateway.units import counted
 
 INDEX: Final = "index"
+app = typer.Typer()
+FolderOption = Annotated[
+    Path | None,
+    typer.Option("--folder", "-d", help="Folder of the catalogue; by default the recordings'."),
+]
+WhereOption = Annotated[
+    str,
+    typer.Option("--where", help="Condition in SQL: 'duration > 300 and loss > 0.05'."),
+]
+GeojsonOption = Annotated[bool, typer.Option("--geojson", help="The tracks, for maps.")]
+WHOLE: Final = ("vehicle", "duration", "highest", "gps_outages", "faults")
+"""Columns that are shown without decimals."""
 
 
 class _IndexByDefault(TyperGroup):
@@ -34,22 +46,11 @@ class _IndexByDefault(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-app = typer.Typer()
 group = typer.Typer(
     cls=_IndexByDefault,
     help="Index all recordings under a folder, and list and search what is in them.",
 )
 app.add_typer(group, name="catalogue")
-
-FolderOption = Annotated[
-    Path | None,
-    typer.Option("--folder", "-d", help="Folder of the catalogue; by default the recordings'."),
-]
-WhereOption = Annotated[
-    str,
-    typer.Option("--where", help="Condition in SQL: 'duration > 300 and loss > 0.05'."),
-]
-GeojsonOption = Annotated[bool, typer.Option("--geojson", help="The tracks, for maps.")]
 
 
 @group.command(INDEX)
@@ -99,10 +100,6 @@ def list_flights(
 
 def _folder(folder: Path | None) -> Path:
     return (folder or folder_of(read_settings())).expanduser()
-
-
-WHOLE: Final = ("vehicle", "duration", "highest", "gps_outages", "faults")
-"""Columns that are shown without decimals."""
 
 
 def _show_table(rows: list[Row]) -> None:

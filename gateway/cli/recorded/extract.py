@@ -53,6 +53,7 @@ app = typer.Typer()
 ITEMS: Final = (".waypoints", ".plan")
 VIDEO_TIME: Final = re.compile(r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)")
 """A time of begin in the name of a video, as cameras write it."""
+NAMES: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally points"}
 
 
 @dataclass(slots=True)
@@ -195,9 +196,6 @@ def _params(path: Path, plan: RecordedPlan) -> Iterable[str]:
     if path.suffix == ".params":
         return qgc_params(parameters, plan)
     return param_file(parameters)
-
-
-NAMES: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally points"}
 
 
 def _items(path: Path, plan: RecordedPlan, kind: int) -> Iterable[str]:

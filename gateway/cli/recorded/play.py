@@ -51,6 +51,7 @@ VIEW_INTERVAL_S: Final = 0.25
 FASTEST: Final = "max"
 KEYS: Final = "space pause  ← → 10 s  ↓ ↑ 1 min  + − speed  . step  home begin  l loop  q quit"
 LEAPS_S: Final = {"left": -10.0, "right": 10.0, "down": -60.0, "up": 60.0}
+group = typer.Typer(help="Control the running player.", no_args_is_help=True)
 
 
 @app.command()
@@ -151,7 +152,6 @@ def _ask_for_commands(settings: GatewaySettings) -> None:
         )
 
 
-group = typer.Typer(help="Control the running player.", no_args_is_help=True)
 app.add_typer(group, name="player")
 
 

@@ -55,6 +55,18 @@ if TYPE_CHECKING:
     from gateway.batch.statistics import Choice, FloatArray
 
 app = typer.Typer()
+SHOWN: Final = 10
+AT_REST_MPS: Final = 1.0
+"""A GPS receiver at rest reports up to 0.3 m/s."""
+HEADINGS: Final = {
+    "north_m": "latitude error, m",
+    "east_m": "longitude error, m",
+    "held_m": "error at withheld fixes, m",
+    "interpolated_m": "error against interpolated GPS, m",
+    "reference_m": "error against the reference, m",
+    "attitude_deg": "attitude error, deg",
+}
+"""By the columns of a sweep's scores."""
 
 
 @app.command()
@@ -122,20 +134,6 @@ def sweep(
     path = Path(given[0]) if given else None
     read = read_options(current, columns, choice=fuse_with, system_id=system)
     run_sweep(path, current, options, lambda: load_flight(path, current, read, reference))
-
-
-SHOWN: Final = 10
-AT_REST_MPS: Final = 1.0
-"""A GPS receiver at rest reports up to 0.3 m/s."""
-HEADINGS: Final = {
-    "north_m": "latitude error, m",
-    "east_m": "longitude error, m",
-    "held_m": "error at withheld fixes, m",
-    "interpolated_m": "error against interpolated GPS, m",
-    "reference_m": "error against the reference, m",
-    "attitude_deg": "attitude error, deg",
-}
-"""By the columns of a sweep's scores."""
 
 
 @dataclass(frozen=True, slots=True)

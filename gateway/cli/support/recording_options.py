@@ -67,6 +67,31 @@ PositionOption = Annotated[
     Position,
     typer.Option("--position", help="Position as live, or on straight lines between fixes."),
 ]
+Wanted = Literal["tlogs", "tables", "all"]
+"""Which files of a recording a command uses; the others if it has none of these."""
+FlightArgument = Annotated[
+    Path | None,
+    typer.Argument(
+        help="A recording by its name, or any flight log; "
+        "by default the built-in simulated flight.",
+        show_default=False,
+    ),
+]
+ReferenceOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--reference",
+        help="A mavgate CSV on the flight's clock, with whose states the estimates are compared.",
+    ),
+]
+SystemOption = Annotated[
+    int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to use.")
+]
+OTHER_DESCRIPTION: Final = "Recorded by another program; its samples count as calibrated."
+DESCRIPTIONS: Final = {
+    TABLE: "Recorded by mavgate.",
+    TLOG: "Read out of an autopilot's MAVLink log; its samples count as calibrated.",
+}
 
 
 def read_sensors(texts: Sequence[str] | None) -> tuple[tuple[str, int], ...]:
@@ -117,10 +142,6 @@ def print_remarks(remarks: Iterable[str]) -> None:
         console_of(stderr=True).print(remark)
 
 
-Wanted = Literal["tlogs", "tables", "all"]
-"""Which files of a recording a command uses; the others if it has none of these."""
-
-
 def recorded_files(names: Iterable[Path], wanted: Wanted) -> list[Path]:
     """Replace names of recordings by their files, for which alone a gateway is asked."""
     names = list(names)
@@ -157,32 +178,6 @@ def _files_of(name: Path, folder: Path, wanted: Wanted) -> list[Path]:
         return files
     ending = ".tlog" if wanted == "tlogs" else ".csv"
     return [file for file in files if file.suffix == ending] or files
-
-
-FlightArgument = Annotated[
-    Path | None,
-    typer.Argument(
-        help="A recording by its name, or any flight log; "
-        "by default the built-in simulated flight.",
-        show_default=False,
-    ),
-]
-ReferenceOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--reference",
-        help="A mavgate CSV on the flight's clock, with whose states the estimates are compared.",
-    ),
-]
-SystemOption = Annotated[
-    int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to use.")
-]
-
-OTHER_DESCRIPTION: Final = "Recorded by another program; its samples count as calibrated."
-DESCRIPTIONS: Final = {
-    TABLE: "Recorded by mavgate.",
-    TLOG: "Read out of an autopilot's MAVLink log; its samples count as calibrated.",
-}
 
 
 def fusion_of(settings: GatewaySettings) -> FusionSettings:

@@ -22,6 +22,9 @@ UNLIMITED_WIDTH: Final = 1000
 NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """Context settings of a command whose arguments may begin with a minus."""
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
+KINDS: Final = {"int": "write a whole number", "float": "write a number"}
+BOUNDS: Final = {"less_than_equal": ("le", "at most"), "greater_than_equal": ("ge", "at least")}
+"""Errors of the library that parses options, by their type."""
 
 
 def console_of(*, stderr: bool = False) -> Console:
@@ -107,11 +110,6 @@ def refuse(text: str) -> NoReturn:
     console = console_of(stderr=True)
     console.print(text, style="red")
     raise typer.Exit(2)
-
-
-KINDS: Final = {"int": "write a whole number", "float": "write a number"}
-BOUNDS: Final = {"less_than_equal": ("le", "at most"), "greater_than_equal": ("ge", "at least")}
-"""Errors of the library that parses options, by their type."""
 
 
 def in_words(error: typer.BadParameter) -> str:

@@ -55,6 +55,12 @@ RETRY_US: Final = US_PER_S
 Write = Callable[[bytes], object]
 OnForeign = Callable[[Sequence[bytes]], None]
 """Called with frames of other systems that are forwarded, in their order."""
+STALE_AFTER_US: Final = 3 * US_PER_S
+"""Three missed heartbeats: a client that has sent nothing for so long may be replaced."""
+SHARE: Final = 4
+"""Divisor: one host keeps a quarter of a full port's clients when others connect."""
+FEW: Final = 4
+"""Clients that one host keeps in any case, such as a ground station, a script and a display."""
 
 
 def not_open(data: bytes) -> int:
@@ -529,14 +535,6 @@ class Client:
 
 
 Peer = TypeVar("Peer", bound=Client)
-
-
-STALE_AFTER_US: Final = 3 * US_PER_S
-"""Three missed heartbeats: a client that has sent nothing for so long may be replaced."""
-SHARE: Final = 4
-"""Divisor: one host keeps a quarter of a full port's clients when others connect."""
-FEW: Final = 4
-"""Clients that one host keeps in any case, such as a ground station, a script and a display."""
 
 
 def client_to_remove(

@@ -23,6 +23,11 @@ from gateway.hub.transports.zenoh.mavlink_server import ZenohJson, ZenohRaw
 from gateway.hub.transports.zenoh.site import ZenohSite
 
 ClientMaker = Callable[[HubContext, int, Endpoint], Client]
+ZENOH: Final[dict[str, type[ZenohClient]]] = {
+    SITE_KEYS: ZenohSite,
+    RAW_KEYS: ZenohRaw,
+    JSON_KEYS: ZenohJson,
+}
 
 
 def _ws_client(context: HubContext, client_id: int, endpoint: Endpoint) -> Client:
@@ -42,11 +47,6 @@ def _ws_listener(context: HubContext, endpoint: Endpoint) -> Listener[Any]:
     return WsListener(context, endpoint)
 
 
-ZENOH: Final[dict[str, type[ZenohClient]]] = {
-    SITE_KEYS: ZenohSite,
-    RAW_KEYS: ZenohRaw,
-    JSON_KEYS: ZenohJson,
-}
 CLIENTS: Final[dict[str, ClientMaker]] = {
     EndpointKind.UDP: UdpClient,
     EndpointKind.UDP_BROADCAST: GroupClient,

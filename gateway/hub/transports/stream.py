@@ -21,6 +21,24 @@ from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter, frame_of
 
 ACCEPT_AGAIN_S: Final = 1.0
 """After which a connection is accepted that could not be."""
+CHUNK_BYTES: Final = 4096
+"""Joined into one write while a queue drains."""
+SLOW_CHUNK_BYTES: Final = 512
+"""The same for a slow connection: joined frames can no longer be overtaken."""
+USER_TIMEOUT_MS: Final = 30_000
+"""A peer that acknowledges nothing for so long is gone; a paused one may resume sooner."""
+SEND_BUFFER_BYTES: Final = 32_768
+"""Most bytes that the peer has not acknowledged: those in flight on a long link."""
+UNSENT_BYTES: Final = 2048
+"""Most bytes in the kernel beyond those: frames wait in our queue, where urgent ones are first."""
+JOINED_BYTES: Final = 1024
+"""The kernel joins unsent writes, and checks `UNSENT_BYTES` only when it starts another segment."""
+SLOW_AFTER_US: Final = US_PER_S
+"""A connection that needs longer to drain its queue is slow; after a stall it is faster."""
+FRESH_US: Final = US_PER_S // 2
+"""Telemetry that has waited longer is not sent to a slow one."""
+ACCEPT_BACKLOG: Final = 128
+"""Connections that wait in the kernel, since each wake-up accepts one: pages that all reconnect."""
 
 
 def accept_each(
@@ -69,26 +87,6 @@ def accept_each(
         admit(connection, address)
 
     watch()
-
-
-CHUNK_BYTES: Final = 4096
-"""Joined into one write while a queue drains."""
-SLOW_CHUNK_BYTES: Final = 512
-"""The same for a slow connection: joined frames can no longer be overtaken."""
-USER_TIMEOUT_MS: Final = 30_000
-"""A peer that acknowledges nothing for so long is gone; a paused one may resume sooner."""
-SEND_BUFFER_BYTES: Final = 32_768
-"""Most bytes that the peer has not acknowledged: those in flight on a long link."""
-UNSENT_BYTES: Final = 2048
-"""Most bytes in the kernel beyond those: frames wait in our queue, where urgent ones are first."""
-JOINED_BYTES: Final = 1024
-"""The kernel joins unsent writes, and checks `UNSENT_BYTES` only when it starts another segment."""
-SLOW_AFTER_US: Final = US_PER_S
-"""A connection that needs longer to drain its queue is slow; after a stall it is faster."""
-FRESH_US: Final = US_PER_S // 2
-"""Telemetry that has waited longer is not sent to a slow one."""
-ACCEPT_BACKLOG: Final = 128
-"""Connections that wait in the kernel, since each wake-up accepts one: pages that all reconnect."""
 
 
 class QueuedClient(Client):

@@ -56,6 +56,14 @@ from gateway.hub.settings import HubSettings
 
 READ_BYTES: Final = 16_384
 """One record of TLS."""
+MAX_MESSAGE: Final = 65_536
+"""No program packs more; longer messages are not MAVLink."""
+SUBPROTOCOLS: Final = ("mavlink", "binary")
+"""Names that pages request, if any; a browser gives up if none is accepted."""
+FINAL_BINARY: Final = b"\x82"
+SHORT: Final = 126
+"""From this payload size on, the length takes two bytes."""
+TWO_BYTES: Final = struct.Struct("!BH")
 
 
 class TlsLayer:
@@ -168,16 +176,6 @@ def _presenting(certificate: Path, key: Path) -> ssl.SSLContext:
     # Never ask for a password: a daemon has no terminal.
     context.load_cert_chain(certificate, key, password="")
     return context
-
-
-MAX_MESSAGE: Final = 65_536
-"""No program packs more; longer messages are not MAVLink."""
-SUBPROTOCOLS: Final = ("mavlink", "binary")
-"""Names that pages request, if any; a browser gives up if none is accepted."""
-FINAL_BINARY: Final = b"\x82"
-SHORT: Final = 126
-"""From this payload size on, the length takes two bytes."""
-TWO_BYTES: Final = struct.Struct("!BH")
 
 
 @dataclass(slots=True)

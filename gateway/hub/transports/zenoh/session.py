@@ -50,6 +50,8 @@ from gateway.wire.mavlink_messages import ids_of
 if TYPE_CHECKING:
     import zenoh
 
+log = logging.getLogger(__name__)
+
 ROOT: Final = "mavlink"
 ALL_SYSTEMS: Final = "*"
 OWN: Final = b"own"
@@ -61,6 +63,42 @@ MAX_CONFIG: Final = 1 << 20
 """Bytes of a configuration file, which Zenoh reads at once; a complete one has some 30 kB."""
 MAX_KEY: Final = 256
 """Letters of a key; ours have at most 150."""
+MAX_WAITING: Final = 4096
+"""Received messages that wait for the loop: a third of a second of two hundred aircraft."""
+AT_ONCE: Final = 64
+"""Messages handled in one turn of the loop, so that a flood does not delay other clients."""
+MAX_MESSAGE: Final = 4096
+"""Bytes of one message with frames, as of a datagram; ours have at most 1100. Longer ones are
+dropped unread."""
+BYTES_AT_ONCE: Final = 4 * MAX_MESSAGE
+"""Bytes handled in one turn by a fleet, which has no sensor samples that would wait meanwhile."""
+MAX_RELIABLE: Final = 1024
+"""Messages that wait for a congested link and must not be dropped: a whole parameter list."""
+BATCHES: Final = 4
+"""Batches of 64 KiB that may wait on a link: two thousand frames, and little memory a site."""
+GIVE_UP_S: Final = 10.0
+"""Zenoh gives a message up after half of this, and closes the link."""
+RELIABLE_IDS: Final = BULK_IDS | ids_of("COMMAND_INT", "COMMAND_LONG", "COMMAND_ACK", "STATUSTEXT")
+"""Parameters, missions, files, commands, their answers, texts: none of them is sent again."""
+MAX_CALLS: Final = 64
+"""Calls at a time: sessions that open or end, and a query for each recording being fetched."""
+CLOSE_S: Final = 3.0
+"""Ten times the duration of closing over a link that works."""
+TLS_FILES: Final = (
+    "root_ca_certificate",
+    *("connect_certificate", "connect_private_key", "listen_certificate", "listen_private_key"),
+)
+IN_USE: Final = "Address already in use"
+NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[Single\((.*)\)\]!")
+SECURED: Final = ("tls/", "quic/", "wss/")
+LOCAL: Final = "unixsock-stream"
+"""The protocol that no other machine can reach."""
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Payload = tuple[bytes, int]
+"""Frames of a message, and its size in bytes; no frames if it is longer than `MAX_MESSAGE`."""
+_Reliable = tuple["zenoh.Publisher", bytes, bytes | None]
+_calls: Final = ThreadPoolExecutor(MAX_CALLS, "zenoh")
 
 
 def out_key(site: str, system: object) -> str:
@@ -92,49 +130,6 @@ def site_of(key: str) -> str:
     """Return the site of a key; empty if the key is not one of the table."""
     parts = key.split("/")
     return parts[1] if len(parts) in (3, 4) and parts[0] == ROOT else ""
-
-
-log = logging.getLogger(__name__)
-
-MAX_WAITING: Final = 4096
-"""Received messages that wait for the loop: a third of a second of two hundred aircraft."""
-AT_ONCE: Final = 64
-"""Messages handled in one turn of the loop, so that a flood does not delay other clients."""
-MAX_MESSAGE: Final = 4096
-"""Bytes of one message with frames, as of a datagram; ours have at most 1100. Longer ones are
-dropped unread."""
-BYTES_AT_ONCE: Final = 4 * MAX_MESSAGE
-"""Bytes handled in one turn by a fleet, which has no sensor samples that would wait meanwhile."""
-MAX_RELIABLE: Final = 1024
-"""Messages that wait for a congested link and must not be dropped: a whole parameter list."""
-BATCHES: Final = 4
-"""Batches of 64 KiB that may wait on a link: two thousand frames, and little memory a site."""
-GIVE_UP_S: Final = 10.0
-"""Zenoh gives a message up after half of this, and closes the link."""
-RELIABLE_IDS: Final = BULK_IDS | ids_of("COMMAND_INT", "COMMAND_LONG", "COMMAND_ACK", "STATUSTEXT")
-"""Parameters, missions, files, commands, their answers, texts: none of them is sent again."""
-MAX_CALLS: Final = 64
-"""Calls at a time: sessions that open or end, and a query for each recording being fetched."""
-CLOSE_S: Final = 3.0
-"""Ten times the duration of closing over a link that works."""
-
-TLS_FILES: Final = (
-    "root_ca_certificate",
-    *("connect_certificate", "connect_private_key", "listen_certificate", "listen_private_key"),
-)
-IN_USE: Final = "Address already in use"
-NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[Single\((.*)\)\]!")
-SECURED: Final = ("tls/", "quic/", "wss/")
-LOCAL: Final = "unixsock-stream"
-"""The protocol that no other machine can reach."""
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-Payload = tuple[bytes, int]
-"""Frames of a message, and its size in bytes; no frames if it is longer than `MAX_MESSAGE`."""
-_Reliable = tuple["zenoh.Publisher", bytes, bytes | None]
-
-_calls: Final = ThreadPoolExecutor(MAX_CALLS, "zenoh")
 
 
 def off_loop(work: Callable[..., Result], *args: object) -> "asyncio.Future[Result]":
