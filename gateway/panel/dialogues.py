@@ -12,7 +12,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
 from gateway.panel.state.calibration import CalibrationRun, CalibrationStep, RunState
-from gateway.panel.state.fleet import FleetState, command_long
+from gateway.panel.state.commands import command_long
+from gateway.panel.state.fleet import FleetState
 from gateway.panel.state.parameters import (
     GENERAL_PATHS,
     FileClient,

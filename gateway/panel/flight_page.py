@@ -28,7 +28,8 @@ from gateway.analysis.flight import FlightTrack, FloatArray, flight_of_files, fu
 from gateway.analysis.metrics import euler_rad
 from gateway.analysis.processes import begin_copy
 from gateway.estimation.select import ESTIMATORS
-from gateway.panel.state.fleet import FlightHistory, VehicleState
+from gateway.panel.state.history import FlightHistory
+from gateway.panel.state.vehicle import VehicleState
 from gateway.printable import printable, reason_of
 from gateway.recordings.convert import FlightToWrite
 from gateway.recordings.files import FlightError

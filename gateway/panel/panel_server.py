@@ -36,7 +36,8 @@ from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.recording_transfer import add_recording_files
 from gateway.panel.rest_api import RestApi
 from gateway.panel.state.fields import FieldHistory
-from gateway.panel.state.fleet import FleetState, SampleMemory
+from gateway.panel.state.fleet import FleetState
+from gateway.panel.state.samples import SampleMemory
 from gateway.panel.telemetry_feed import PATH, TelemetryFeed, add_tracks
 from gateway.panel.uplink import ControlClient, GatewayWatch, Uplink
 from gateway.panel.view_context import WEB, PanelParts

@@ -21,9 +21,10 @@ from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError, find_socket, request
-from gateway.panel.state.fleet import FleetState, command_long
+from gateway.panel.state.commands import command_at, command_long
+from gateway.panel.state.fleet import FleetState
 from gateway.records import NAN, Incoming, Outgoing
-from gateway.units import DEGE7_PER_DEG, US_PER_S
+from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 
@@ -206,16 +207,7 @@ class Uplink:
 
     async def command_at(self, system_id: int, number: int, spot: Location) -> None:
         """Send a command with a position; raises as `command`."""
-        message = mavlink.MAVLink_command_int_message(
-            system_id,
-            mavlink.MAV_COMP_ID_AUTOPILOT1,
-            mavlink.MAV_FRAME_GLOBAL,
-            number,
-            *(0, 0, 0.0, 0.0, 0.0, 0.0),
-            round(spot.lat_deg * DEGE7_PER_DEG),
-            round(spot.lon_deg * DEGE7_PER_DEG),
-            spot.alt_amsl_m,
-        )
+        message = command_at(system_id, number, spot)
         await self._until_acknowledged(system_id, number, message)
 
     async def _until_acknowledged(self, system_id: int, number: int, message: Any) -> None:

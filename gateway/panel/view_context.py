@@ -43,7 +43,9 @@ from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
 from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.state.fields import FieldHistory
-from gateway.panel.state.fleet import FleetState, SampleMemory, VehicleState
+from gateway.panel.state.fleet import FleetState
+from gateway.panel.state.samples import SampleMemory
+from gateway.panel.state.vehicle import VehicleState
 from gateway.panel.uplink import READING, ControlClient, GatewayWatch, Uplink
 from gateway.vehicle.plan import Location
 

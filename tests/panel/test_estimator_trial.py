@@ -4,7 +4,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.estimation.select import ESTIMATORS
 from gateway.panel.estimator_trial import LEAST_HZ, LEAST_S, ComparisonError, compare, settings_of
-from gateway.panel.state.fleet import SPAN_US, SampleMemory
+from gateway.panel.state.samples import SPAN_US, SampleMemory
 from gateway.units import US_PER_S
 
 

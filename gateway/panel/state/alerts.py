@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.fleet import VehicleState
+from gateway.panel.state.vehicle import VehicleState
 from gateway.records import node_role
 from gateway.units import US_PER_S
 
@@ -75,11 +75,10 @@ def _gps(vehicle: VehicleState, now_us: int) -> list[Alert]:
     """Return an alert for a GPS that lost its fix; one that never had one is still searching."""
     if not vehicle.fixes:
         return []
-    newest = vehicle.newest["GPS_RAW_INT"]
-    age_us = now_us - vehicle.heard_us["GPS_RAW_INT"]
+    age_us = vehicle.state.age_us(now_us, "GPS_RAW_INT")
     if age_us > FIX_OLD_US:
-        detail = f"nothing from the receiver for {age_us // US_PER_S} s"
-    elif newest.fix_type < mavlink.GPS_FIX_TYPE_2D_FIX:
+        detail = f"nothing from the receiver for {age_us // US_PER_S:.0f} s"
+    elif vehicle.state.fields["GPS_RAW_INT"]["fix_type"] < mavlink.GPS_FIX_TYPE_2D_FIX:
         detail = "the receiver has no fix"
     else:
         return []
@@ -87,11 +86,13 @@ def _gps(vehicle: VehicleState, now_us: int) -> list[Alert]:
 
 
 def _sensors(vehicle: VehicleState) -> list[Alert]:
-    status = vehicle.newest.get("SYS_STATUS")
+    status = vehicle.state.fields.get("SYS_STATUS")
     if status is None:
         return []
-    used = status.onboard_control_sensors_present & status.onboard_control_sensors_enabled
-    ill = used & ~status.onboard_control_sensors_health
+    present, enabled, healthy = (
+        status[f"onboard_control_sensors_{word}"] for word in ("present", "enabled", "health")
+    )
+    ill = present & enabled & ~healthy
     names = [name for bit, name in SENSORS.items() if ill & bit]
     if not names:
         return []

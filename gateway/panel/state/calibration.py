@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.fleet import command_long
+from gateway.panel.state.commands import command_long
 from gateway.records import NAN
 from gateway.sensing.calibrating import fit_sphere
 from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S, UT_PER_GAUSS

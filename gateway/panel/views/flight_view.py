@@ -102,7 +102,7 @@ async def _clear(context: ViewContext, _: Location) -> None:
     await context.command(mavlink.MAV_CMD_DO_SET_ROI_NONE)
     if context.vehicle is not None:
         context.vehicle.exact_mark = None
-        context.vehicle.newest.pop("NAV_CONTROLLER_OUTPUT", None)
+        context.vehicle.state.fields.pop("NAV_CONTROLLER_OUTPUT", None)
     ui.notify("Mark cleared", type="positive")
 
 

@@ -185,8 +185,8 @@ class LinkView:
     def _vehicle_rows(self) -> dict[str, Cells]:
         rows: dict[str, Cells] = {}
         for system_id, vehicle in sorted(self._context.vehicles.items()):
-            ages = [self._age(vehicle.heard_us.get(name)) for name in _SHOWN]
-            rows[str(system_id)] = (vehicle.title, *ages, str(len(vehicle.newest)))
+            ages = [self._age(vehicle.state.heard_us.get(name)) for name in _SHOWN]
+            rows[str(system_id)] = (vehicle.title, *ages, str(len(vehicle.state.fields)))
         return rows
 
     def _age(self, heard_us: int | None) -> str | tuple[str, str]:

@@ -6,7 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of, with_status
-from gateway.panel.state.fleet import VehicleState
+from gateway.panel.state.vehicle import VehicleState
 from gateway.units import US_PER_S
 from tests.panel.messages import decoded
 

@@ -6,7 +6,9 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.state.fields import FieldHistory
-from gateway.panel.state.fleet import MAX_TRACK, SPAN_US, FleetState, SampleMemory
+from gateway.panel.state.fleet import FleetState
+from gateway.panel.state.history import MAX_TRACK
+from gateway.panel.state.samples import SPAN_US, SampleMemory
 from gateway.units import US_PER_S
 from tests.panel.messages import decoded, heartbeat, position
 
@@ -41,7 +43,7 @@ class Memory:
         return {
             "track": len(vehicle.history),
             "texts": len(vehicle.texts.all),
-            "newest": len(vehicle.newest),
+            "newest": len(vehicle.state.fields),
             "frames": len(self.samples.frames(1)),
             "rows": sum(columns.capacity for columns in self.history._vehicles[1].values()),
         }

@@ -4,7 +4,8 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import from_euler
-from gateway.panel.state.fleet import MAX_VEHICLES, FleetState, VehicleState
+from gateway.panel.state.fleet import MAX_VEHICLES, FleetState
+from gateway.panel.state.vehicle import VehicleState
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
 from tests.panel.messages import decoded, fix, heartbeat, position

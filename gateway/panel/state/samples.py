@@ -1,0 +1,67 @@
+"""The newest sensor frames of each aircraft, to be fused again."""
+
+from collections import Counter, deque
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import message_id_of
+
+SPAN_US: Final = 180 * US_PER_S
+MAX_FRAMES: Final = 40_000
+"""Three minutes at 200 a second; less at a higher rate."""
+
+SENSOR_MESSAGES: Final = frozenset(
+    {
+        mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+        mavlink.MAVLINK_MSG_ID_RAW_IMU,
+        mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
+    }
+)
+
+TimedFrames = list[tuple[int, bytes]]
+"""When each came, in µs on the panel's clock, and the frame."""
+
+
+class SampleMemory:
+    """Sensor frames of each aircraft."""
+
+    def __init__(self) -> None:
+        self._frames: dict[int, deque[tuple[int, bytes]]] = {}
+
+    def take(self, system_id: int, message: Any, now_us: int) -> None:
+        """Store a message, if it is a sensor's."""
+        if message.get_msgId() not in SENSOR_MESSAGES:
+            return
+        frames = self._frames.setdefault(system_id, deque(maxlen=MAX_FRAMES))
+        frames.append((now_us, bytes(message.get_msgbuf())))
+        while frames[0][0] < now_us - SPAN_US:
+            frames.popleft()
+
+    def discard(self, system_id: int) -> None:
+        """Delete the frames of an aircraft."""
+        self._frames.pop(system_id, None)
+
+    def frames(self, system_id: int) -> TimedFrames:
+        """Return the frames of an aircraft, the oldest first."""
+        return list(self._frames.get(system_id, ()))
+
+    def collected(self, system_id: int, span_s: float, rate_hz: float) -> float:
+        """Return the collected share of a span up to the newest sample at a rate, at most 1."""
+        frames = self._frames.get(system_id, ())
+        newest_us = frames[-1][0] if frames else 0
+        counts, first_us = Counter[int](), dict[int, int]()
+        for time_us, frame in reversed(frames):
+            if newest_us - time_us > (span_s + 1.0) * US_PER_S:
+                break
+            kind = message_id_of(frame)
+            counts[kind] += 1
+            first_us[kind] = time_us
+        shares = (
+            min(count / (span_s * rate_hz), (newest_us - first_us[kind]) / US_PER_S / span_s)
+            for kind, count in counts.items()
+        )
+        return min(1.0, max(shares, default=0.0))

@@ -1,0 +1,48 @@
+"""The texts of an aircraft."""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from gateway.recordings.status_texts import JoinedText, TextJoiner
+
+MAX_TEXTS: Final = 500
+MAX_LETTERS: Final = 2_000
+"""Longer texts are cut there."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimedText:
+    """One text."""
+
+    number: int
+    """Counts up from 1, so that a page knows which are new."""
+    time_us: int
+    """On the panel's clock."""
+    severity: int
+    """MAV_SEVERITY: 0 emergency to 7 debug."""
+    text: str
+
+
+class StatusTexts:
+    """The texts of one aircraft, the oldest first."""
+
+    def __init__(self) -> None:
+        self.all: deque[TimedText] = deque(maxlen=MAX_TEXTS)
+        self._count = 0
+        self._joiner = TextJoiner()
+
+    def take(self, message: Any, now_us: int) -> None:
+        """Take one STATUSTEXT; the chunks of a long one go into one entry, blanks into none."""
+        self._add(self._joiner.feed(bytes(message.get_msgbuf()), now_us))
+
+    def poll(self, now_us: int) -> None:
+        """Add the texts whose last chunks are lost."""
+        self._add(self._joiner.poll(now_us))
+
+    def _add(self, texts: Iterable[JoinedText]) -> None:
+        for joined in texts:
+            if text := joined.text.strip()[:MAX_LETTERS]:
+                self._count += 1
+                self.all.append(TimedText(self._count, joined.time_us, joined.severity, text))

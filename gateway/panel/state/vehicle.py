@@ -1,0 +1,187 @@
+"""State of one aircraft: its newest messages, texts, and path."""
+
+import math
+from collections import deque
+from typing import Any, Final
+
+import pymap3d.vincenty as vincenty
+
+from gateway.geometry.angle import wrap_180
+from gateway.panel.state.history import MAX_TRACK, TRACK_INTERVAL_US, FlightHistory
+from gateway.panel.state.instant import Instant
+from gateway.panel.state.texts import StatusTexts
+from gateway.recordings.newest import NewestState
+from gateway.recordings.positions import GPS_IDS, Position, TrackPoint, named_position, position_of
+from gateway.records import NAN
+from gateway.units import US_PER_S
+from gateway.vehicle.plan import Location
+
+LIVE: Final = "live"
+"""Origin of an aircraft that is not played."""
+ATTITUDES: Final = ("ATTITUDE_QUATERNION", "ATTITUDE")
+UNKNOWN_POSITION: Final = Position(NAN, NAN)
+PLANES: Final = frozenset((1, 16, 17, 19, 20, 21, 22, 23, 24, 25, 28))
+COPTERS: Final = frozenset((2, 3, 13, 14, 15, 29, 35))
+OTHERS: Final = {4: "heli", 7: "balloon", 8: "balloon", 10: "rover", 11: "boat", 12: "boat"}
+
+
+class VehicleState:
+    """Everything known about one system."""
+
+    def __init__(self, system_id: int, origin: str = LIVE, number: int | None = None) -> None:
+        self.system_id = system_id
+        self.origin = origin
+        self.number = system_id if number is None else number
+        self.generation = 0
+        """How often the path was restarted."""
+        self.state = NewestState()
+        """The newest messages of its autopilot, and when each came on the panel's clock."""
+        self.history = FlightHistory()
+        """Its states so far, a few a second."""
+        self.fixes: deque[TrackPoint] = deque(maxlen=MAX_TRACK)
+        """GPS fixes."""
+        self.texts = StatusTexts()
+        self.exact_mark: Location | None = None
+        """The mark from the gateway's control socket, exact where MAVLink is rounded."""
+
+    def take(self, message: Any, now_us: int) -> None:
+        """Take in one decoded message of this system's autopilot."""
+        name = message.get_type()
+        has_moved = self.state.take(name, vars(message), now_us)
+        self.texts.poll(now_us)
+        if name == "STATUSTEXT":
+            self.texts.take(message, now_us)
+        elif name == "GPS_RAW_INT":
+            self._note_fix(now_us)
+        if has_moved and now_us - self.history.newest_us >= TRACK_INTERVAL_US:
+            self.history.add(now_us, self.instant(now_us))
+
+    @property
+    def name(self) -> str:
+        """Its kind and its number."""
+        kind = "Aircraft" if self.model == "none" else self.model.capitalize()
+        return f"{kind} {self.number}"
+
+    @property
+    def title(self) -> str:
+        """Displayed name, which indicates where it is not live."""
+        return self.name if self.is_live else f"{self.name}, {self.origin}"
+
+    @property
+    def is_live(self) -> bool:
+        """Whether it is not played from a recording."""
+        return self.origin == LIVE
+
+    def restart_path(self) -> None:
+        """Restart the path, as after a seek in a recording."""
+        self.history.clear()
+        self.fixes.clear()
+        self.generation += 1
+
+    @property
+    def _moved_us(self) -> int:
+        """When the newest attitude or position came; 0 before the first."""
+        heard_us = (self.state.heard_us.get(name, 0) for name in ATTITUDES)
+        return max(*heard_us, self.state.position_us, 0)
+
+    def silent_s(self, now_us: int) -> float:
+        """Return how long no heartbeat came; infinite if none ever did."""
+        return self.state.age_us(now_us, "HEARTBEAT") / US_PER_S
+
+    @property
+    def model(self) -> str:
+        """Its 3D model: `plane`, `copter`, `heli`, `rover`, `boat`, `balloon`, `none`."""
+        kind = self.state.kind()
+        if kind in PLANES:
+            return "plane"
+        return "copter" if kind in COPTERS else OTHERS.get(kind, "none")
+
+    @property
+    def home(self) -> Location | None:
+        """Home, if known."""
+        fields = self.state.fields.get("HOME_POSITION")
+        return None if fields is None else _location(named_position(fields))
+
+    @property
+    def fix(self) -> Location | None:
+        """The newest GPS fix of two dimensions or more."""
+        fields = self.state.fields.get("GPS_RAW_INT")
+        return None if fields is None else _location(position_of(GPS_IDS[0], fields))
+
+    def instant(self, now_us: int) -> Instant:
+        """Return the present state."""
+        state, gps = self.state, self.state.fix()
+        (q_nb, rates), (battery_v, battery_percent) = state.attitude(), state.battery()
+        at, hud = state.position or UNKNOWN_POSITION, state.fields.get("VFR_HUD")
+        mark, distance_m, bearing_deg = self._mark()
+        return Instant(
+            system_id=self.system_id,
+            time_us=self._moved_us,
+            title=self.title,
+            model=self.model,
+            origin=self.origin,
+            generation=self.generation,
+            silent_s=self.silent_s(now_us),
+            q_nb=q_nb,
+            rate_b_radps=rates,
+            lat_deg=at.lat_deg,
+            lon_deg=at.lon_deg,
+            alt_amsl_m=hud["alt"] if hud and not state.position else at.alt_amsl_m,
+            alt_home_m=at.alt_home_m,
+            vel_n_mps=at.vel_n_mps,
+            groundspeed_mps=hud["groundspeed"] if hud else at.groundspeed_mps,
+            airspeed_mps=state.airspeed_mps(),
+            climb_mps=hud["climb"] if hud else NAN,
+            heading_deg=state.heading_deg(),
+            pos_std_m=self._pos_std_m(),
+            fix_type=gps.fix_type if gps else 0,
+            satellites=state.satellites(),
+            fix=self.fix,
+            home=self.home,
+            mark=mark,
+            mark_distance_m=distance_m,
+            mark_bearing_deg=bearing_deg,
+            battery_v=battery_v,
+            battery_percent=battery_percent,
+            attitude_s=self._age_s(now_us, *ATTITUDES),
+            position_s=(now_us - state.position_us) / US_PER_S if state.position else NAN,
+            hud_s=self._age_s(now_us, "VFR_HUD"),
+            gps_s=self._age_s(now_us, "GPS_RAW_INT"),
+            battery_s=self._age_s(now_us, "BATTERY_STATUS", "SYS_STATUS"),
+            armed=state.is_armed(),
+        )
+
+    def _age_s(self, now_us: int, *names: str) -> float:
+        """Return the age of the newest of some messages; NaN if none came."""
+        age_us = self.state.age_us(now_us, *names)
+        return NAN if math.isinf(age_us) else age_us / US_PER_S
+
+    def _pos_std_m(self) -> float:
+        """Return the position's standard deviation: the estimator's, or the GPS receiver's."""
+        estimator, gps = self.state.fields.get("ESTIMATOR_STATUS"), self.state.fix()
+        if estimator and math.isfinite(estimator["pos_horiz_accuracy"]):
+            return float(estimator["pos_horiz_accuracy"])
+        return gps.h_acc_m if gps else NAN
+
+    def _mark(self) -> tuple[Location | None, float, float]:
+        """Return the mark, and the distance and bearing reported by the aircraft."""
+        way, at = self.state.fields.get("NAV_CONTROLLER_OUTPUT"), self.state.position
+        if way is None or at is None or not way["wp_dist"]:
+            return self.exact_mark, NAN, NAN
+        bearing_deg, distance_m = float(way["target_bearing"] % 360), float(way["wp_dist"])
+        if self.exact_mark is not None:
+            return self.exact_mark, distance_m, bearing_deg
+        lat_deg, lon_deg = vincenty.vreckon(at.lat_deg, at.lon_deg, distance_m, bearing_deg)
+        lon_deg = wrap_180(float(lon_deg))
+        return Location(float(lat_deg), lon_deg), distance_m, bearing_deg
+
+    def _note_fix(self, now_us: int) -> None:
+        if (at := self.fix) is None:
+            return
+        last = self.fixes[-1] if self.fixes else None
+        if last is None or (last.lat_deg, last.lon_deg) != (at.lat_deg, at.lon_deg):
+            self.fixes.append(TrackPoint(now_us, at.lat_deg, at.lon_deg, at.alt_amsl_m))
+
+
+def _location(at: Position | None) -> Location | None:
+    return None if at is None else Location(at.lat_deg, at.lon_deg, at.alt_amsl_m)
