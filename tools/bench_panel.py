@@ -253,7 +253,7 @@ def measure_hours() -> list[dict[str, float]]:
             found.append({"minute": minute, "memory_mb": memory_mb(os.getpid())})
         for message in vehicle.messages(count):
             decoded = reader.decode(bytearray(message.pack(sender)))
-            parts.fleet.take(decoded, count * 1_000_000 // RATE_HZ)
+            parts.fleet.update(decoded, count * 1_000_000 // RATE_HZ)
     return found
 
 

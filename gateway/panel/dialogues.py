@@ -70,12 +70,12 @@ class Dialogue:
         system_id, number = self.parameters.system_id, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
         return [command_long(system_id, number, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, SAMPLES_US)]
 
-    def take(self, message: Any, now_us: int) -> list[Any]:
-        """Process one message of the aircraft; return the messages to send."""
-        self.parameters.take(message, now_us)
+    def handle(self, message: Any, now_us: int) -> list[Any]:
+        """Handle one message of the aircraft; return the messages to send."""
+        self.parameters.handle(message, now_us)
         if self.calibration is not None:
-            self.calibration.take(message, now_us)
-        return self.files.take(message, now_us) + self._follow_files(now_us)
+            self.calibration.handle(message, now_us)
+        return self.files.handle(message, now_us) + self._follow_files(now_us)
 
     def poll(self, now_us: int) -> list[Any]:
         """Return the messages that are due by time."""
@@ -108,7 +108,7 @@ class Dialogues:
         self._send = send
         self._clock = clock
         self._task: asyncio.Task[None] | None = None
-        fleet.listen(self._take)
+        fleet.listen(self._handle)
         fleet.on_discard(self._discard)
 
     def start(self) -> None:
@@ -151,10 +151,10 @@ class Dialogues:
     def _discard(self, system_id: int) -> None:
         self._all.pop(system_id, None)
 
-    def _take(self, system_id: int, message: Any, now_us: int) -> None:
+    def _handle(self, system_id: int, message: Any, now_us: int) -> None:
         dialogue = self._all.get(system_id)
         if dialogue is not None:
-            self._send_all(dialogue.take(message, now_us))
+            self._send_all(dialogue.handle(message, now_us))
 
     async def _poll(self) -> None:
         while True:

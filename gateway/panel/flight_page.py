@@ -116,7 +116,7 @@ def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageF
     reader = mavlink.MAVLink(None)
     tracks: defaultdict[int, Continuity] = defaultdict(Continuity)
     for message in recorded.vehicle_messages(READ):
-        _take(flight, message, reader, tracks[message.system_id])
+        _add(flight, message, reader, tracks[message.system_id])
     flight.remarks += recorded.remarks
     flight.histories = {key: one for key, one in flight.histories.items() if len(one) > 1}
     if not flight.histories:
@@ -125,8 +125,8 @@ def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageF
     return flight
 
 
-def _take(flight: PageFlight, message: VehicleMessage, reader: Any, track: Continuity) -> None:
-    """Take in the next message of an aircraft."""
+def _add(flight: PageFlight, message: VehicleMessage, reader: Any, track: Continuity) -> None:
+    """Add the next message of an aircraft."""
     system_id, time_us = message.system_id, message.time_us
     if (text := message.text) is not None:
         if len(flight.texts) < MAX_TEXTS:
@@ -134,7 +134,7 @@ def _take(flight: PageFlight, message: VehicleMessage, reader: Any, track: Conti
         return
     vehicle = flight.aircraft.setdefault(system_id, VehicleState(system_id, "recorded"))
     with suppress(mavlink.MAVError):
-        vehicle.take(reader.decode(bytearray(message.frame)), time_us)
+        vehicle.update(reader.decode(bytearray(message.frame)), time_us)
     if (at := message.position) is None or vehicle.state.position is None:
         return
     place = (time_us, at.lat_deg, at.lon_deg, message.boot_us)

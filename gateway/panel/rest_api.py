@@ -80,8 +80,8 @@ class MessageBook:
         self.dropped = 0
         """Entries that made room for others."""
 
-    def take(self, message: Any, *, is_sent: bool = False) -> None:
-        """Take in one message, received or sent from here."""
+    def add(self, message: Any, *, is_sent: bool = False) -> None:
+        """Add one message, received or sent from here."""
         key = (message.get_srcSystem(), message.get_srcComponent(), message.msgname)
         if not is_sent:
             self._heard.add(key[:2])
@@ -292,7 +292,7 @@ class RestApi:
         self._uplink = uplink
         self._book = MessageBook(time.time)
         self._stream = MessageStream()
-        uplink.listen(self._take)
+        uplink.listen(self._on_message)
 
     def routers(self) -> list[APIRouter]:
         """Return the routers to include in an application."""
@@ -431,11 +431,11 @@ class RestApi:
             # Ids of a known system must not be used: the gateway would take that for a loop.
             system_id = component_id = 0
         size = self._uplink.send_as(message, system_id, component_id)
-        self._book.take(message, is_sent=True)
+        self._book.add(message, is_sent=True)
         return size
 
-    def _take(self, message: Any) -> None:
-        self._book.take(message)
+    def _on_message(self, message: Any) -> None:
+        self._book.add(message)
         self._stream.send(message)
 
 

@@ -250,17 +250,17 @@ class Uplink:
     def _make_hub(self, endpoints: tuple[str, ...], *, played: bool) -> Hub:
         def on_frame(incoming: Incoming) -> None:
             self._heard = incoming.frame
-            self._take(incoming.frame, played=played)
+            self._handle(incoming.frame, played=played)
 
         def on_foreign(frames: Sequence[bytes]) -> None:
             for frame in frames:
                 # A broadcast arrives both as ours and as foreign.
                 if frame is not self._heard:
-                    self._take(frame, played=played)
+                    self._handle(frame, played=played)
 
         return Hub(HubSettings(endpoints=endpoints), on_frame, self._clock, on_foreign=on_foreign)
 
-    def _take(self, frame: bytes, *, played: bool) -> None:
+    def _handle(self, frame: bytes, *, played: bool) -> None:
         if (origin_of(frame)[0] in self._fleet.origins) is not played:
             # Of two with the same id, the page uses the one that it assigned.
             return
@@ -274,7 +274,7 @@ class Uplink:
             self._heard_us = now_us
         if message.get_type() == "COMMAND_ACK":
             self._note_ack(message)
-        self._fleet.take(message, now_us)
+        self._fleet.update(message, now_us)
         for listener in self._listeners:
             listener(message)
 

@@ -32,7 +32,7 @@ def test_too_few_samples_are_refused_with_the_reason() -> None:
         compare([], {})
     memory = SampleMemory()
     for n in range(100):
-        memory.take(1, imu(n * 20_000), n * 20_000)
+        memory.add(1, imu(n * 20_000), n * 20_000)
     with pytest.raises(ComparisonError, match="2 s of samples at 50 Hz"):
         compare(memory.frames(1), {})
 
@@ -44,17 +44,17 @@ def test_share_of_the_needed_samples_is_reported(rate_hz: int, seconds: int, sha
     memory = SampleMemory()
     assert memory.collected(1, LEAST_S, LEAST_HZ) == 0.0
     for n in range(rate_hz * seconds + 1):
-        memory.take(1, imu(n), n * US_PER_S // rate_hz)
+        memory.add(1, imu(n), n * US_PER_S // rate_hz)
     assert memory.collected(1, LEAST_S, LEAST_HZ) == pytest.approx(share, abs=0.03)
 
 
 def test_newest_samples_suffice_if_the_earlier_ones_came_too_slowly() -> None:
     memory = SampleMemory()
     for n in range(150):
-        memory.take(1, imu(n * US_PER_S), n * US_PER_S)
+        memory.add(1, imu(n * US_PER_S), n * US_PER_S)
     for n in range(1100):
         time_us = 150 * US_PER_S + n * 20_000
-        memory.take(1, imu(time_us), time_us)
+        memory.add(1, imu(time_us), time_us)
     found = compare(memory.frames(1), {})
     assert np.ptp(found[0].time_us) / US_PER_S == pytest.approx(LEAST_S + 1.0, abs=1.0)
 
@@ -62,7 +62,7 @@ def test_newest_samples_suffice_if_the_earlier_ones_came_too_slowly() -> None:
 def test_samples_with_repeated_times_are_fused() -> None:
     memory = SampleMemory()
     for n in range(1200):
-        memory.take(1, imu(n // 5 * 100_000), n * 20_000)
+        memory.add(1, imu(n // 5 * 100_000), n * 20_000)
     found = compare(memory.frames(1), {})
     assert [each.name for each in found] == list(ESTIMATORS)
     assert {len(each.time_us) for each in found} == {120}
@@ -72,9 +72,9 @@ def test_samples_with_repeated_times_are_fused() -> None:
 
 def test_only_the_newest_minutes_of_sensor_frames_are_stored() -> None:
     memory = SampleMemory()
-    memory.take(1, mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3), 0)
+    memory.add(1, mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3), 0)
     assert memory.frames(1) == []
     for second in range(400):
-        memory.take(1, imu(second), second * US_PER_S)
+        memory.add(1, imu(second), second * US_PER_S)
     times = [time_us for time_us, _ in memory.frames(1)]
     assert times[-1] - times[0] == SPAN_US

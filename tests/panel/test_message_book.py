@@ -34,8 +34,8 @@ def book(wall: Wall) -> MessageBook:
     book = MessageBook(wall)
     for count in range(11):
         wall.now_s = 1_700_000_000.0 + count / 10
-        book.take(attitude(count / 2))
-    book.take(attitude(7, 2, 5))
+        book.add(attitude(count / 2))
+    book.add(attitude(7, 2, 5))
     return book
 
 
@@ -68,7 +68,7 @@ def test_status_has_count_frequency_and_times(book: MessageBook) -> None:
 def test_array_element_is_found_by_its_index(book: MessageBook) -> None:
     link = mavlink.MAVLink(None, 1, 1)
     message = mavlink.MAVLink_param_value_message(b"SPEED", 1.5, 9, 1, 0)
-    book.take(link.decode(bytearray(message.pack(link))))
+    book.add(link.decode(bytearray(message.pack(link))))
     path = "vehicles/1/components/1/messages/PARAM_VALUE/message/param_id"
     assert book.look_up(f"{path}/1") == "P"
     for element in ("16", "-1", "01", "+1"):
@@ -100,9 +100,9 @@ def test_forged_ids_are_dropped_before_entries_that_are_updated(
     monkeypatch.setattr(rest_api, bound, 3)
     for number in range(3, 10):
         wall.now_s += 1
-        book.take(attitude(9))
+        book.add(attitude(9))
         of_system = bound == "MAX_KINDS_OF_SYSTEM"
-        book.take(attitude(0, 1, number) if of_system else attitude(0, number))
+        book.add(attitude(0, 1, number) if of_system else attitude(0, number))
     assert book.look_up(f"{ATTITUDE}/message/roll") == 9
     everything = book.look_up("")["vehicles"]
     kept = everything["1"]["components"] if of_system else everything
@@ -114,7 +114,7 @@ async def test_tree_is_encoded_in_pieces_as_it_is_in_one(
     book: MessageBook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for number in range(20):
-        book.take(attitude(0, number + 3))
+        book.add(attitude(0, number + 3))
     monkeypatch.setattr(rest_api, "PIECE", 100)
     pieces = [piece async for piece in rest_api.encode_in_pieces(book.look_up(""))]
     assert max(map(len, pieces)) < 200
@@ -124,9 +124,9 @@ async def test_tree_is_encoded_in_pieces_as_it_is_in_one(
 
 def test_sent_message_is_listed_but_not_counted_as_received(book: MessageBook) -> None:
     assert book.has_heard(1, 1)
-    book.take(attitude(3, 255, 0), is_sent=True)
+    book.add(attitude(3, 255, 0), is_sent=True)
     path = "vehicles/255/components/0/messages/ATTITUDE/message/roll"
     assert book.look_up(path) == 3
     assert not book.has_heard(255, 0)
-    book.take(attitude(4, 255, 0))
+    book.add(attitude(4, 255, 0))
     assert book.has_heard(255, 0)

@@ -142,8 +142,8 @@ async def test_recording_is_visible_only_on_the_page_that_opened_it() -> None:
     playback = Playback(None, fleet, "mine")
     recorded = RecordedAircraft(1, RECORDED, Profile())
     (first,) = playback._number([[recorded]])
-    fleet.take(heartbeat(), 0)
-    fleet.take(heartbeat(system_id=first), 0)
+    fleet.update(heartbeat(), 0)
+    fleet.update(heartbeat(system_id=first), 0)
     assert set(fleet.visible("mine")) == {1, first}
     assert set(fleet.visible("another")) == set(fleet.visible("")) == {1}
     other = Playback(None, fleet, "another")

@@ -24,8 +24,8 @@ def fleet() -> FleetState:
     made = FleetState()
     made.origins[3] = Origin("recorded", 1)
     for system_id, lon_deg in ((1, 8.01), (2, 8.0), (3, 8.0)):
-        made.take(heartbeat(system_id=system_id), US_PER_S)
-        made.take(position(0.0, lon_deg, system_id=system_id), US_PER_S)
+        made.update(heartbeat(system_id=system_id), US_PER_S)
+        made.update(position(0.0, lon_deg, system_id=system_id), US_PER_S)
     return made
 
 

@@ -67,10 +67,10 @@ async def served() -> AsyncIterator[tuple[FleetState, Browser]]:
 
 async def test_slow_browser_gets_only_the_newest_state() -> None:
     async with served() as (fleet, browser):
-        fleet.take(position(10.0, 20.0), 0)
+        fleet.update(position(10.0, 20.0), 0)
         await browser.until(GRANTS)
         for step in range(200):
-            fleet.take(position(10.0 + step / 1000, 20.0), step)
+            fleet.update(position(10.0 + step / 1000, 20.0), step)
             await asyncio.sleep(0)
         assert len(browser.frames) == GRANTS
         await browser.grants.put("1")
@@ -88,7 +88,7 @@ async def test_unused_grants_do_not_accumulate() -> None:
         await browser.until(2 * GRANTS)
         before = len(browser.frames)
         for step in range(50):
-            fleet.take(position(10.0 + step / 1000, 20.0), step)
+            fleet.update(position(10.0 + step / 1000, 20.0), step)
             await asyncio.sleep(0)
         assert len(browser.frames) <= before + GRANTS
 
@@ -100,7 +100,7 @@ async def test_history_and_path_are_served_in_flight() -> None:
     async with httpx.AsyncClient(transport=transport, base_url="http://panel") as client:
         assert (await client.get("/history/1")).status_code == 404
         for n in range(2 * MAX_HISTORY):
-            fleet.take(position(47.0 + n * 1e-6, 8.0), n * 250_000)
+            fleet.update(position(47.0 + n * 1e-6, 8.0), n * 250_000)
         history = (await client.get("/history/1")).json()
         path = (await client.get("/path/1")).json()
     assert MAX_HISTORY // 2 < len(history["time_us"]) <= MAX_HISTORY

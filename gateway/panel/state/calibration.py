@@ -191,17 +191,17 @@ class CalibrationRun:
         """Return the command that cancels it: all zero."""
         return command_long(self.system_id, CALIBRATE)
 
-    def take(self, message: Any, now_us: int) -> None:
-        """Take in one message of the vehicle."""
+    def handle(self, message: Any, now_us: int) -> None:
+        """Handle one message of the vehicle."""
         match message.get_type():
             case "COMMAND_ACK" if message.command == CALIBRATE:
-                self._take_ack(message, now_us)
+                self._handle_ack(message, now_us)
             case "STATUSTEXT":
-                self._take_text(message.text, now_us)
+                self._handle_text(message.text, now_us)
             case "HIGHRES_IMU":
-                self._take_sample(_highres(message))
+                self._add_sample(_highres(message))
             case "SCALED_IMU" | "RAW_IMU":
-                self._take_sample(_milli(message))
+                self._add_sample(_milli(message))
 
     def poll(self, now_us: int) -> None:
         """Notice missing answers."""
@@ -253,7 +253,7 @@ class CalibrationRun:
             case CalibrationStep.MOUNTING:
                 return []
 
-    def _take_ack(self, message: Any, now_us: int) -> None:
+    def _handle_ack(self, message: Any, now_us: int) -> None:
         self._heard_us = now_us
         if self.state.is_over or self.state is RunState.CHECKING:
             return
@@ -271,7 +271,7 @@ class CalibrationRun:
             name = mavlink.enums["MAV_RESULT"][message.result].name.removeprefix("MAV_RESULT_")
             self._fail(name.lower().replace("_", " "))
 
-    def _take_text(self, text: str, now_us: int) -> None:
+    def _handle_text(self, text: str, now_us: int) -> None:
         if match := _FAILED.match(text):
             # The acknowledgement, which gives no reason, comes before it.
             self.state, self.trouble = RunState.FAILED, match[1]
@@ -301,7 +301,7 @@ class CalibrationRun:
         if self.state is not RunState.FAILED:
             self.state, self.trouble = RunState.FAILED, why
 
-    def _take_sample(self, sample: tuple[_Vector, _Vector, _Vector | None]) -> None:
+    def _add_sample(self, sample: tuple[_Vector, _Vector, _Vector | None]) -> None:
         into = {RunState.RUNNING: self._before, RunState.CHECKING: self._after}.get(self.state)
         if into is None:
             return

@@ -71,7 +71,7 @@ class FieldHistory:
     def __init__(self) -> None:
         self._vehicles: dict[int, dict[str, _Columns]] = {}
 
-    def take(self, system_id: int, message: Any, now_us: int) -> None:
+    def add(self, system_id: int, message: Any, now_us: int) -> None:
         """Store one message."""
         kinds = self._vehicles.setdefault(system_id, {})
         name = _kind_of(message)

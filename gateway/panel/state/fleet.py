@@ -71,8 +71,8 @@ class FleetState:
         for callback in self._on_discard:
             callback(system_id)
 
-    def take(self, message: Any, now_us: int) -> None:
-        """Take in a decoded message; those of ground stations and other components are ignored."""
+    def update(self, message: Any, now_us: int) -> None:
+        """Update the state of the sender, unless it is a ground station or another component."""
         system_id, component_id = message.get_srcSystem(), message.get_srcComponent()
         is_beat = message.get_msgId() == mavlink.MAVLINK_MSG_ID_HEARTBEAT
         autopilot = message.autopilot if is_beat else None
@@ -86,7 +86,7 @@ class FleetState:
             if origin := self.origins.get(system_id):
                 vehicle = VehicleState(system_id, origin.word, origin.recorded_id)
             self.vehicles[system_id] = vehicle
-        vehicle.take(message, now_us)
+        vehicle.update(message, now_us)
         self.version += 1
         for listener in self._listeners:
             listener(system_id, message, now_us)

@@ -65,8 +65,8 @@ class FileClient:
         self._wanted.append(path)
         return [] if self.busy else self._next(now_us)
 
-    def take(self, message: Any, now_us: int) -> list[Any]:
-        """Process one message of the vehicle; return the messages to send."""
+    def handle(self, message: Any, now_us: int) -> list[Any]:
+        """Handle one message of the vehicle; return the messages to send."""
         if message.get_type() != "FILE_TRANSFER_PROTOCOL" or self._asked is None:
             return []
         packet = decode_packet(bytes(message.payload))
@@ -309,11 +309,11 @@ class ParameterClient:
         self._changes[name] = _Change(value, now_us + QUIET_US)
         return [message]
 
-    def take(self, message: Any, now_us: int) -> None:
-        """Process one message of the vehicle; only those about parameters matter."""
+    def handle(self, message: Any, now_us: int) -> None:
+        """Handle one message of the vehicle; only those about parameters matter."""
         match message.get_type():
             case "PARAM_VALUE":
-                self._take_value(message, now_us)
+                self._handle_value(message, now_us)
             case "PARAM_ERROR":
                 name = message.param_id
                 if self._answered(name, now_us) is not None:
@@ -328,7 +328,7 @@ class ParameterClient:
         """Repeat requests without an answer; return the messages to send."""
         return self._poll_list(now_us) + self._poll_changes(now_us)
 
-    def _take_value(self, message: Any, now_us: int) -> None:
+    def _handle_value(self, message: Any, now_us: int) -> None:
         name, kind = message.param_id, message.param_type
         if name not in self.entries and len(self.entries) >= MAX_PARAMETERS:
             return

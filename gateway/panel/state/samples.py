@@ -32,7 +32,7 @@ class SampleMemory:
     def __init__(self) -> None:
         self._frames: dict[int, deque[tuple[int, bytes]]] = {}
 
-    def take(self, system_id: int, message: Any, now_us: int) -> None:
+    def add(self, system_id: int, message: Any, now_us: int) -> None:
         """Store a message, if it is a sensor's."""
         if message.get_msgId() not in SENSOR_MESSAGES:
             return

@@ -33,8 +33,8 @@ class StatusTexts:
         self._count = 0
         self._joiner = TextJoiner()
 
-    def take(self, message: Any, now_us: int) -> None:
-        """Take one STATUSTEXT; the chunks of a long one go into one entry, blanks into none."""
+    def feed(self, message: Any, now_us: int) -> None:
+        """Add one STATUSTEXT; the chunks of a long one go into one entry, blanks into none."""
         self._add(self._joiner.feed(bytes(message.get_msgbuf()), now_us))
 
     def poll(self, now_us: int) -> None:

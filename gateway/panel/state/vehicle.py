@@ -44,13 +44,13 @@ class VehicleState:
         self.exact_mark: Location | None = None
         """The mark from the gateway's control socket, exact where MAVLink is rounded."""
 
-    def take(self, message: Any, now_us: int) -> None:
-        """Take in one decoded message of this system's autopilot."""
+    def update(self, message: Any, now_us: int) -> None:
+        """Update the state by one decoded message of this system's autopilot."""
         name = message.get_type()
         has_moved = self.state.take(name, vars(message), now_us)
         self.texts.poll(now_us)
         if name == "STATUSTEXT":
-            self.texts.take(message, now_us)
+            self.texts.feed(message, now_us)
         elif name == "GPS_RAW_INT":
             self._note_fix(now_us)
         if has_moved and now_us - self.history.newest_us >= TRACK_INTERVAL_US:

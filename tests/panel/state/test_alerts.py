@@ -82,9 +82,9 @@ CASES: dict[str, tuple[list[tuple[float, Any]], float, list[tuple[str, str]]]] =
 def test_messages_begin_and_end_alerts(name: str) -> None:
     messages, at_s, expected = CASES[name]
     vehicle = VehicleState(1)
-    vehicle.take(HEARTBEAT, 0)
+    vehicle.update(HEARTBEAT, 0)
     for time_s, message in messages:
-        vehicle.take(decoded(message), round(time_s * US_PER_S))
+        vehicle.update(decoded(message), round(time_s * US_PER_S))
     found = alerts_of(vehicle, round(at_s * US_PER_S))
     assert [(alert.title, alert.detail) for alert in found] == expected
     assert all(

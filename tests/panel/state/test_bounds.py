@@ -21,7 +21,7 @@ class Memory:
 
     def __init__(self) -> None:
         self.fleet, self.history, self.samples = FleetState(), FieldHistory(), SampleMemory()
-        for listener in (self.history.take, self.samples.take):
+        for listener in (self.history.add, self.samples.add):
             self.fleet.listen(listener)
         for discard in (self.history.discard, self.samples.discard):
             self.fleet.on_discard(discard)
@@ -35,7 +35,7 @@ class Memory:
             now_us = step * US_PER_S // RATE_HZ
             slow: list[Any] = [heartbeat(), text] if step % RATE_HZ == 0 else []
             for message in (imu, attitude, here, *slow):
-                self.fleet.take(message, now_us)
+                self.fleet.update(message, now_us)
 
     @property
     def size(self) -> dict[str, int]:

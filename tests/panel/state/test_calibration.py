@@ -38,7 +38,7 @@ class Bench:
 
     def send(self, message: Any) -> None:
         frame = message.pack(self._mav)
-        self._take(self.vehicle.handle(Incoming(1, frame, True), self.now_us))
+        self._receive(self.vehicle.handle(Incoming(1, frame, True), self.now_us))
 
     def hold(
         self,
@@ -57,14 +57,14 @@ class Bench:
             if mag is not None:
                 values["mag_b_ut"] = mag
             sample = sample_at(self.now_us, **values)
-            self._take(self.vehicle.on_state(state_at(self.now_us), sample, self.now_us))
-            self._take(self.vehicle.poll(self.now_us))
+            self._receive(self.vehicle.on_state(state_at(self.now_us), sample, self.now_us))
+            self._receive(self.vehicle.poll(self.now_us))
             self.run.poll(self.now_us)
 
-    def _take(self, actions: Any) -> None:
+    def _receive(self, actions: Any) -> None:
         for action in actions:
             if hasattr(action, "frame"):
-                self.run.take(self._mav.decode(bytearray(action.frame)), self.now_us)
+                self.run.handle(self._mav.decode(bytearray(action.frame)), self.now_us)
 
 
 def test_gyro_calibration_reports_bias_before_and_after() -> None:
@@ -146,7 +146,7 @@ def test_cancelling_and_timeout_end_a_calibration() -> None:
 def test_denied_command_fails_the_calibration() -> None:
     run = CalibrationRun(1, CalibrationStep.GYRO, 0)
     command = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
-    run.take(mavlink.MAVLink_command_ack_message(command, mavlink.MAV_RESULT_DENIED), 0)
+    run.handle(mavlink.MAVLink_command_ack_message(command, mavlink.MAV_RESULT_DENIED), 0)
     assert (run.state, run.trouble) == (RunState.FAILED, "denied")
 
 
@@ -174,6 +174,6 @@ def test_scaled_and_raw_imu_are_read_in_thousandths(kind: Any) -> None:
     run = CalibrationRun(1, CalibrationStep.MAG, 0)
     run.state = RunState.RUNNING
     for mag in ((200, -30, 400), (0, 0, 0)):
-        run.take(kind(0, 0, 0, -1000, 0, 0, 0, *mag), 0)
+        run.handle(kind(0, 0, 0, -1000, 0, 0, 0, *mag), 0)
     # A field of nothing is that of a vehicle without a magnetometer.
     assert run.field_points.tolist() == [pytest.approx([20.0, -3.0, 40.0])]

@@ -47,7 +47,7 @@ class Bench:
             for action in actions:
                 if hasattr(action, "frame") and not self._is_lost():
                     message = self._mav.decode(bytearray(action.frame))
-                    waiting += self.client.take(message, self.now_us) or []
+                    waiting += self.client.handle(message, self.now_us) or []
             waiting += self.client.poll(self.now_us)
 
     def _is_lost(self) -> bool:
@@ -97,7 +97,7 @@ def test_second_change_before_the_answer_is_not_refused() -> None:
 
 def test_retry_sends_the_newest_value_of_an_unanswered_change() -> None:
     client = ParameterClient(1)
-    client.take(mavlink.MAVLink_param_value_message(b"P", 1.0, 9, 1, 0), 0)
+    client.handle(mavlink.MAVLink_param_value_message(b"P", 1.0, 9, 1, 0), 0)
     client.change("P", 2.0, 0)
     assert not client.change("P", 3.0, 0)
     [message] = client.poll(US_PER_S)
@@ -112,11 +112,11 @@ def test_unrequested_value_does_not_complete_the_list() -> None:
     client = ParameterClient(1)
     client.load(0)
     for message in (value_of("NEW", index=65535), value_of("A", index=0)):
-        client.take(message, 0)
+        client.handle(message, 0)
     assert client.state is ListState.LOADING
     assert [m.param_index for m in client.poll(2 * US_PER_S)] == [1]
-    client.take(value_of("B", index=1), 0)
-    client.take(value_of("A", index=65535), 0)
+    client.handle(value_of("B", index=1), 0)
+    client.handle(value_of("A", index=65535), 0)
     assert client.state is ListState.COMPLETE
     assert {name: entry.index for name, entry in client.entries.items()} == {
         "NEW": 65535, "A": 0, "B": 1,
@@ -126,13 +126,13 @@ def test_unrequested_value_does_not_complete_the_list() -> None:
 def test_number_of_parameters_is_bounded() -> None:
     client = ParameterClient(1)
     for index in range(MAX_PARAMETERS + 3):
-        client.take(value_of(f"P{index}", index=index, count=65_000), 0)
+        client.handle(value_of(f"P{index}", index=index, count=65_000), 0)
     assert len(client.entries) == MAX_PARAMETERS
 
 
 def test_change_without_an_answer_is_refused_after_retries() -> None:
     client = ParameterClient(1)
-    client.take(value_of("P", index=0), 0)
+    client.handle(value_of("P", index=0), 0)
     sent = client.change("P", 2.0, 0)
     for second in range(1, 30):
         sent += client.poll(second * US_PER_S)
@@ -159,7 +159,7 @@ def test_unknown_name_and_invalid_value_are_not_sent() -> None:
     client = ParameterClient(1)
     with pytest.raises(ValueError, match="no parameter NIX"):
         client.change("NIX", 1.0, 0)
-    client.take(mavlink.MAVLink_param_value_message(b"P", 1.0, 9, 1, 0), 0)
+    client.handle(mavlink.MAVLink_param_value_message(b"P", 1.0, 9, 1, 0), 0)
     with pytest.raises(ValueError, match="not a number"):
         client.change("P", math.nan, 0)
     with pytest.raises(ValueError, match="P cannot hold"):
@@ -169,14 +169,14 @@ def test_unknown_name_and_invalid_value_are_not_sent() -> None:
 
 def test_value_beyond_the_parameter_type_is_refused() -> None:
     client = ParameterClient(1)
-    client.take(mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3), 0)
-    client.take(mavlink.MAVLink_param_value_message(b"N", 0.0, 6, 1, 0), 0)
+    client.handle(mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3), 0)
+    client.handle(mavlink.MAVLink_param_value_message(b"N", 0.0, 6, 1, 0), 0)
     with pytest.raises(ValueError, match="N cannot hold"):
         client.change("N", 1e10, 0)
     assert client.change("N", 300.0, 0)
     # Changed again, and then the vehicle reports another type.
     client.change("N", 301.0, 0)
-    client.take(mavlink.MAVLink_param_value_message(b"N", 0.0, 1, 1, 0), 0)
+    client.handle(mavlink.MAVLink_param_value_message(b"N", 0.0, 1, 1, 0), 0)
     assert client.poll(2 * US_PER_S) == []
     assert client.refused == {"N": "N cannot hold 301"}
 
@@ -185,8 +185,8 @@ def test_integers_are_encoded_by_the_convention_of_the_autopilot() -> None:
     """PX4 packs their bytes into the float, ArduPilot writes the number."""
     for autopilot, on_the_wire in ((12, 7.0e-45), (3, 5.0)):
         client = ParameterClient(1)
-        client.take(mavlink.MAVLink_heartbeat_message(1, autopilot, 0, 0, 4, 3), 0)
-        client.take(mavlink.MAVLink_param_value_message(b"N", on_the_wire, 6, 1, 0), 0)
+        client.handle(mavlink.MAVLink_heartbeat_message(1, autopilot, 0, 0, 4, 3), 0)
+        client.handle(mavlink.MAVLink_param_value_message(b"N", on_the_wire, 6, 1, 0), 0)
         assert client.entries["N"].value == 5.0
         [message] = client.change("N", 5.0, 0)
         assert message.param_value == pytest.approx(on_the_wire, rel=0.01)
