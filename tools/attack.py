@@ -28,7 +28,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.hub.transports.datagram import UNPROVEN_FACTOR
 from gateway.live.control_socket import ControlError, request
-from gateway.panel.access import hash_password
+from gateway.panel.logins import hash_password
 from tests.kit.process import Process
 from tests.ports import free_port
 

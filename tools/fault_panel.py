@@ -30,7 +30,8 @@ from rich.console import Console
 from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from gateway.panel.access import COOKIE, hash_password
+from gateway.panel.access import COOKIE
+from gateway.panel.logins import hash_password
 from tests.kit.process import Process
 from tests.ports import free_port
 from tools.bench_panel import Vehicle, memory_mb

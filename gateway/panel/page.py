@@ -9,8 +9,8 @@ from typing import Any, Final
 from nicegui import ui
 from nicegui.element import Element
 
-from gateway.panel.access import Role
 from gateway.panel.added_views import ADDED_VIEWS, View
+from gateway.panel.admission import Role
 from gateway.panel.playback import Playback
 from gateway.panel.player_bar import PlayerBar
 from gateway.panel.view_context import WEB, PanelParts, ViewContext

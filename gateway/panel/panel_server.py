@@ -24,9 +24,10 @@ from starlette.websockets import WebSocket
 
 from gateway.clock import GatewayClock
 from gateway.live.terminal import on_end_signals, on_parent_gone
-from gateway.panel.access import HOLDER, ROLE, AccessControl, Logins, ScriptNonces
+from gateway.panel.access import HOLDER, ROLE, AccessControl
 from gateway.panel.connections import ConnectionLimits, LimitedProtocol, LimitedServer
 from gateway.panel.dialogues import Dialogues
+from gateway.panel.logins import Logins
 from gateway.panel.map_tiles import MapTiles
 from gateway.panel.open_pages import OpenPages
 from gateway.panel.page import build_page
@@ -34,6 +35,7 @@ from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.pointing_api import pointing_router
 from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.recording_transfer import add_recording_files
+from gateway.panel.response_headers import ScriptNonces
 from gateway.panel.rest_api import RestApi
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState

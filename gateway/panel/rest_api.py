@@ -27,11 +27,13 @@ from urllib.parse import quote
 from fastapi import APIRouter, Request, Response
 from pydantic_core import SchemaError, SchemaValidator, core_schema
 from starlette.responses import FileResponse, StreamingResponse
+from starlette.status import WS_1008_POLICY_VIOLATION
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gateway import __version__
 from gateway.hub.systems import FILTER_OPTIONS, NO_FILTER, SystemFilter, system_filter_from
-from gateway.panel.access import ROLE, WS_POLICY_VIOLATION, Role
+from gateway.panel.access import ROLE
+from gateway.panel.admission import Role
 from gateway.panel.uplink import Uplink
 from gateway.wire.mavlink_json import CLASSES, BadMessageError, from_json, template, to_json
 
@@ -402,7 +404,7 @@ class RestApi:
         with suppress(WebSocketDisconnect):
             while (given := await socket.receive())["type"] == "websocket.receive":
                 if not is_operator:
-                    await socket.close(WS_POLICY_VIOLATION, NOT_ALLOWED)
+                    await socket.close(WS_1008_POLICY_VIOLATION, NOT_ALLOWED)
                     return
                 text = given.get("text")
                 subscriber.push(

@@ -13,10 +13,10 @@ from typing import Any, Final
 import msgspec
 from fastapi import FastAPI
 from starlette.responses import Response, StreamingResponse
+from starlette.status import WS_1008_POLICY_VIOLATION
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gateway.clock import GatewayClock
-from gateway.panel.access import WS_POLICY_VIOLATION
 from gateway.panel.state.fleet import FleetState
 
 PATH: Final = "/telemetry"
@@ -54,7 +54,7 @@ class TelemetryFeed:
                 if message["type"] == "websocket.disconnect":
                     break
                 if message.get("text") != GRANT:
-                    await socket.close(WS_POLICY_VIOLATION, "only grants may be sent")
+                    await socket.close(WS_1008_POLICY_VIOLATION, "only grants may be sent")
                     break
                 if grants._value < GRANTS:  # noqa: SLF001 -- a browser may not save up
                     grants.release()

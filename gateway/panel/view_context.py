@@ -35,7 +35,7 @@ from typing import Any, Final
 from nicegui import ui
 
 from gateway.clock import GatewayClock
-from gateway.panel.access import Role
+from gateway.panel.admission import Role
 from gateway.panel.dialogues import Dialogue, Dialogues
 from gateway.panel.map_tiles import MapTiles
 from gateway.panel.open_pages import OpenPages

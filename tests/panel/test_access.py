@@ -19,27 +19,17 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.types import Message, Receive, Scope, Send
 
-from gateway.panel import access
-from gateway.panel.access import (
-    COOKIE,
-    HEADERS,
-    MAX_ATTEMPTS,
-    MAX_BODY,
-    MAX_LOGIN_BODY,
-    ROLE,
-    AccessControl,
-    Logins,
-    ScriptNonces,
-    hash_password,
-    matches,
-)
+from gateway.panel import access, logins
+from gateway.panel.access import COOKIE, MAX_BODY, MAX_LOGIN_BODY, ROLE, AccessControl
+from gateway.panel.logins import MAX_ATTEMPTS, Logins, hash_password, matches
 from gateway.panel.panel_server import PanelError, tls_files, without_traceback
 from gateway.panel.panel_settings import LEAST_COST, PanelSettings
+from gateway.panel.response_headers import HEADERS, ScriptNonces
 
 HERE = "http://127.0.0.1:14590"
 with pytest.MonkeyPatch.context() as patch:
     # A hash contains its cost: checking these takes half of the time.
-    patch.setattr(access, "COST", LEAST_COST)
+    patch.setattr(logins, "COST", LEAST_COST)
     OPERATOR, VIEWER = hash_password("tower"), hash_password("guest")
 
 
@@ -305,7 +295,7 @@ async def test_parallel_login_attempts_of_an_address_are_limited(
     locked: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hashed: list[str] = []
-    monkeypatch.setattr(access, "matches", lambda password, _: hashed.append(password))
+    monkeypatch.setattr(logins, "matches", lambda password, _: hashed.append(password))
     answers = await asyncio.gather(
         *(locked.post("/login", data={"password": f"guess {n}"}) for n in range(100))
     )
@@ -330,7 +320,7 @@ async def test_passwords_are_hashed_one_at_a_time(
         running.pop()
         return False
 
-    monkeypatch.setattr(access, "matches", slow)
+    monkeypatch.setattr(logins, "matches", slow)
     await asyncio.gather(*(locked.post("/login", data={"password": "x"}) for _ in range(4)))
     assert max(peak) == 1
 

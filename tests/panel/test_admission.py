@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from gateway.panel import access
-from gateway.panel.access import HOLDER, BusyError, Logins, hash_password
+from gateway.panel.access import HOLDER
 from gateway.panel.admission import Holder, Places, Role
+from gateway.panel.logins import SESSIONS_OF_ROLE, BusyError, Logins, hash_password
 from gateway.panel.open_pages import PENDING_OF_SESSION, OpenPages
 
 OPERATOR, VIEWER = Role.OPERATOR, Role.VIEWER
@@ -76,7 +76,7 @@ def test_many_logins_of_viewers_log_no_operator_out() -> None:
     viewers = [logins.open_session(VIEWER, f"10.0.{n % 7}.1") for n in range(200)]
     assert logins.role_of(operator) is OPERATOR
     assert logins.role_of(viewers[-1]) is VIEWER
-    assert len(ended) == len(set(ended)) == 200 - access.SESSIONS_OF_ROLE
+    assert len(ended) == len(set(ended)) == 200 - SESSIONS_OF_ROLE
 
 
 async def test_wrong_passwords_of_many_networks_delay_a_login_by_one_of_each(

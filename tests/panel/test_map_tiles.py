@@ -19,7 +19,7 @@ from fastapi import FastAPI
 from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
 
-from gateway.panel.access import Role
+from gateway.panel.admission import Role
 from gateway.panel.map_tiles import MAX_FILES, MAX_TILE, MapTiles, tidy
 from gateway.panel.panel_settings import MapStyle, PanelSettings
 from tests.panel.web_client import client_as

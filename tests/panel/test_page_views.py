@@ -18,7 +18,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from gateway.estimation.select import ESTIMATORS
 from gateway.live.control_socket import request
-from gateway.panel.access import hash_password
+from gateway.panel.logins import hash_password
 from tests.kit.process import wait_for
 from tests.panel.bench_receiver import RATE_HZ, BenchReceiver
 from tests.panel.browsing import (

@@ -22,7 +22,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
-from gateway.panel.access import COOKIE, AccessControl, Logins, hash_password
+from gateway.panel.access import COOKIE, AccessControl
+from gateway.panel.logins import Logins, hash_password
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.rest_api import (
     MAX_WAITING_BYTES,

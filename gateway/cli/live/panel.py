@@ -66,7 +66,7 @@ def panel(
     from gateway.panel.panel_server import PanelError, run_panel
 
     if hash_password:
-        from gateway.panel.access import hash_password as hashed
+        from gateway.panel.logins import hash_password as hashed
 
         print(f'password = "{hashed(typer.prompt("Password", hide_input=True))}"')
         return
