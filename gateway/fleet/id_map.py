@@ -42,8 +42,9 @@ class IdMap:
     """System ids assigned once and kept as long as there are enough.
 
     A vehicle keeps the id that it has at its site if that is free here, else it gets the lowest
-    free one. No site gets more than `per_site`, nor more than are left for the others. Where none
-    is left, `make_room` finds a vehicle that is no longer received.
+    free one. No site gets more than `per_site`, nor do all sites of one client together; and none
+    gets more than are left for the others. Where none is left, `make_room` finds a vehicle that is
+    no longer received.
     """
 
     def __init__(self, known: Mapping[Vehicle, int] | None = None, per_site: int = LAST_ID) -> None:
@@ -56,6 +57,8 @@ class IdMap:
         """Vehicles for which no id is left."""
         self.left_out: set[Vehicle] = set()
         """Vehicles excluded by the operator."""
+        self.clients: dict[str, str] = {}
+        """Client of each site, if known; else a site is a client of its own."""
         for vehicle, own_id in (known or {}).items():
             if own_id == LEFT_OUT:
                 self.left_out.add(vehicle)
@@ -70,7 +73,7 @@ class IdMap:
             return own_id
         if vehicle in self.unmapped or vehicle in self.left_out:
             return None
-        share = self._shares()[site]
+        share = self._shares()[self._client_of(site)]
         if share >= self._per_site or share >= LAST_ID - len(self._ids):
             if len(self.unmapped) < MAX_WAITING:
                 self.unmapped.add(vehicle)
@@ -92,14 +95,22 @@ class IdMap:
         idle = [each for each in self._ids if received_us.get(each, 0) < idle_since_us]
         idle.sort(key=lambda each: received_us.get(each, 0))
         one_of_site = {each[0]: each for each in self.unmapped}
-        for site in sorted(one_of_site, key=lambda each: shares[each]):
+        for site in sorted(one_of_site, key=lambda each: shares[self._client_of(each)]):
+            share = shares[self._client_of(site)]
             for former in idle:
-                may_grow = shares[site] < self._per_site and shares[former[0]] > shares[site]
-                if former[0] == site or may_grow:
+                client = self._client_of(former[0])
+                may_grow = share < self._per_site and shares[client] > share
+                if client == self._client_of(site) or may_grow:
                     own_id = self._ids.pop(former)
                     self._give(one_of_site[site], own_id)
                     return Handover(own_id, former, one_of_site[site])
         return None
+
+    def set_client(self, site: str, client: str) -> None:
+        """Set whose places a site uses; waiting vehicles ask again with their next frames."""
+        if self.clients.get(site) != client:
+            self.clients[site] = client
+            self.unmapped.clear()
 
     def known_id(self, site: str, system_id: int) -> int | None:
         """Return the id of a vehicle here, if it has one."""
@@ -144,7 +155,10 @@ class IdMap:
         return out + sorted(self._ids.items(), key=lambda item: item[1])
 
     def _shares(self) -> Counter[str]:
-        return Counter(site for site, _ in self._ids)
+        return Counter(self._client_of(site) for site, _ in self._ids)
+
+    def _client_of(self, site: str) -> str:
+        return self.clients.get(site, site)
 
     def _is_free(self, own_id: int) -> bool:
         return FIRST_ID <= own_id <= LAST_ID and own_id not in self._vehicles

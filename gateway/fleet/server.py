@@ -39,6 +39,8 @@ log = logging.getLogger(__name__)
 NO_BROADCASTS: Final = frozenset({1 << 24})
 """No message has this number. No site receives the telemetry of another: it gets frames addressed
 to its vehicles, and broadcasts of ground stations."""
+NO_CLIENT: Final = ""
+"""Client of all sites without a session of their own."""
 MAX_SESSIONS: Final = 16
 """Sessions under the name of one site that are remembered; more are forged."""
 
@@ -180,6 +182,8 @@ class FleetServer:
         self._metrics = MetricsServer(self._metrics_text)
         self._metrics_port = hub_settings.metrics_port
         self._sites: dict[str, SiteClient] = {}
+        self._site_of_session: dict[str, str] = {}
+        """The site that each linked session has announced first."""
         self._bad_names = 0
         self._task: asyncio.Task[None] | None = None
         own: Verbs = {"fleet.status": self.status, "fleet.id": self._set_id}
@@ -227,6 +231,9 @@ class FleetServer:
             "is_linked": self._session.is_linked,
             "sites": [self._sites[name].describe(now_us) for name in sorted(self._sites)],
             "unmapped": sorted(f"{site}/{system}" for site, system in self._ids.unmapped),
+            "without_session": sorted(
+                site for site, client in self._ids.clients.items() if client == NO_CLIENT
+            ),
             "left_out": sorted(f"{site}/{system}" for site, system in self._ids.left_out),
             "bad_names": self._bad_names,
             "looped": self._loops.looped,
@@ -271,11 +278,28 @@ class FleetServer:
             now_us = self._now_us()
             for site in self._sites.values():
                 site.translation.mark(now_us)
+            self._find_clients()
             self._make_room(now_us)
             if self._ping_interval_us and now_us - self._ping_us >= self._ping_interval_us:
                 self._ping_us = now_us
                 self._session.ask_round_trips()
             await asyncio.sleep(POLL_S)
+
+    def _find_clients(self) -> None:
+        """Note which client each site belongs to, so that no client takes all ids by many names.
+
+        A site belongs to the linked session that announces it, which may announce no other one.
+        All sites without a session of their own share the places of one client.
+        """
+        if (clients := self._session.clients()) is None:
+            return
+        sessions = self._site_of_session
+        for gone in sessions.keys() - clients.keys():
+            del sessions[gone]
+        for name, site in self._sites.items():
+            for token in site.tokens & clients.keys():
+                if sessions.setdefault(token, name) == name:
+                    self._ids.set_client(name, clients[token])
 
     def _make_room(self, now_us: int) -> None:
         """Pass on the id of one abandoned vehicle, and remove abandoned sites."""
@@ -293,6 +317,7 @@ class FleetServer:
             for name, site in list(self._sites.items()):
                 if not site.is_here and now_us - (site.heard_us or site.since_us) > ABANDONED_US:
                     del self._sites[name]
+                    self._ids.clients.pop(name, None)
                     self._hub.vanish(site)
 
     def _handle(self, name: str, payload: Payload, is_own: bool) -> None:
@@ -316,6 +341,8 @@ class FleetServer:
             session=self._session,
             translation=FrameTranslation(name, self._ids, self._signatures.get(name), self._loops),
         )
+        if self._session.is_router:
+            self._ids.set_client(name, NO_CLIENT)
         self._hub.appear(site)
         return site
 

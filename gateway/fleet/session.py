@@ -128,6 +128,13 @@ class FleetSession:
         """Messages dropped because they arrived faster than they were handled."""
         return sum(each.dropped for each in self._subscriptions)
 
+    def clients(self) -> dict[str, str] | None:
+        """Return the certificate name of each linked session, or its id; None if not the router."""
+        if self._connection is None or not self.is_router:
+            return None
+        links = self._connection.session.info.links()
+        return {str(link.zid): link.auth_identifier or str(link.zid) for link in links}
+
     async def open(self) -> None:
         """Open the session if it is not open, and subscribe; log a failure once."""
         if self._connection is not None:

@@ -46,7 +46,7 @@ class FleetSettings(Settings, frozen=True):
         str, setting("Zenoh's own configuration file: TLS, certificates, access control.")
     ] = ""
     vehicles_per_site: Annotated[
-        int, setting("Most system ids that one site may use.", ge=1, le=249)
+        int, setting("Most system ids of one site, and of all sites of one client.", ge=1, le=249)
     ] = 50
     ids_file: Annotated[str, setting("File that keeps the system ids of all vehicles.")] = (
         "~/.config/mavgate/fleet.json"

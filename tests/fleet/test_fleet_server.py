@@ -19,6 +19,7 @@ from gateway.fleet.id_map import LAST_ID
 from gateway.fleet.server import FleetServer
 from gateway.fleet.settings import FleetSettings
 from gateway.hub.settings import HubSettings
+from gateway.hub.transports.zenoh.session import open_session, out_key, presence_key, session_config
 from gateway.live.control_socket import ControlError, request
 from gateway.wire.mavlink_signing import EPOCH_2015_US, TICK_US, key_from_passphrase
 from tests.fleet.conftest import World, run
@@ -301,6 +302,33 @@ async def test_two_sites_of_one_name_are_reported(
     first.close()
     await world.until(lambda: site_of(world, "field-a")["sessions"] == 1)
     assert site_of(world, "field-a")["is_here"], "the other one is there still"
+
+
+async def test_one_session_under_many_names_takes_no_more_ids_than_one_site(world: World) -> None:
+    thief = open_session(session_config(world.locator, ""))
+    tokens = [
+        thief.liveliness().declare_token(presence_key(f"field-{n}", thief.zid())) for n in range(6)
+    ]
+    ids = world.fleet._ids
+
+    def forge(least: int) -> bool:
+        for number in range(6):
+            for system in range(1, 60):
+                key = out_key(f"field-{number}", system)
+                thief.put(key, world.rig.sender(system).heartbeat())
+        return len(ids.items()) >= least
+
+    # Those of the one site that the session may announce, and of all without a session.
+    await world.until(lambda: forge(100))
+    world.open_site("field-late")
+    await world.until(lambda: forge(101))
+    await world.until(lambda: ids.known_id("field-late", 1) is not None)
+    assert len(ids.items()) == 101
+    assert len(world.fleet.status()["without_session"]) == 5
+    assert "sharing the ids of one site: field-" in await run("fleet", "status")
+    for token in tokens:
+        token.undeclare()
+    thief.close()
 
 
 async def test_excluded_vehicle_is_not_shown(world: World, tmp_path: Path) -> None:

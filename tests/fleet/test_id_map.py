@@ -89,6 +89,23 @@ def test_site_gets_no_more_ids_than_its_limit() -> None:
     assert ids.known_id("field", 4) == 9, "the operator may exceed the limit"
 
 
+def test_sites_of_one_client_share_the_limit_of_one_site() -> None:
+    ids = IdMap(per_site=3)
+    for number in range(5):
+        ids.set_client(f"forged-{number}", "thief")
+    given = [ids.id_of(f"forged-{n}", system) for n in range(5) for system in (1, 2)]
+    assert [each for each in given if each is not None] == [1, 2, 3]
+    assert ids.id_of("field", 1) == 4
+    ids.set_client("forged-4", "its own session")
+    assert ids.id_of("forged-4", 1) is not None
+    assert ids.id_of("forged-2", 1) is None
+    received_us = {vehicle: 1000 for vehicle, _ in ids.items()}
+    assert ids.make_room(received_us | {("field", 1): 0}, 1000) is None
+    done = ids.make_room(received_us | {("forged-0", 1): 0}, 1000)
+    assert done is not None
+    assert (done.former, done.holder) == (("forged-0", 1), ("forged-2", 1))
+
+
 def test_received_vehicle_keeps_its_id() -> None:
     ids = filled(8)
     assert ids.id_of("field", 7) is None

@@ -91,6 +91,9 @@ def status(*, json: JsonOption = False) -> None:
     if found["unmapped"]:
         text = f"no id left for: {', '.join(found['unmapped'])}; give one by `mavgate fleet id`"
         console.print(text)
+    if found["without_session"]:
+        names = ", ".join(found["without_session"])
+        console.print(f"without a session of their own, sharing the ids of one site: {names}")
     if found["left_out"]:
         console.print(f"excluded: {', '.join(found['left_out'])}")
     if found["overflowed"]:
