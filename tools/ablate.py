@@ -66,7 +66,7 @@ class Mechanism(NamedTuple):
 
 
 FILTER: Final = "gateway.estimation.eskf"
-VALIDITY: Final = ("predict.store_integrals", "predict.look_back", "fixes.past_state")
+VALIDITY: Final = ("predict.store_integrals", "predict.look_back", "fix_model.past_state")
 SENSORS: Final = ("faults.check_sensor", "faults.check_sensors", "faults.is_hanging")
 MECHANISMS: Final = (
     Mechanism("noise by vibration", "filter", "add_vibration", NOTHING, ("predict.add_vibration",)),
@@ -102,8 +102,8 @@ MECHANISMS: Final = (
     Mechanism("time of validity of a fix", "fixes", "look_back", at_present, VALIDITY),
     Mechanism("GPS latency from motion", "latency", "slew_latency", NOTHING, ("latency",)),
     Mechanism(
-        "GPS glitches", "fixes", "raise_glitch_variance", NOTHING,
-        ("fixes.raise_glitch_variance",),
+        "GPS glitches", "fix_model", "raise_glitch_variance", NOTHING,
+        ("fix_model.raise_glitch_variance",),
     ),
     Mechanism("faults of inertial sensors", "faults", "check_sensor", ZERO, SENSORS),
 )  # fmt: skip

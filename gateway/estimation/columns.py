@@ -79,6 +79,14 @@ ROW_FLAGS: Final = (
 
 _flags_of = cache(NavFlags)
 """They are the same for many samples; a lookup costs a tenth of making them."""
+FLAG: Final = cast(Any, namedtuple("Flag", NavFlags.__members__))(*map(int, NavFlags))
+"""The bits of `NavFlags` by their names, as plain numbers for compiled code."""
+HEADING_VALID_RAD: Final = 0.26
+"""A heading is valid up to this standard deviation."""
+BARO_STALE_S: Final = 2.0
+"""A barometer without readings for longer is not in use."""
+FRESH_GPS_S: Final = 1.5
+"""Without an accepted fix for longer than this, the estimate is dead reckoning."""
 
 
 def imu_row(sample: ImuSample) -> ImuRow:
@@ -160,17 +168,6 @@ def nav_row(state: NavState) -> list[float]:
         *s.q_nb, *s.rate_b_radps, s.lat_deg, s.lon_deg, s.alt_amsl_m, *s.vel_n_mps,
         *s.attitude_std_rad, *s.vel_std_mps, *s.pos_std_m, float(s.flags),
     ]  # fmt: skip
-
-
-FLAG: Final = cast(Any, namedtuple("Flag", NavFlags.__members__))(*map(int, NavFlags))
-"""The bits of `NavFlags` by their names, as plain numbers for compiled code."""
-
-HEADING_VALID_RAD: Final = 0.26
-"""A heading is valid up to this standard deviation."""
-BARO_STALE_S: Final = 2.0
-"""A barometer without readings for longer is not in use."""
-FRESH_GPS_S: Final = 1.5
-"""Without an accepted fix for longer than this, the estimate is dead reckoning."""
 
 
 @compiled

@@ -58,22 +58,17 @@ class SampleLog:
     """Shape (m, GPS_COLUMNS)."""
 
 
-def contiguous(log: SampleLog) -> SampleLog:
-    """Return the log with contiguous arrays; those that are so are not copied."""
-    return SampleLog(*(np.ascontiguousarray(getattr(log, field.name)) for field in fields(log)))
-
-
-def log_arrays(log: SampleLog) -> kernels.LogArrays:
-    """Return where the contiguous arrays of a log lie; valid as long as these live."""
+def log_arrays(log: SampleLog) -> tuple[SampleLog, kernels.LogArrays]:
+    """Return a log with contiguous arrays, and where they lie; valid as long as these live."""
+    log = SampleLog(*(np.ascontiguousarray(getattr(log, field.name)) for field in fields(log)))
     numbers = {field.name: address_of(getattr(log, field.name)) for field in fields(log)}
     numbers["imu_count"] = len(log.imu_time_us)
     numbers["baro_count"] = len(log.baro_time_us)
     numbers["gps_count"] = len(log.gps_time_us)
-    return filled_record(kernels.LogArrays, numbers)
+    return log, filled_record(kernels.LogArrays, numbers)
 
 
-@dataclass(frozen=True, slots=True)
-class FoundLatency:
+class FoundLatency(NamedTuple):
     """A GPS latency that manoeuvres have shown."""
 
     latency_s: float
@@ -104,7 +99,7 @@ class CompiledEstimator:
     """
 
     def __init__(self, kernels: Kernels, gains: Any, reference: ReferenceSettings) -> None:
-        self._kernels, self._gains = kernels, gains
+        self._kernels, self.gains = kernels, gains
         self._gains_at = address_of(gains)
         self._reference = reference
         self._earth = EarthField(reference)
@@ -218,7 +213,7 @@ class KernelEstimator(CompiledEstimator):
     """The Kalman filter; its parameters are those of `CompiledEstimator`."""
 
     _state: State
-    _gains: Gains
+    gains: Gains
 
     def __init__(self, gains: Gains, reference: ReferenceSettings) -> None:
         super().__init__(ESKF, gains, reference)
@@ -236,7 +231,7 @@ class KernelEstimator(CompiledEstimator):
 
     def latency_of(self, log: SampleLog) -> float:
         """Return the GPS latency of a whole log, s: the set one, or that shown by manoeuvres."""
-        other = KernelEstimator(self._gains, self._reference)
+        other = KernelEstimator(self.gains, self._reference)
         other.restore(self.snapshot())
         other.run(log)
         found, set_s = other.found_latency(), self._reference.gps_latency_s
@@ -248,11 +243,6 @@ class KernelEstimator(CompiledEstimator):
         if std_s > KNOWN_STD_S:
             return None
         return FoundLatency(float(self._state.latency_found[0]), std_s)
-
-    @property
-    def gains(self) -> Gains:
-        """The record of constants."""
-        return self._gains
 
     def run(self, log: SampleLog) -> FloatArray:
         """Advance over a whole log, with the same bits as sample by sample.
@@ -268,7 +258,6 @@ class KernelEstimator(CompiledEstimator):
             One row per IMU sample.
         """
         out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
-        log = contiguous(log)
-        arrays = log_arrays(log)
+        log, arrays = log_arrays(log)
         kernels.run(self._at, self._gains_at, address_of(arrays), address_of(out))
         return out

@@ -109,6 +109,8 @@ REST_S: Final = 1.5
 FIRST_RATE_HZ: Final = 100.0
 RATE_CHANGE: Final = 0.1
 """The filters are redesigned when the sample rate changes by this share."""
+FLOAT: Final = np.dtype(np.float64)
+INT: Final = np.dtype(np.int64)
 
 
 class PaperSettings(Settings, frozen=True):
@@ -257,17 +259,15 @@ def update_imu(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> b
         s.time_us = time_us
         if sound:
             follow_rate(s, p, dt_s)
+            force, rate = accel, gyro
             if row[ACCEL_FILTERED] == 0.0:
                 c = s.lowpass
-                accel_lowpass = filter_step((c[0], c[1], c[2], c[3], c[4]), s.delays[0], accel)
-            else:
-                accel_lowpass = accel
-            rate = gyro
+                force = filter_step((c[0], c[1], c[2], c[3], c[4]), s.delays[0], accel)
             if row[GYRO_FILTERED] == 0.0:
                 c = s.highpass
                 rate = filter_step((c[0], c[1], c[2], c[3], c[4]), s.delays[1], gyro)
             follow_rest(s, accel, gyro, dt_s)
-            advance(s, p, accel_lowpass, difference(rate, as_vec(s.bias_b)), dt_s)
+            advance(s, p, force, difference(rate, as_vec(s.bias_b)), dt_s)
     if dt_s >= 0.0 and norm_sq(mag) > 0.0 and is_below(mag, math.inf):
         correct_yaw(s, p, mag)
     return sound
@@ -439,8 +439,6 @@ def moved(location: Vec3, vel: Vec3, dt_s: float) -> Vec3:
 
 STATE_LAYOUT: Final = layout(PaperState)
 GAINS_LAYOUT: Final = layout(PaperGains)
-FLOAT: Final = np.dtype(np.float64)
-INT: Final = np.dtype(np.int64)
 
 
 @EntryPoint

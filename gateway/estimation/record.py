@@ -20,6 +20,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 Declared = TypeVar("Declared")
+Packed = tuple[int, bytes]
+"""A mark of the layout, and the bytes of a record."""
 
 
 def layout(declaration: type) -> np.dtype[np.void]:
@@ -60,10 +62,6 @@ def filled_record(declaration: type[Declared], values: dict[str, Any]) -> Declar
 def copy_record(record: Declared) -> Declared:
     """Copy a record, for a state that is read out or restored."""
     return cast(Declared, cast(np.void, record).copy())
-
-
-Packed = tuple[int, bytes]
-"""A mark of the layout, and the bytes of a record."""
 
 
 def pack_record(record: object) -> Packed:

@@ -16,6 +16,8 @@ FIELD_RENEWAL_M: Final = 20_000.0
 NO_DECLINATION_RAD: Final = 0.29
 """Magnetic north may be off by so much where the declination is not known: the root of the mean
 square of the declination within 60 deg of the equator."""
+EarthLocation = tuple[float, float, MagneticField]
+"""Latitude and longitude in degrees, and the model's field there."""
 
 
 class ReferenceSettings(Settings, frozen=True):
@@ -63,10 +65,6 @@ def is_usable(fix: GpsFix, settings: ReferenceSettings) -> bool:
         and not fix.h_acc_m > settings.gps_max_h_acc_m
         and (fix.lat_dege7, fix.lon_dege7) != (0, 0)
     )
-
-
-EarthLocation = tuple[float, float, MagneticField]
-"""Latitude and longitude in degrees, and the model's field there."""
 
 
 class EarthField:

@@ -20,27 +20,21 @@ class Estimator(Protocol):
 
     def update_imu(self, sample: ImuSample) -> NavState:
         """Advance by one IMU sample and return the state at its time."""
-        ...
 
     def update_baro(self, sample: BaroSample) -> None:
         """Use one barometer sample."""
-        ...
 
     def update_gps(self, fix: GpsFix) -> None:
         """Use one GPS fix at its arrival; the estimator compensates the latency."""
-        ...
 
     def snapshot(self) -> bytes:
         """Return the whole state."""
-        ...
 
     def restore(self, snapshot: bytes) -> None:
         """Continue from a snapshot to the last bit; raises ValueError for another estimator's."""
-        ...
 
     def reset(self) -> None:
         """Discard everything except the settings."""
-        ...
 
 
 Maker = Callable[["EstimationSettings"], Estimator]
@@ -79,17 +73,7 @@ def make_estimator(settings: EstimationSettings) -> Estimator:
     return ESTIMATORS[settings.estimator](settings)
 
 
-def _make_eskf(settings: EstimationSettings) -> Estimator:
-    return KernelEstimator(make_gains(settings.eskf, settings.reference), settings.reference)
-
-
-def _make_paper(settings: EstimationSettings) -> Estimator:
-    return PaperEstimator(settings.paper, settings.reference)
-
-
-add_estimator("eskf", _make_eskf)
-add_estimator("paper", _make_paper)
-
-
+add_estimator("eskf", lambda s: KernelEstimator(make_gains(s.eskf, s.reference), s.reference))
+add_estimator("paper", lambda s: PaperEstimator(s.paper, s.reference))
 OWN_ESTIMATORS: Final = tuple(ESTIMATORS)
 """The estimators of this package, without those of extensions."""

@@ -71,7 +71,7 @@ from gateway.estimation.eskf.state import (
     VEL,
     State,
 )
-from gateway.estimation.kernel import KernelEstimator, SampleLog, contiguous, log_arrays
+from gateway.estimation.kernel import KernelEstimator, SampleLog, log_arrays
 from gateway.estimation.record import FloatArray, IntArray, as_quat, copy_record
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import displacement_m, radii_m
@@ -153,15 +153,6 @@ def end_stretch(s: State, copy: State, F: FloatArray, predicted: FloatArray) -> 
 
 
 @compiled
-def is_reset(s: State, copy: State) -> bool:
-    """Return whether a part of the filter has been reset since the copy was made."""
-    for k in range(STATES):
-        if s.resets[k] != copy.resets[k]:
-            return True
-    return bool(s.started != copy.started)
-
-
-@compiled
 def move_copy(s: State, p: Gains, time_us: int, row: FloatArray, used: bool, F: FloatArray) -> None:
     """Move the copy by one IMU sample, if the filter has used it."""
     if s.started == 0 or time_us <= s.time_us:
@@ -177,11 +168,14 @@ def move_copy(s: State, p: Gains, time_us: int, row: FloatArray, used: bool, F: 
 
 
 @compiled
-def share_raised(s: State, copy: State) -> None:
-    """Raise variances of the copy as those of the filter."""
+def share_raised(s: State, copy: State) -> bool:
+    """Raise variances of the copy as those of the filter; return whether that was reset since."""
+    reset = s.started != copy.started
     for k in range(STATES):
         copy.P[k, k] += s.raised[k] - copy.raised[k]
         copy.raised[k] = s.raised[k]
+        reset = reset or s.resets[k] != copy.resets[k]
+    return reset
 
 
 @compiled
@@ -258,8 +252,7 @@ def run_forward(
             s.blend_n[:] = 0.0
             update_imu(s, p, now_us, row)
             move_copy(copy, p, now_us, row, s.imu_s == s.time_s, F)
-            share_raised(s, copy)
-            reset = is_reset(s, copy)
+            reset = share_raised(s, copy)
             was_reset[i] = 1 if reset else 0
             write_row(s, copy, p, reset, row_at(outputs, i, NAV_COLUMNS))
         propagate(s, p)
@@ -301,8 +294,7 @@ def smooth(estimator: KernelEstimator, log: SampleLog) -> tuple[FloatArray, floa
     out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
     P, F, predicted = (np.empty((count, STATES, STATES)) for _ in range(3))
     d, reset = np.empty((count, STATES)), np.zeros(len(out), np.uint8)
-    log = contiguous(log)
-    arrays = log_arrays(log)
+    log, arrays = log_arrays(log)
     run_forward(
         address_of(states),
         address_of(gains),

@@ -38,7 +38,7 @@ def started(dip_rad: float = DIP_RAD, strength_ut: float = STRENGTH_UT) -> State
     s = new_record(State)
     start(s, GAINS)
     s.started = 1
-    s.earth_field[1], s.earth_field[2] = DIP_RAD, STRENGTH_UT
+    s.earth_dip_rad, s.earth_norm_ut = DIP_RAD, STRENGTH_UT
     s.field_n[0] = strength_ut * math.cos(dip_rad)
     s.field_n[2] = strength_ut * math.sin(dip_rad)
     return s
@@ -69,7 +69,7 @@ def test_field_unlike_the_model_has_little_weight_before_a_usual_one_is_known() 
     assert field_weight(s, GAINS, STRENGTH_UT, DIP_RAD, 0.01) == pytest.approx(1.0)
     assert field_weight(s, GAINS, 1.2 * STRENGTH_UT, DIP_RAD, 0.01) < 0.1
     assert field_weight(s, GAINS, STRENGTH_UT, DIP_RAD - 0.2, 0.01) < 0.1
-    s.earth_field[2] = math.nan
+    s.earth_norm_ut = math.nan
     assert field_weight(s, GAINS, 1.2 * STRENGTH_UT, DIP_RAD, 0.01) == 1.0
 
 

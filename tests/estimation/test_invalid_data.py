@@ -26,11 +26,7 @@ from gateway.estimation.columns import (
     NAV_QUAT,
     NAV_VEL,
 )
-from gateway.estimation.eskf.filter import clear_times
-from gateway.estimation.eskf.fixes import is_zero_velocity_wrong
-from gateway.estimation.eskf.state import State
 from gateway.estimation.kernel import SampleLog
-from gateway.estimation.record import new_record
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import NavFlags
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -233,22 +229,6 @@ def test_zero_velocity_contradicted_by_positions_is_not_used(flight: Flight) -> 
     counted = replace(flight, counts=late, log=log, q_nb=flight.q_nb[: len(out)])
     scores = attitude_scores(counted, out[:, :4])
     assert max(scores["heading"], scores["inclination"]) < 3.5
-
-
-def test_zero_velocity_is_accepted_at_rest_and_rejected_in_motion(rng: np.random.Generator) -> None:
-    s = new_record(State)
-    clear_times(s)
-    zero, refuted = (0.0, 0.0, 0.0), []
-    for k in range(600):
-        north_m, east_m = 2.0 * rng.standard_normal(2)
-        if k >= 300:
-            north_m += 1.5 * (k - 300)
-        s.time_s = 0.2 * k
-        refuted.append(is_zero_velocity_wrong(s, (north_m, east_m, 0.0), zero))
-    assert not any(refuted[:300])
-    assert all(refuted[330:])
-    assert not is_zero_velocity_wrong(s, zero, (0.1, 0.0, 0.0))
-    assert not is_zero_velocity_wrong(s, zero, zero)
 
 
 @pytest.mark.parametrize("has_velocity", [True, False])

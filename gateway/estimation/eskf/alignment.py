@@ -22,7 +22,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import MOMENTS, NEVER_S, State
-from gateway.estimation.record import as_quat, write_quat, write_vec
+from gateway.estimation.record import as_quat, as_vec, write_quat, write_vec
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import (
     from_rotation_vector,
@@ -84,27 +84,28 @@ def add_velocity(
 
     Returns the length in s of the pair that it completes, or 0.
     """
-    dt = valid_s - s.pair_s
-    if not 0.0 <= dt <= MAX_PAIR_S:
+    v, f, dt = as_vec(s.pair_vel), as_vec(s.pair_force), valid_s - s.pair_s
+    if 0.0 <= dt < PAIR_S:
+        return 0.0
+    completes = 0.0 <= dt <= MAX_PAIR_S
+    if not completes:
         clear_pairs(s)
-        begin_pair(s, valid_s, vel, force_i)
+    s.pair_s = valid_s
+    write_vec(s.pair_vel, vel)
+    write_vec(s.pair_force, force_i)
+    if not completes:
         return 0.0
-    if dt < PAIR_S:
-        return 0.0
-    v, f = s.pair_vel, s.pair_force
     north, east = (vel[0] - v[0]) / dt, (vel[1] - v[1]) / dt
-    down = (vel[2] - v[2]) / dt
     force = ((force_i[0] - f[0]) / dt, (force_i[1] - f[1]) / dt, (force_i[2] - f[2]) / dt)
-    begin_pair(s, valid_s, vel, force_i)
     late_sq = p.gps_jitter_sq * (north * north + east * east)
     # Over one second the noise that successive differences share averages out.
     weight = dt / (2.0 * (noise_mps * noise_mps + late_sq))
-    reference = (north, east, down - STANDARD_GRAVITY_MPS2)
+    reference = (north, east, (vel[2] - v[2]) / dt - STANDARD_GRAVITY_MPS2)
     excess = contradiction(s, reference, force, weight)
     if excess > 0.0:
         s.fix_excess = max(s.fix_excess, excess)
         clear_pairs(s)
-        begin_pair(s, valid_s, vel, force_i)
+        s.pair_s = valid_s
         return 0.0
     add_pair(s, reference, force, weight, dt)
     return dt
@@ -125,14 +126,6 @@ def contradiction(s: State, reference: Vec3, force: Vec3, weight: float) -> floa
     if off_sq < MISMATCH_MPS2**2 + MISMATCH_SIGMA**2 * misfit / weight:
         return 0.0
     return off_sq * weight / (2.0 * ENOUGH_PAIRS)
-
-
-@compiled
-def begin_pair(s: State, time_s: float, vel: Vec3, force_i: Vec3) -> None:
-    """Begin the next pair."""
-    s.pair_s = time_s
-    write_vec(s.pair_vel, vel)
-    write_vec(s.pair_force, force_i)
 
 
 @compiled

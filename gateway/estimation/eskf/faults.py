@@ -78,12 +78,6 @@ WANDER_RADPS: Final = 0.05
 
 
 @compiled
-def is_zero_sample(gyro: Vec3, accel: Vec3) -> bool:
-    """Return whether a sample is all zeros, as of a sensor that has just been reset."""
-    return not (gyro[0] or gyro[1] or gyro[2] or accel[0] or accel[1] or accel[2])
-
-
-@compiled
 def is_start(s: State, gyro: Vec3, accel: Vec3) -> bool:
     """Return whether the filter may start with a sample, and set the fault if not."""
     force = math.sqrt(norm_sq(accel)) / STANDARD_GRAVITY_MPS2
@@ -150,8 +144,8 @@ def check_sensors(
     accel_fault = check_sensor(s, 1, accel, ACCEL_LIMIT_MPS2, same_gyro, dt)
     s.fault = 1 if gyro_fault == 2 or accel_fault == 2 or clipped != 0.0 else 0
     s.sound_s = s.sound_s + dt if s.fault == 0 else 0.0
-    # A bus error changes both sensors; a blow changes the force alone.
-    odd = gyro_fault == 1 or is_zero_sample(gyro, accel)
+    # A bus error changes both sensors, as a reset to zeros; a blow changes the force alone.
+    odd = gyro_fault == 1 or norm_sq(gyro) + norm_sq(accel) == 0.0
     good_gyro, good_accel = gyro_fault == 0 and not odd, accel_fault == 0 and not odd
     for k in range(3):
         s.imu_last[k], s.imu_last[3 + k] = gyro[k], accel[k]
@@ -177,14 +171,6 @@ def substitute_accel(s: State) -> Vec3:
         return as_vec(s.imu_held[3:6])
     gravity = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, STANDARD_GRAVITY_MPS2))
     return difference(as_vec(s.accel_bias_b), gravity)
-
-
-@compiled
-def add_clipping_noise(s: State, dt: float) -> None:
-    """Add noise for a sensor at the end of its range: as much as it reads may be cut off."""
-    for k in range(3):
-        s.pending_noise[0] += (dt * s.imu_held[k]) ** 2
-        s.pending_noise[1] += (dt * s.imu_held[3 + k]) ** 2
 
 
 @compiled
@@ -265,6 +251,7 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     turn = from_rotation_vector(scaled(rate, dt))
     write_quat(s.q_nb, normalise(multiply(as_quat(s.q_nb), turn)))
     write_quat(s.q_ib, normalise(multiply(as_quat(s.q_ib), turn)))
+    flown_s = 0.0
     if s.aided == 1:
         # Fixes in the gap have moved position and velocity already.
         flown_s = min(s.time_s - s.fix_s, dt)
@@ -276,9 +263,7 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
         chord = math.sin(half_rad) / half_rad if abs(half_rad) > 1e-6 else 1.0
         for k in range(3):
             s.pos_n[k] += mean[k] * flown_s * (chord if k < 2 else 1.0)
-        add_gap_variance(s, turned_var, flown_s)
-    else:
-        add_gap_variance(s, turned_var, 0.0)
+    add_gap_variance(s, turned_var, flown_s)
     if s.lost == 0 and turned_var > LOST_LEVEL_RAD * LOST_LEVEL_RAD:
         lose_attitude(s, p)
 

@@ -41,7 +41,6 @@ from gateway.estimation.eskf.faults import (
     GAP_S,
     GYRO_LIMIT_RADPS,
     UNKNOWN_REPEAT_S,
-    add_clipping_noise,
     bridge_gap,
     check_sensors,
     close_gap,
@@ -50,7 +49,6 @@ from gateway.estimation.eskf.faults import (
     interpolate,
     is_hanging,
     is_start,
-    is_zero_sample,
     substitute_accel,
     substitute_gyro,
 )
@@ -65,7 +63,6 @@ from gateway.estimation.eskf.integrity import (
     reset_accel_bias,
     reset_gyro_bias,
 )
-from gateway.estimation.eskf.latency import begin_latency
 from gateway.estimation.eskf.magnetometer import (
     STALE_MAG_S,
     hard_iron_var,
@@ -105,7 +102,7 @@ from gateway.estimation.eskf.update import (
 from gateway.estimation.record import FloatArray, as_quat, as_vec, layout, write_quat, write_vec
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.geometry.geodesy import offset_deg
-from gateway.geometry.quaternion import is_below
+from gateway.geometry.quaternion import is_below, norm_sq
 from gateway.records import NAN, UNKNOWN_VEC3, Vec3
 from gateway.units import RAD_PER_DEG
 
@@ -143,10 +140,10 @@ def start(s: State, p: Gains) -> None:
         s.rate_b[k] = NAN
     s.mag_latency_s = p.mag_latency_s
     s.P[MAG_LATENCY, MAG_LATENCY] = p.mag_latency_var
-    s.earth_field[0] = p.declination_rad
-    s.earth_field[1] = s.earth_field[2] = NAN
+    s.declination_rad = p.declination_rad
+    s.earth_dip_rad = s.earth_norm_ut = NAN
     s.fix_excess = 1.0
-    begin_latency(s, p.gps_latency_s)
+    s.gps_latency_s = p.gps_latency_s
     clear_times(s)
 
 
@@ -154,8 +151,8 @@ def start(s: State, p: Gains) -> None:
 def clear_times(s: State) -> None:
     """Discard everything that depends on the clock."""
     s.mag_s = s.mag_used_s = s.fix_s = s.update_s = s.level_s = NEVER_S
-    s.baro_s = s.reject_last[0] = s.track_from[0] = s.zero_from[0] = NEVER_S
-    s.reject_s, s.zero_velocity_wrong = 0.0, 0
+    s.baro_s = s.rejected_s = s.track_s = NEVER_S
+    s.reject_s = 0.0
     close_gap(s)
 
 
@@ -191,7 +188,7 @@ def update_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
 def end_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, since_s: float) -> None:
     """Bridge a gap at the first sound sample after it."""
     sound = is_below(gyro, GYRO_LIMIT_RADPS) and is_below(accel, ACCEL_LIMIT_MPS2)
-    if not sound or is_zero_sample(gyro, accel):
+    if not sound or norm_sq(gyro) + norm_sq(accel) == 0.0:
         s.fault = 1
         return
     bridge_gap(s, p, gyro, accel, since_s)
@@ -275,7 +272,10 @@ def move(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, dt: float)
         accel = substitute_accel(s)
     integrate(s, p, gyro, accel, dt)
     if clipped != 0.0:
-        add_clipping_noise(s, dt)
+        # As much as a sensor reads at the end of its range may be cut off.
+        for k in range(3):
+            s.pending_noise[0] += (dt * s.imu_held[k]) ** 2
+            s.pending_noise[1] += (dt * s.imu_held[3 + k]) ** 2
     store_integrals(s)
     return sound
 
@@ -288,18 +288,12 @@ def level(s: State, p: Gains) -> None:
         return
     s.level_s = s.time_s
     if s.aided == 1 and s.time_s - s.fix_s > p.dead_reckoning_s:
-        end_dead_reckoning(s, p)
+        propagate(s, p)
+        end_aiding(s)
     if s.aided == 0:
         level_by_gravity(s, p, min(since_s, 1.0))
     if s.at_rest == 1:
         update_rest(s, p)
-
-
-@compiled
-def end_dead_reckoning(s: State, p: Gains) -> None:
-    """Stop estimating position and velocity."""
-    propagate(s, p)
-    end_aiding(s)
 
 
 @compiled
@@ -352,8 +346,7 @@ def heading_std_rad(s: State) -> float:
 def write_position(s: State, row: FloatArray) -> None:
     """Write position, velocity and their standard deviations; NaN for the unknown."""
     write_vec(row[NAV_VEL : NAV_VEL + 3], UNKNOWN_VEC3)
-    write_vec(row[NAV_VEL_STD : NAV_VEL_STD + 3], UNKNOWN_VEC3)
-    write_vec(row[NAV_POS_STD : NAV_POS_STD + 3], UNKNOWN_VEC3)
+    row[NAV_VEL_STD : NAV_POS_STD + 3] = NAN
     row[NAV_LAT] = row[NAV_LON] = NAN
     row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 or s.baro_s != NEVER_S else NAN
     if s.has_origin == 0:
@@ -391,7 +384,7 @@ def flags_of(s: State, p: Gains) -> int:
     if s.fix_s == NEVER_S:
         return flags
     hold_s = p.dead_reckoning_s if s.aided == 1 else UNAIDED_VALID_S
-    return flags | gps_flags(s.time_s - s.fix_s, s.time_s - s.reject_last[0], hold_s)
+    return flags | gps_flags(s.time_s - s.fix_s, s.time_s - s.rejected_s, hold_s)
 
 
 @compiled

@@ -1,14 +1,4 @@
-"""GPS fixes as they arrive: recognised, completed, and used to start, restart or update.
-
-A fix is compared with the state at the time it was valid, `L` seconds ago, and its row carries that
-state's error to the present one:
-
-    vel_then = vel - att x S + R L accel_bias
-    pos_then = pos - L vel + att x (L S - D) - R L^2 / 2 accel_bias
-
-with `S` and `D` the first and second integral of the specific force over the lag. This equals
-fusing the fix in time, but for the process noise of the few tenths of a second between.
-"""
+"""GPS fixes as they arrive: recognised, completed, and used to start, restart or update."""
 
 import math
 from typing import Final
@@ -18,13 +8,10 @@ from gateway.estimation.columns import (
     GPS_ALT,
     GPS_DECLINATION,
     GPS_DIP,
-    GPS_H_ACC,
     GPS_LAT,
     GPS_LON,
-    GPS_SPEED_ACC,
     GPS_STRENGTH,
     GPS_USABLE,
-    GPS_V_ACC,
     GPS_VEL,
 )
 from gateway.estimation.eskf.alignment import (
@@ -36,14 +23,18 @@ from gateway.estimation.eskf.alignment import (
     add_velocity,
 )
 from gateway.estimation.eskf.faults import gap_limit_s
+from gateway.estimation.eskf.fix_model import (
+    is_unlikely,
+    past_state,
+    set_error_variances,
+    update_fix,
+)
 from gateway.estimation.eskf.integrity import check_attitude, lose_attitude
 from gateway.estimation.eskf.latency import compare_latencies
-from gateway.estimation.eskf.magnetometer import STALE_MAG_S, raise_hard_iron, turn_heading
+from gateway.estimation.eskf.magnetometer import raise_hard_iron, turn_heading
 from gateway.estimation.eskf.predict import look_back, propagate
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import (
-    ACCEL_BIAS,
-    ATT,
     GPS_ERROR,
     GYRO_SCALE,
     NEVER_S,
@@ -53,29 +44,18 @@ from gateway.estimation.eskf.state import (
     reset_state,
     reset_states,
 )
-from gateway.estimation.eskf.update import (
-    clear_row,
-    inject,
-    innovation_variance,
-    restart_baro,
-    update_scalar,
-)
-from gateway.estimation.record import FloatArray, as_quat, as_vec, write_vec
+from gateway.estimation.eskf.update import restart_baro
+from gateway.estimation.record import FloatArray, as_vec, write_vec
 from gateway.geometry.geodesy import displacement_m, offset_deg
-from gateway.geometry.quaternion import body_axes, difference, is_below, norm_sq, scaled
+from gateway.geometry.quaternion import difference, is_below, norm_sq
 from gateway.records import NAN, Vec3
-from gateway.units import STANDARD_GRAVITY_MPS2
 
 FASTEST_MPS: Final = 1000.0
 """A larger velocity is an error."""
 BASELINE_S: Final = 2.0 * PAIR_S
 """Positions closer together differ mostly by their noise."""
-ZERO_S: Final = 3.0
-ZERO_MPS: Final = 2.0
-"""Fixes that move so fast for this time contradict a velocity of exactly zero."""
 AFTER_GAP_S: Final = 2.0
-"""For so long after a gap, corrections of the position are blended in, and fixes, some of which may
-have waited, show no latency."""
+"""After a gap: corrections of the position are blended in, and late fixes show no latency."""
 STATIONARY_MPS: Final = 0.1
 """A receiver at rest reports up to this speed, and may repeat itself."""
 SLOWEST_FIXES_S: Final = 1.1
@@ -91,27 +71,6 @@ AGREE_S: Final = 5.0
 FIRST_VELOCITY_VAR: Final = 0.5**2
 NO_VELOCITY_VAR: Final = 5.0**2
 """Of the first velocity with and without one in the fix, m2/s2."""
-NOISE_SHARE: Final = 0.2
-"""Share of a receiver's accuracy that is noise from fix to fix."""
-ERROR_SHARES: Final = (0.7, 0.7, 0.9)
-"""Share of it that is slow error, north, east (of a radial accuracy) and down."""
-SPEED_SHARES: Final = (0.4, 0.4, 0.8)
-"""Share of its speed accuracy that is noise of one axis."""
-SLOW_ERROR_MPS: Final = 0.05
-SLOW_ERROR_S: Final = 4.0
-"""Slow error of GPS velocities where the receiver reports none, and its correlation time."""
-LEAST_FIX_INTERVAL_S: Final = 0.05
-"""Fixes closer together count as that far apart."""
-LEAST_LAG_S: Final = 0.1
-"""Over less, a mean acceleration is mostly vibration."""
-GLITCH_GATE_SQ: Final = (9.0, 16.0)
-MAX_GLITCH: Final = (5.0, 30.0)
-"""Gates of velocity and position beyond which an innovation is a glitch, and its largest size."""
-GLITCH_S: Final = 10.0
-"""Fixes of this time share a glitch."""
-GLITCH_FADE_S: Final = 1.0
-RECEIVER_LAG_S: Final = 0.2
-"""Lag of the receiver's own filter in a manoeuvre."""
 
 
 @compiled
@@ -127,8 +86,6 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
         compare_latencies(s, p.gps_latency_s, arrival_s, reported)
     wanted_s = arrival_s - s.gps_latency_s
     pos = position_of(s, row)
-    if is_zero_velocity_wrong(s, pos, reported):
-        reported = (NAN, NAN, NAN)
     vel, vel_s = complete_velocity(s, wanted_s, pos, reported)
     sound = is_below(vel, FASTEST_MPS)
     if sound:
@@ -177,30 +134,30 @@ def is_new_fix(s: State, row: FloatArray) -> bool:
     lat, lon, vel = row[GPS_LAT], row[GPS_LON], as_vec(row[GPS_VEL : GPS_VEL + 3])
     if row[GPS_USABLE] == 0.0 or not math.isfinite(lat + lon):
         return False
-    last, has_velocity = s.fix_last, is_below(vel, FASTEST_MPS)
-    repeated = lat == last[0] and lon == last[1]
+    has_velocity = is_below(vel, FASTEST_MPS)
+    repeated = lat == s.newest_lat_deg and lon == s.newest_lon_deg
     if has_velocity:
-        repeated = repeated and norm_sq(difference(vel, as_vec(last[2:5]))) == 0.0
+        repeated = repeated and norm_sq(difference(vel, as_vec(s.newest_vel))) == 0.0
     if not repeated:
-        last[0], last[1], last[5] = lat, lon, s.time_s
-        write_vec(last[2:5], vel)
+        s.newest_lat_deg, s.newest_lon_deg, s.newest_s = lat, lon, s.time_s
+        write_vec(s.newest_vel, vel)
         return True
     if has_velocity:
         return math.sqrt(norm_sq(vel)) <= STATIONARY_MPS
-    return bool(s.time_s - last[5] >= SLOWEST_FIXES_S)
+    return bool(s.time_s - s.newest_s >= SLOWEST_FIXES_S)
 
 
 @compiled
 def learn_declination(s: State, row: FloatArray) -> None:
     """Take the Earth's field at a fix; a magnetic heading becomes a true one."""
     if math.isfinite(row[GPS_DIP] + row[GPS_STRENGTH]):
-        s.earth_field[1], s.earth_field[2] = row[GPS_DIP], row[GPS_STRENGTH]
+        s.earth_dip_rad, s.earth_norm_ut = row[GPS_DIP], row[GPS_STRENGTH]
     if not math.isfinite(row[GPS_DECLINATION]):
         return
-    s.earth_field[0] = row[GPS_DECLINATION]
+    s.declination_rad = row[GPS_DECLINATION]
     if s.heading_known == 1 and s.heading_true == 0:
         s.heading_true = 1
-        turn_heading(s, s.earth_field[0])
+        turn_heading(s, s.declination_rad)
 
 
 @compiled
@@ -211,9 +168,8 @@ def position_of(s: State, row: FloatArray) -> Vec3:
     elif math.hypot(s.pos_n[0], s.pos_n[1]) > ORIGIN_RENEWAL_M:
         lat, lon = offset_deg(s.origin[0], s.origin[1], 0.0, s.pos_n[0], s.pos_n[1])
         north, east = displacement_m(s.origin[0], s.origin[1], lat, lon, 0.0)
-        for from_pos in (s.track_from, s.zero_from):
-            from_pos[1] -= north
-            from_pos[2] -= east
+        s.track_pos_n[0] -= north
+        s.track_pos_n[1] -= east
         s.pos_n[0] -= north
         s.pos_n[1] -= east
         s.origin[0], s.origin[1] = lat, lon
@@ -228,33 +184,17 @@ def is_level_sound(vel: Vec3) -> bool:
 
 
 @compiled
-def is_zero_velocity_wrong(s: State, pos: Vec3, vel: Vec3) -> bool:
-    """Return whether the positions contradict a velocity of exactly zero."""
-    if vel[0] != 0.0 or vel[1] != 0.0 or vel[2] != 0.0:
-        s.zero_from[0], s.zero_velocity_wrong = NEVER_S, 0
-        return False
-    dt = s.time_s - s.zero_from[0]
-    if not 0.0 <= dt < ZERO_S:
-        if s.zero_from[0] != NEVER_S:
-            way_m = math.hypot(pos[0] - s.zero_from[1], pos[1] - s.zero_from[2])
-            s.zero_velocity_wrong = 1 if way_m > ZERO_MPS * dt else 0
-        s.zero_from[0] = s.time_s
-        write_vec(s.zero_from[1:4], pos)
-    return s.zero_velocity_wrong == 1
-
-
-@compiled
 def complete_velocity(s: State, valid_s: float, pos: Vec3, vel: Vec3) -> tuple[Vec3, float]:
     """Return the velocity of a fix, from two positions where it has none, and its time.
 
     Without heights it does not climb; unknown components are NaN.
     """
-    f = s.track_from
-    dt = valid_s - f[0]
+    f = s.track_pos_n
+    dt = valid_s - s.track_s
     if is_below(vel, FASTEST_MPS) or not 0.0 <= dt < BASELINE_S:
-        f[0] = valid_s
-        track = ((pos[0] - f[1]) / dt, (pos[1] - f[2]) / dt, (pos[2] - f[3]) / dt)
-        write_vec(f[1:4], pos)
+        s.track_s = valid_s
+        track = ((pos[0] - f[0]) / dt, (pos[1] - f[1]) / dt, (pos[2] - f[2]) / dt)
+        write_vec(f, pos)
         if is_below(vel, FASTEST_MPS):
             return vel, valid_s
         known = 0.0 <= dt <= MAX_PAIR_S
@@ -285,7 +225,7 @@ def pair_velocity(s: State, p: Gains, vel_s: float, vel: Vec3, noise_mps: float)
 def accept_fix(s: State) -> None:
     """Record that a fix was used."""
     s.fix_s = s.time_s
-    s.reject_s, s.reject_last[0] = 0.0, NEVER_S
+    s.reject_s, s.rejected_s = 0.0, NEVER_S
 
 
 @compiled
@@ -297,23 +237,23 @@ def fuse_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, lag: flo
     off_pos = difference(difference(pos, past_pos), as_vec(s.gps_error_n))
     off_vel = difference(vel, past_vel)
     far = math.hypot(off_pos[0], off_pos[1]) >= p.gate_m and is_unlikely(s, p, row, off_pos, lag)
-    if far and have_agreed(s, p, pos, vel):
+    agreed = far and have_agreed(s, p, pos, vel)
+    if agreed:
         restart_at(s, p, pos, as_vec(s.fix_vel), lag)
-        accept_fix(s)
-        return
-    update_fix(s, p, row, off_pos, off_vel, lag)
-    if not far:
+    else:
+        update_fix(s, p, row, off_pos, off_vel, lag)
+    if agreed or not far:
         accept_fix(s)
 
 
 @compiled
 def have_agreed(s: State, p: Gains, pos: Vec3, vel: Vec3) -> bool:
     """Return whether rejected fixes have agreed with one another for the relocking time."""
-    last = s.reject_last
-    dt = s.time_s - last[0]
-    off_m = math.hypot(pos[0] - last[1] - vel[0] * dt, pos[1] - last[2] - vel[1] * dt)
+    last = s.rejected_pos_n
+    dt = s.time_s - s.rejected_s
+    off_m = math.hypot(pos[0] - last[0] - vel[0] * dt, pos[1] - last[1] - vel[1] * dt)
     s.reject_s = s.reject_s + dt if dt < AGREE_S and off_m < AGREE_M else 0.0
-    last[0], last[1], last[2] = s.time_s, pos[0], pos[1]
+    s.rejected_s, last[0], last[1] = s.time_s, pos[0], pos[1]
     return bool(s.reject_s > p.gps_relock_s)
 
 
@@ -363,184 +303,3 @@ def start_position(s: State, k: int, value: float, noise_var: float) -> None:
     reset_state(s, POS + k, error_var + noise_var)
     reset_state(s, GPS_ERROR + k, error_var)
     s.P[POS + k, GPS_ERROR + k] = s.P[GPS_ERROR + k, POS + k] = -error_var
-
-
-@compiled
-def past_state(s: State, lag: float) -> tuple[Vec3, Vec3]:
-    """Return position and velocity `lag` seconds ago, from the present ones and `then`."""
-    now, then = s.integrals, s.then
-    vel = difference(as_vec(s.vel_n), difference(as_vec(now[3:6]), as_vec(then[3:6])))
-    pos = (
-        s.pos_n[0] - vel[0] * lag - (now[6] - then[6] - then[3] * lag),
-        s.pos_n[1] - vel[1] * lag - (now[7] - then[7] - then[4] * lag),
-        s.pos_n[2] - vel[2] * lag - (now[8] - then[8] - then[5] * lag),
-    )
-    return pos, vel
-
-
-@compiled
-def lag_integrals(s: State, lag: float) -> tuple[Vec3, Vec3]:
-    """Return `S` and `D`: the specific force in NED integrated once and twice over the lag."""
-    now, then, g = s.integrals, s.then, STANDARD_GRAVITY_MPS2
-    once = (now[3] - then[3], now[4] - then[4], now[5] - then[5] - g * lag)
-    twice = (
-        now[6] - then[6] - then[3] * lag,
-        now[7] - then[7] - then[4] * lag,
-        now[8] - then[8] - then[5] * lag - 0.5 * g * lag * lag,
-    )
-    return once, twice
-
-
-@compiled
-def set_error_variances(s: State, p: Gains, row: FloatArray) -> None:
-    """Take the slow errors of a fix from the accuracies that the receiver reports."""
-    for k in range(3):
-        usual = p.gps_error_var if k < 2 else p.gps_height_error_var
-        accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
-        s.gps_error_var[k] = reported_variance(usual, accuracy, ERROR_SHARES[k])
-        usual = SLOW_ERROR_MPS * SLOW_ERROR_MPS
-        slow = reported_variance(usual, row[GPS_SPEED_ACC], SPEED_SHARES[k])
-        s.pos_density[k] = 2.0 * SLOW_ERROR_S * slow
-
-
-@compiled
-def reported_variance(variance: float, accuracy: float, share: float) -> float:
-    """Return the variance by a reported accuracy, or the usual one where there is none."""
-    return (share * accuracy) ** 2 if accuracy > 0.0 else variance
-
-
-@compiled
-def position_variance(s: State, p: Gains, row: FloatArray, k: int, since_s: float) -> float:
-    """Return the noise of one coordinate of a fix, m2; its latency varies."""
-    usual = p.gps_position_var if k < 2 else p.gps_height_var
-    accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
-    white = reported_variance(usual, accuracy, NOISE_SHARE)
-    late = p.gps_jitter_sq * s.vel_n[k] * s.vel_n[k]
-    return float((white + late) * max(1.0, p.gps_correlation_s / since_s))
-
-
-@compiled
-def velocity_variance(
-    s: State, p: Gains, row: FloatArray, accel_n: Vec3, k: int, since_s: float
-) -> float:
-    """Return the white noise with the long-term effect of one velocity's errors, m2/s2."""
-    accuracy = row[GPS_SPEED_ACC]
-    usual = p.gps_velocity_var if k < 2 else p.gps_climb_var
-    white = reported_variance(usual, accuracy, SPEED_SHARES[k])
-    assumed = NOISE_MPS * NOISE_MPS
-    if k < 2 and s.time_s - s.mag_used_s > STALE_MAG_S:
-        # Without a compass the heading depends on these velocities alone.
-        white = max(white, assumed * s.fix_excess)
-    white *= max(1.0, p.gps_correlation_s / since_s)
-    late = p.gps_jitter_sq * accel_n[k] * accel_n[k]
-    level_sq = accel_n[0] * accel_n[0] + accel_n[1] * accel_n[1]
-    excess = (s.fix_excess - 1.0) * (assumed + p.gps_jitter_sq * level_sq)
-    return max(white + late, excess)
-
-
-@compiled
-def mean_acceleration(s: State, lag: float) -> Vec3:
-    """Return the mean acceleration over the lag, m/s2; `then` is overwritten."""
-    span = s.time_s - look_back(s, s.time_s - max(lag, LEAST_LAG_S))
-    if span <= 0.0:
-        return (0.0, 0.0, 0.0)
-    gained = difference(as_vec(s.integrals[3:6]), as_vec(s.then[3:6]))
-    return (gained[0] / span, gained[1] / span, gained[2] / span)
-
-
-@compiled
-def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
-    """Write the row of one component of a late velocity."""
-    clear_row(s)
-    set_attitude(s, k, scaled(once, -1.0))
-    s.h[VEL + k] = 1.0
-    set_accel_bias(s, k, lag)
-
-
-@compiled
-def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
-    """Write the row of one component of a late position, which has the slow GPS error."""
-    clear_row(s)
-    set_attitude(s, k, difference(scaled(once, lag), twice))
-    s.h[VEL + k] = -lag
-    s.h[POS + k] = 1.0
-    s.h[GPS_ERROR + k] = 1.0
-    set_accel_bias(s, k, -0.5 * lag * lag)
-
-
-@compiled
-def set_attitude(s: State, k: int, w: Vec3) -> None:
-    """Write how `(att x w)[k]` depends on the attitude error."""
-    a, b = (k + 1) % 3, (k + 2) % 3
-    s.h[ATT + a] = w[b]
-    s.h[ATT + b] = -w[a]
-
-
-@compiled
-def set_accel_bias(s: State, k: int, share: float) -> None:
-    """Write `share` times row `k` of `R_nb` for the accelerometer bias."""
-    x, y, z = body_axes(as_quat(s.q_nb))
-    s.h[ACCEL_BIAS] = share * x[k]
-    s.h[ACCEL_BIAS + 1] = share * y[k]
-    s.h[ACCEL_BIAS + 2] = share * z[k]
-
-
-@compiled
-def is_unlikely(s: State, p: Gains, row: FloatArray, off: Vec3, lag: float) -> bool:
-    """Return whether a position is outside the gate, north or east."""
-    once, twice = lag_integrals(s, lag)
-    worst = 0.0
-    for k in range(2):
-        position_row(s, k, once, twice, lag)
-        total = innovation_variance(s, position_variance(s, p, row, k, p.gps_correlation_s))
-        worst = max(worst, off[k] * off[k] / total)
-    return worst > p.gate_sq
-
-
-@compiled
-def raise_glitch_variance(s: State, k: int, off: float, variance: float, since_s: float) -> None:
-    """Add the variance of a glitch: an innovation outside the gate is shared by several fixes.
-
-    `k` is 0 for velocities and 1 for positions. Taken for errors that are new in each fix, a glitch
-    would win over sound inertial sensors. The variance that errs as much in the long run is that of
-    one error times the number of fixes that share it.
-    """
-    off = min(abs(off), MAX_GLITCH[k])
-    excess = off * off / GLITCH_GATE_SQ[k] - innovation_variance(s, variance)
-    s.glitch[k] = max(s.glitch[k], excess * max(1.0, GLITCH_S / since_s))
-
-
-@compiled
-def update_fix(
-    s: State, p: Gains, row: FloatArray, off_pos: Vec3, off_vel: Vec3, lag: float
-) -> None:
-    """Update by velocity and position of a fix; components that are not finite are left out."""
-    once, twice = lag_integrals(s, lag)
-    since_s = max(s.time_s - s.update_s, LEAST_FIX_INTERVAL_S)
-    s.update_s = s.time_s
-    accel_n = mean_acceleration(s, lag)
-    faded = math.exp(-since_s / GLITCH_FADE_S)
-    s.glitch[0] *= faded
-    s.glitch[1] *= faded
-    s.glitch[2] = max(norm_sq(accel_n), s.glitch[2] * faded)
-    late_var = RECEIVER_LAG_S * RECEIVER_LAG_S * s.glitch[2]
-    # The whole fix is checked before any of it is used: a glitch affects all components.
-    for k in range(3):
-        if math.isfinite(off_vel[k]):
-            velocity_row(s, k, once, lag)
-            variance = velocity_variance(s, p, row, accel_n, k, since_s)
-            raise_glitch_variance(s, 0, off_vel[k], variance + late_var, since_s)
-        if math.isfinite(off_pos[k]):
-            position_row(s, k, once, twice, lag)
-            variance = position_variance(s, p, row, k, since_s)
-            raise_glitch_variance(s, 1, off_pos[k], variance, since_s)
-    for k in range(3):
-        if math.isfinite(off_vel[k]):
-            velocity_row(s, k, once, lag)
-            variance = velocity_variance(s, p, row, accel_n, k, since_s)
-            update_scalar(s, off_vel[k], variance + s.glitch[0], GLITCH_GATE_SQ[0])
-        if math.isfinite(off_pos[k]):
-            position_row(s, k, once, twice, lag)
-            variance = position_variance(s, p, row, k, since_s) + s.glitch[1]
-            update_scalar(s, off_pos[k], variance, p.gate_sq)
-    inject(s)

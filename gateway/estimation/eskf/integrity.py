@@ -68,8 +68,7 @@ GRAVITY_MISMATCH_S: Final = 5.0
 @compiled
 def lose_attitude(s: State, p: Gains) -> None:
     """Discard the attitude; the position follows the fixes until another one is found."""
-    s.lost, s.lost_s, s.mismatch_s = 1, 0.0, 0.0
-    s.heading_known = 0
+    s.lost, s.lost_s, s.mismatch_s, s.heading_known = 1, 0.0, 0.0, 0
     clear_pairs(s)
     begin_attitude(s, p, LOST_LEVEL_VAR, NO_HEADING_VAR)
     # The low-pass contains forces rotated by the discarded attitude, or by none.

@@ -56,16 +56,10 @@ CERTAIN: Final = 1e30
 
 
 @compiled
-def begin_latency(s: State, latency_s: float) -> None:
-    """Start with a latency."""
-    s.gps_latency_s = latency_s
-    clear_velocities(s)
-
-
-@compiled
 def begin_certain(s: State, latency_s: float) -> None:
     """Start with a latency that no manoeuvre changes."""
-    begin_latency(s, latency_s)
+    s.gps_latency_s = latency_s
+    clear_velocities(s)
     for k in range(LATENCIES):
         s.latency_misfit[k] = CERTAIN * (STEP_S * k - latency_s) ** 2
 
@@ -87,8 +81,7 @@ def compare_latencies(s: State, set_s: float, arrival_s: float, vel: Vec3) -> No
         s.window_from[4] = arrival_s
     whole = 0.0 < dt < FRESH_GPS_S
     f = s.window_from
-    g = STANDARD_GRAVITY_MPS2
-    change = (vel[0] - f[1], vel[1] - f[2], vel[2] - f[3] - g * dt)
+    change = (vel[0] - f[1], vel[1] - f[2], vel[2] - f[3] - STANDARD_GRAVITY_MPS2 * dt)
     for k in range(LATENCIES):
         look_back(s, arrival_s - STEP_S * k)
         for j in range(3):

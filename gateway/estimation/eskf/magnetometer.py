@@ -170,9 +170,9 @@ def field_weight(s: State, p: Gains, norm: float, dip: float, dt: float) -> floa
     """
     if s.mag_ref[0] == 0.0:
         learn_field(s, p, norm, dip, dt)
-        if not math.isfinite(s.earth_field[2]):
+        if not math.isfinite(s.earth_norm_ut):
             return 1.0
-        return agreement(norm / s.earth_field[2] - 1.0, dip - s.earth_field[1])
+        return agreement(norm / s.earth_norm_ut - 1.0, dip - s.earth_dip_rad)
     norm_off, dip_off = norm / s.mag_ref[0] - 1.0, dip - s.mag_ref[1]
     usual = abs(norm_off) < p.field_norm_tolerance and abs(dip_off) < p.field_dip_tolerance_rad
     s.mag_usual_s = s.mag_usual_s + dt if usual else 0.0
@@ -229,10 +229,13 @@ def update_mag(s: State, p: Gains, mag_b: Vec3) -> None:
         return
     steep = max(1.0, (math.cos(STEEP_DIP_RAD) * norm / level) ** 2)
     variance = p.mag_var * steep / weight
+    propagate(s, p)
     if s.heading_known == 0:
         start_heading(s, p, field_n, variance)
     else:
         update_heading(s, p, field_n, variance)
+    inject(s)
+    write_vec(s.field_n, field_n)
     update_hard_iron(s, p, mag_b, weight, min(since_s, STALE_MAG_S))
     s.mag_used_s = s.time_s
 
@@ -301,36 +304,30 @@ def consider_unaided(s: State) -> None:
 @compiled
 def declination(s: State) -> float:
     """Return the declination, rad; 0 while unknown."""
-    return s.earth_field[0] if math.isfinite(s.earth_field[0]) else 0.0
+    return s.declination_rad if math.isfinite(s.declination_rad) else 0.0
 
 
 @compiled
 def start_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
     """Take the heading from the compass."""
-    propagate(s, p)
     turn_heading(s, declination(s) - math.atan2(field_n[1], field_n[0]))
     reset_state(s, ATT + 2, NO_HEADING_VAR)
     clear_row(s)
     heading_row(s, field_n)
     update_scalar(s, 0.0, variance, p.gate_sq)
-    inject(s)
     s.heading_known = 1
-    s.heading_true = 1 if math.isfinite(s.earth_field[0]) else 0
-    write_vec(s.field_n, field_n)
+    s.heading_true = 1 if math.isfinite(s.declination_rad) else 0
 
 
 @compiled
 def update_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
     """Update by the direction of the horizontal field, whose errors last for a while."""
-    propagate(s, p)
     consider_unaided(s)
     heading_row(s, field_n)
     correlation_s = CORRELATION_S if s.aided == 1 else UNAIDED_CORRELATION_S
     since_s = min(s.time_s - s.mag_used_s, STALE_MAG_S)
     off = wrap_pi(declination(s) - math.atan2(field_n[1], field_n[0]))
     update_scalar(s, off, variance * max(1.0, correlation_s / since_s), p.gate_sq)
-    inject(s)
-    write_vec(s.field_n, field_n)
 
 
 @compiled
@@ -340,12 +337,12 @@ def raise_hard_iron(s: State) -> None:
     Hard iron that changes norm and dip changes the heading as much. A heading that follows the
     compass gets the same error.
     """
-    field, norm = as_vec(s.field_n), s.earth_field[2]
+    field, norm = as_vec(s.field_n), s.earth_norm_ut
     level = math.hypot(field[0], field[1])
     if level == 0.0 or not math.isfinite(norm):
         return
     norm_off = math.hypot(level, field[2]) / norm - 1.0
-    dip_off = math.sin(math.atan2(field[2], level) - s.earth_field[1])
+    dip_off = math.sin(math.atan2(field[2], level) - s.earth_dip_rad)
     excess = max(norm_off * norm_off - NORM_ERROR**2, 0.0)
     excess += max(dip_off * dip_off - DIP_ERROR_RAD**2, 0.0)
     more = excess * norm * norm - s.P[HARD_IRON, HARD_IRON]

@@ -30,12 +30,14 @@ from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
     ATT,
     BARO_OFFSET,
+    GAINED,
     GPS_ERROR,
     GYRO_BIAS,
     GYRO_SCALE,
     HARD_IRON,
     HISTORY_LENGTH,
     INTEGRALS,
+    MOVED,
     MOVING_STATES,
     POS,
     STATES,
@@ -107,23 +109,21 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     write_quat(s.q_ib, normalise(multiply(q_i, half)))
     q = multiply(as_quat(s.q_nb), half)
     write_quat(s.q_nb, normalise(multiply(q, half)))
-    x, y, z = body_axes(q)
+    axes = body_axes(q)
+    x, y, z = axes
     f = difference(accel, as_vec(s.accel_bias_b))
     force_i = rotate(q_i, f)
     accel_sq = 0.0
     for k in range(3):
         force = x[k] * f[0] + y[k] * f[1] + z[k] * f[2]
         s.pending_force_n[k] += force * dt
-        s.pending_rotation[k, 0] += x[k] * dt
-        s.pending_rotation[k, 1] += y[k] * dt
-        s.pending_rotation[k, 2] += z[k] * dt
-        s.pending_rotation_gyro[k, 0] += x[k] * rate[0] * dt
-        s.pending_rotation_gyro[k, 1] += y[k] * rate[1] * dt
-        s.pending_rotation_gyro[k, 2] += z[k] * rate[2] * dt
+        for i in range(3):
+            s.pending_rotation[k, i] += axes[i][k] * dt
+            s.pending_rotation_gyro[k, i] += axes[i][k] * rate[i] * dt
         a = force + STANDARD_GRAVITY_MPS2 if k == 2 else force
         accel_sq += a * a
-        s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * a * dt) * dt
-        s.integrals[3 + k] += a * dt
+        s.integrals[MOVED + k] += (s.integrals[GAINED + k] + 0.5 * a * dt) * dt
+        s.integrals[GAINED + k] += a * dt
         s.integrals[k] += force_i[k] * dt
         if s.aided == 1:
             s.pos_n[k] += (s.vel_n[k] + 0.5 * a * dt) * dt
@@ -236,7 +236,8 @@ def propagate(s: State, p: Gains) -> None:
     for k in range(3):
         s.P[ATT + k, ATT + k] += angle_var + p.gyro_density * dt
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_density * dt
-        raise_bias_variance(s, p, k, unexpected_bias_density(s, k) * dt)
+        limit = max(p.gyro_bias_var - s.P[GYRO_BIAS + k, GYRO_BIAS + k], 0.0)
+        raise_variance(s, GYRO_BIAS + k, min(unexpected_bias_density(s, k) * dt, limit))
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_density * dt
         s.P[HARD_IRON + k, HARD_IRON + k] += p.hard_iron_density * dt
         if s.aided == 1:
@@ -258,20 +259,12 @@ def propagate(s: State, p: Gains) -> None:
 
 
 @compiled
-def raise_bias_variance(s: State, p: Gains, k: int, more: float) -> None:
-    """Add to the variance of one axis of the gyroscope bias, up to its initial variance."""
-    limit = max(p.gyro_bias_var - s.P[GYRO_BIAS + k, GYRO_BIAS + k], 0.0)
-    raise_variance(s, GYRO_BIAS + k, min(more, limit))
-
-
-@compiled
 def apply_transition(s: State, P: FloatArray, columns: int) -> None:
     """Multiply the first columns of `P` by the transition matrix from the left."""
     R, W, dt, f = s.pending_rotation, s.pending_rotation_gyro, s.pending_s, s.pending_force_n
     if s.aided == 1:
         for k in range(3):
             add_row(P, POS + k, dt, VEL + k, columns)
-        for k in range(3):
             a, b = (k + 1) % 3, (k + 2) % 3
             add_row(P, VEL + k, f[b], ATT + a, columns)
             add_row(P, VEL + k, -f[a], ATT + b, columns)

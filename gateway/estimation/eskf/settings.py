@@ -19,8 +19,7 @@ class EskfSettings(Settings, frozen=True):
     """
 
     gyro_noise_degprs: Annotated[
-        float,
-        setting("Gyroscope noise, without vibration.", "deg/sqrt(s)", ge=1e-4, le=10.0),
+        float, setting("Gyroscope noise, without vibration.", "deg/sqrt(s)", ge=1e-4, le=10.0)
     ] = 0.066
     gyro_vibration: Annotated[
         float,
@@ -189,12 +188,10 @@ class EskfSettings(Settings, frozen=True):
         ),
     ] = 10.0
     rest_gyro_degps: Annotated[
-        float,
-        setting("At rest the rate stays this close to its mean.", "deg/s", ge=0.01, le=10.0),
+        float, setting("At rest the rate stays this close to its mean.", "deg/s", ge=0.01, le=10.0)
     ] = 2.0
     rest_accel_mps2: Annotated[
-        float,
-        setting("At rest the force stays this close to its mean.", "m/s2", ge=0.01, le=5.0),
+        float, setting("At rest the force stays this close to its mean.", "m/s2", ge=0.01, le=5.0)
     ] = 0.5
     rest_time_s: Annotated[
         float, setting("How long that must last to be called rest.", "s", ge=0.2, le=30.0)
@@ -203,8 +200,7 @@ class EskfSettings(Settings, frozen=True):
         float, setting("GPS speed above which nothing is at rest.", "m/s", ge=0.05, le=10.0)
     ] = 0.7
     bias_limit_degps: Annotated[
-        float,
-        setting("Largest gyroscope bias that is possible.", "deg/s", ge=0.1, le=30.0),
+        float, setting("Largest gyroscope bias that is possible.", "deg/s", ge=0.1, le=30.0)
     ] = 20.0
 
 

@@ -38,9 +38,11 @@ STATES: Final = 26
 MOVING_STATES: Final = 9
 """Attitude, velocity and position: the states that the transition changes."""
 
+GAINED: Final = 3
+MOVED: Final = 6
 INTEGRALS: Final = 9
-"""Force in the gyroscope frame, acceleration in NED, and the integral of that: three numbers each,
-each integrated once more over time."""
+"""Integrals over time of the force in the gyroscope frame, of the acceleration in NED (`GAINED`),
+and of that integral (`MOVED`): three numbers each."""
 HISTORY_LENGTH: Final = 512
 """Past integrals that are kept: 2.5 s at `predict.HISTORY_INTERVAL_S`, more than any latency."""
 LATENCIES: Final = 13
@@ -146,25 +148,26 @@ class State:
     update_s: float
     """Arrival of the last fix that was fused or rejected."""
     fix_vel: Annotated[FloatArray, (3,)]
-    fix_last: Annotated[FloatArray, (6,)]
-    """Latitude, longitude and velocity of the newest fix, to recognise repetitions, and the arrival
-    of the first fix with these values."""
-    track_from: Annotated[FloatArray, (4,)]
+    newest_lat_deg: float
+    newest_lon_deg: float
+    newest_vel: Annotated[FloatArray, (3,)]
+    newest_s: float
+    """Newest fix, to recognise repetitions, and the arrival of the first one with these values."""
+    track_s: float
+    track_pos_n: Annotated[FloatArray, (3,)]
     """Time and position from which a velocity is derived where fixes have none."""
-    zero_from: Annotated[FloatArray, (4,)]
-    """The same for velocities of exactly zero."""
-    zero_velocity_wrong: int
-    """1 while positions contradict a velocity of exactly zero."""
     gps_error_var: Annotated[FloatArray, (3,)]
     pos_density: Annotated[FloatArray, (3,)]
     """Position noise for slow errors of GPS velocities, m2/s."""
     reject_s: float
     """How long fixes have been rejected and agreed with one another."""
-    reject_last: Annotated[FloatArray, (3,)]
-    """Time, north and east of the last rejected fix."""
-    glitch: Annotated[FloatArray, (3,)]
-    """Variance of velocity and position by a present glitch, m2/s2 and m2; and the square of the
-    hardest recent acceleration, m2/s4."""
+    rejected_s: float
+    rejected_pos_n: Annotated[FloatArray, (2,)]
+    """Last rejected fix."""
+    glitch_var: Annotated[FloatArray, (2,)]
+    """Variance of velocity and position by a present glitch, m2/s2 and m2."""
+    hard_accel_sq: float
+    """Square of the hardest recent acceleration, m2/s4."""
     fix_excess: float
     """Noise of GPS velocities in units of the assumed variance, see `alignment`."""
 
@@ -213,9 +216,10 @@ class State:
     """Angle of an apparent turn about the vertical at rest, since the compass last turned too."""
 
     # Magnetometer.
-    earth_field: Annotated[FloatArray, (3,)]
-    """Declination and dip of the Earth's field at the last fix in rad, and its norm in uT; NaN
-    before."""
+    declination_rad: float
+    earth_dip_rad: float
+    earth_norm_ut: float
+    """The Earth's field at the last fix; NaN before."""
     mag_s: float
     """Newest field that was compared with the usual one."""
     mag_used_s: float

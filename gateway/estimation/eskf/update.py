@@ -9,7 +9,7 @@ error `dx` of the group, and at the end `inject` moves that into the nominal sta
 | gravity, without GPS | `0 = (f_n + att x f_n - R accel_bias)` north, east | `update_gravity` |
 | rest | `mean gyro = gyro_bias`, `0 = vel` | `update_rest` |
 | barometer | `baro_down + baro_offset = pos_down` | `update_height` |
-| fix | see `fixes` | `fixes.update_fix` |
+| fix | see `fix_model` | `fix_model.update_fix` |
 | magnetic heading | see `magnetometer.heading_row` | `magnetometer.update_heading` |
 
 References
@@ -39,11 +39,12 @@ from gateway.estimation.eskf.state import (
     VEL,
     State,
 )
-from gateway.estimation.record import as_quat, write_quat
+from gateway.estimation.record import as_quat, as_vec, write_quat
 from gateway.geometry.quaternion import (
     body_axes,
     from_rotation_vector,
     multiply,
+    norm_sq,
     normalise,
     rotate,
     rotate_inverse,
@@ -74,6 +75,14 @@ def clear_row(s: State) -> None:
 def consider(s: State, first: int, count: int) -> None:
     """Keep states as they are in this update, while their uncertainty counts [2]_."""
     s.considered[first : first + count] = 1.0
+
+
+@compiled
+def set_accel_bias(s: State, k: int, share: float) -> None:
+    """Write `share` times row `k` of `R_nb` for the accelerometer bias."""
+    axes = body_axes(as_quat(s.q_nb))
+    for i in range(3):
+        s.h[ACCEL_BIAS + i] = share * axes[i][k]
 
 
 @compiled
@@ -148,19 +157,16 @@ def inject(s: State) -> None:
 @compiled
 def gravity_force_n(s: State) -> Vec3:
     """Return the low-pass filtered force in NED by the present attitude, m/s2."""
-    f = s.force_lp_i
-    force_b = rotate_inverse(as_quat(s.q_ib), (f[1, 0], f[1, 1], f[1, 2]))
+    force_b = rotate_inverse(as_quat(s.q_ib), as_vec(s.force_lp_i[1]))
     return rotate(as_quat(s.q_nb), force_b)
 
 
 @compiled
 def sustained_sq(s: State) -> float:
     """Return the square of the horizontal acceleration that a mean force beyond gravity implies."""
-    f = s.force_lp_i
-    most = (1.0 + GRAVITY_TOLERANCE) * STANDARD_GRAVITY_MPS2 + math.sqrt(
-        s.P[ACCEL_BIAS, ACCEL_BIAS]
-    )
-    return float(max(f[1, 0] ** 2 + f[1, 1] ** 2 + f[1, 2] ** 2 - most * most, 0.0))
+    bias_std = math.sqrt(s.P[ACCEL_BIAS, ACCEL_BIAS])
+    most = (1.0 + GRAVITY_TOLERANCE) * STANDARD_GRAVITY_MPS2 + bias_std
+    return float(max(norm_sq(as_vec(s.force_lp_i[1])) - most * most, 0.0))
 
 
 @compiled
@@ -182,15 +188,12 @@ def update_gravity(s: State, p: Gains, dt: float) -> None:
     propagate(s, p)
     north, east, down = gravity_force_n(s)
     variance = gravity_variance(s, p) * max(1.0, 2.0 * p.gravity_tau_s / dt)
-    x, y, z = body_axes(as_quat(s.q_nb))
     for k in range(2):
         clear_row(s)
         consider(s, ACCEL_BIAS, 3)
         consider(s, ATT + 2, 1)
         s.h[ATT + 1 - k] = down if k == 0 else -down
-        s.h[ACCEL_BIAS] = -x[k]
-        s.h[ACCEL_BIAS + 1] = -y[k]
-        s.h[ACCEL_BIAS + 2] = -z[k]
+        set_accel_bias(s, k, -1.0)
         update_scalar(s, -north if k == 0 else -east, variance, p.gate_sq)
     inject(s)
 

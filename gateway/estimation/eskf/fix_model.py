@@ -1,0 +1,240 @@
+"""Measurement model of a GPS fix: its row at the time it was valid, its variance, and glitches.
+
+A fix is compared with the state at the time it was valid, `L` seconds ago, and its row carries that
+state's error to the present one:
+
+    vel_then = vel - att x S + R L accel_bias
+    pos_then = pos - L vel + att x (L S - D) - R L^2 / 2 accel_bias
+
+with `S` and `D` the first and second integral of the specific force over the lag. This equals
+fusing the fix in time, but for the process noise of the few tenths of a second between.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.columns import GPS_H_ACC, GPS_SPEED_ACC, GPS_V_ACC
+from gateway.estimation.eskf.alignment import NOISE_MPS
+from gateway.estimation.eskf.magnetometer import STALE_MAG_S
+from gateway.estimation.eskf.predict import look_back
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import ATT, GAINED, GPS_ERROR, MOVED, POS, VEL, State
+from gateway.estimation.eskf.update import (
+    clear_row,
+    inject,
+    innovation_variance,
+    set_accel_bias,
+    update_scalar,
+)
+from gateway.estimation.record import FloatArray, as_vec
+from gateway.geometry.quaternion import difference, norm_sq, scaled
+from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+NOISE_SHARE: Final = 0.2
+"""Share of a receiver's accuracy that is noise from fix to fix."""
+ERROR_SHARES: Final = (0.7, 0.7, 0.9)
+"""Share of it that is slow error, north, east (of a radial accuracy) and down."""
+SPEED_SHARES: Final = (0.4, 0.4, 0.8)
+"""Share of its speed accuracy that is noise of one axis."""
+SLOW_ERROR_MPS: Final = 0.05
+SLOW_ERROR_S: Final = 4.0
+"""Slow error of GPS velocities where the receiver reports none, and its correlation time."""
+LEAST_FIX_INTERVAL_S: Final = 0.05
+"""Fixes closer together count as that far apart."""
+LEAST_LAG_S: Final = 0.1
+"""Over less, a mean acceleration is mostly vibration."""
+VELOCITY: Final = 0
+POSITION: Final = 1
+GLITCH_GATE_SQ: Final = (9.0, 16.0)
+MAX_GLITCH: Final = (5.0, 30.0)
+"""Gate of either, in variances, beyond which an innovation is a glitch; its limit, m/s and m."""
+GLITCH_S: Final = 10.0
+"""Fixes of this time share a glitch."""
+GLITCH_FADE_S: Final = 1.0
+RECEIVER_LAG_S: Final = 0.2
+"""Lag of the receiver's own filter in a manoeuvre."""
+
+
+@compiled
+def past_state(s: State, lag: float) -> tuple[Vec3, Vec3]:
+    """Return position and velocity `lag` seconds ago, from the present ones and `then`."""
+    now, then = s.integrals, s.then
+    vel = difference(
+        as_vec(s.vel_n),
+        difference(as_vec(now[GAINED : GAINED + 3]), as_vec(then[GAINED : GAINED + 3])),
+    )
+    pos = (
+        s.pos_n[0] - vel[0] * lag - (now[MOVED] - then[MOVED] - then[GAINED] * lag),
+        s.pos_n[1] - vel[1] * lag - (now[MOVED + 1] - then[MOVED + 1] - then[GAINED + 1] * lag),
+        s.pos_n[2] - vel[2] * lag - (now[MOVED + 2] - then[MOVED + 2] - then[GAINED + 2] * lag),
+    )
+    return pos, vel
+
+
+@compiled
+def lag_integrals(s: State, lag: float) -> tuple[Vec3, Vec3]:
+    """Return `S` and `D`: the specific force in NED integrated once and twice over the lag."""
+    now, then, g = s.integrals, s.then, STANDARD_GRAVITY_MPS2
+    once = (
+        now[GAINED] - then[GAINED],
+        now[GAINED + 1] - then[GAINED + 1],
+        now[GAINED + 2] - then[GAINED + 2] - g * lag,
+    )
+    twice = (
+        now[MOVED] - then[MOVED] - then[GAINED] * lag,
+        now[MOVED + 1] - then[MOVED + 1] - then[GAINED + 1] * lag,
+        now[MOVED + 2] - then[MOVED + 2] - then[GAINED + 2] * lag - 0.5 * g * lag * lag,
+    )
+    return once, twice
+
+
+@compiled
+def set_error_variances(s: State, p: Gains, row: FloatArray) -> None:
+    """Take the slow errors of a fix from the accuracies that the receiver reports."""
+    for k in range(3):
+        usual = p.gps_error_var if k < 2 else p.gps_height_error_var
+        accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
+        s.gps_error_var[k] = reported_variance(usual, accuracy, ERROR_SHARES[k])
+        usual = SLOW_ERROR_MPS * SLOW_ERROR_MPS
+        slow = reported_variance(usual, row[GPS_SPEED_ACC], SPEED_SHARES[k])
+        s.pos_density[k] = 2.0 * SLOW_ERROR_S * slow
+
+
+@compiled
+def reported_variance(variance: float, accuracy: float, share: float) -> float:
+    """Return the variance by a reported accuracy, or the usual one where there is none."""
+    return (share * accuracy) ** 2 if accuracy > 0.0 else variance
+
+
+@compiled
+def position_variance(s: State, p: Gains, row: FloatArray, k: int, since_s: float) -> float:
+    """Return the noise of one coordinate of a fix, m2; its latency varies."""
+    usual = p.gps_position_var if k < 2 else p.gps_height_var
+    accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
+    white = reported_variance(usual, accuracy, NOISE_SHARE)
+    late = p.gps_jitter_sq * s.vel_n[k] * s.vel_n[k]
+    return float((white + late) * max(1.0, p.gps_correlation_s / since_s))
+
+
+@compiled
+def velocity_variance(
+    s: State, p: Gains, row: FloatArray, accel_n: Vec3, k: int, since_s: float
+) -> float:
+    """Return the white noise with the long-term effect of one velocity's errors, m2/s2."""
+    accuracy = row[GPS_SPEED_ACC]
+    usual = p.gps_velocity_var if k < 2 else p.gps_climb_var
+    white = reported_variance(usual, accuracy, SPEED_SHARES[k])
+    assumed = NOISE_MPS * NOISE_MPS
+    if k < 2 and s.time_s - s.mag_used_s > STALE_MAG_S:
+        # Without a compass the heading depends on these velocities alone.
+        white = max(white, assumed * s.fix_excess)
+    white *= max(1.0, p.gps_correlation_s / since_s)
+    late = p.gps_jitter_sq * accel_n[k] * accel_n[k]
+    level_sq = accel_n[0] * accel_n[0] + accel_n[1] * accel_n[1]
+    excess = (s.fix_excess - 1.0) * (assumed + p.gps_jitter_sq * level_sq)
+    return max(white + late, excess)
+
+
+@compiled
+def mean_acceleration(s: State, lag: float) -> Vec3:
+    """Return the mean acceleration over the lag, m/s2; `then` is overwritten."""
+    span = s.time_s - look_back(s, s.time_s - max(lag, LEAST_LAG_S))
+    if span <= 0.0:
+        return (0.0, 0.0, 0.0)
+    gained = difference(
+        as_vec(s.integrals[GAINED : GAINED + 3]), as_vec(s.then[GAINED : GAINED + 3])
+    )
+    return (gained[0] / span, gained[1] / span, gained[2] / span)
+
+
+@compiled
+def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
+    """Write the row of one component of a late velocity."""
+    clear_row(s)
+    set_attitude(s, k, scaled(once, -1.0))
+    s.h[VEL + k] = 1.0
+    set_accel_bias(s, k, lag)
+
+
+@compiled
+def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
+    """Write the row of one component of a late position, which has the slow GPS error."""
+    clear_row(s)
+    set_attitude(s, k, difference(scaled(once, lag), twice))
+    s.h[VEL + k] = -lag
+    s.h[POS + k] = 1.0
+    s.h[GPS_ERROR + k] = 1.0
+    set_accel_bias(s, k, -0.5 * lag * lag)
+
+
+@compiled
+def set_attitude(s: State, k: int, w: Vec3) -> None:
+    """Write how `(att x w)[k]` depends on the attitude error."""
+    a, b = (k + 1) % 3, (k + 2) % 3
+    s.h[ATT + a] = w[b]
+    s.h[ATT + b] = -w[a]
+
+
+@compiled
+def is_unlikely(s: State, p: Gains, row: FloatArray, off: Vec3, lag: float) -> bool:
+    """Return whether a position is outside the gate, north or east."""
+    once, twice = lag_integrals(s, lag)
+    worst = 0.0
+    for k in range(2):
+        position_row(s, k, once, twice, lag)
+        total = innovation_variance(s, position_variance(s, p, row, k, p.gps_correlation_s))
+        worst = max(worst, off[k] * off[k] / total)
+    return worst > p.gate_sq
+
+
+@compiled
+def raise_glitch_variance(s: State, kind: int, off: float, variance: float, since_s: float) -> None:
+    """Add the variance of a glitch: an innovation outside the gate is shared by several fixes.
+
+    Taken for errors that are new in each fix, a glitch
+    would win over sound inertial sensors. The variance that errs as much in the long run is that of
+    one error times the number of fixes that share it.
+    """
+    off = min(abs(off), MAX_GLITCH[kind])
+    excess = off * off / GLITCH_GATE_SQ[kind] - innovation_variance(s, variance)
+    s.glitch_var[kind] = max(s.glitch_var[kind], excess * max(1.0, GLITCH_S / since_s))
+
+
+@compiled
+def update_fix(
+    s: State, p: Gains, row: FloatArray, off_pos: Vec3, off_vel: Vec3, lag: float
+) -> None:
+    """Update by velocity and position of a fix; components that are not finite are left out."""
+    once, twice = lag_integrals(s, lag)
+    since_s = max(s.time_s - s.update_s, LEAST_FIX_INTERVAL_S)
+    s.update_s = s.time_s
+    accel_n = mean_acceleration(s, lag)
+    faded = math.exp(-since_s / GLITCH_FADE_S)
+    s.glitch_var[VELOCITY] *= faded
+    s.glitch_var[POSITION] *= faded
+    s.hard_accel_sq = max(norm_sq(accel_n), s.hard_accel_sq * faded)
+    late_var = RECEIVER_LAG_S * RECEIVER_LAG_S * s.hard_accel_sq
+    # The whole fix is checked before any of it is used: a glitch affects all components.
+    for k in range(3):
+        if math.isfinite(off_vel[k]):
+            velocity_row(s, k, once, lag)
+            variance = velocity_variance(s, p, row, accel_n, k, since_s)
+            raise_glitch_variance(s, VELOCITY, off_vel[k], variance + late_var, since_s)
+        if math.isfinite(off_pos[k]):
+            position_row(s, k, once, twice, lag)
+            variance = position_variance(s, p, row, k, since_s)
+            raise_glitch_variance(s, POSITION, off_pos[k], variance, since_s)
+    for k in range(3):
+        if math.isfinite(off_vel[k]):
+            velocity_row(s, k, once, lag)
+            variance = velocity_variance(s, p, row, accel_n, k, since_s)
+            update_scalar(
+                s, off_vel[k], variance + s.glitch_var[VELOCITY], GLITCH_GATE_SQ[VELOCITY]
+            )
+        if math.isfinite(off_pos[k]):
+            position_row(s, k, once, twice, lag)
+            variance = position_variance(s, p, row, k, since_s) + s.glitch_var[POSITION]
+            update_scalar(s, off_pos[k], variance, p.gate_sq)
+    inject(s)
