@@ -161,15 +161,15 @@ class Aircraft:
         if self._fused is None:
             self.chain, self.estimator = make_fusion(self.settings, state)
 
-    def take(
+    def feed(
         self, record: RawRecord | ImuCalibrated | VehicleReport, now_us: int, out: Outputs
     ) -> None:
         """Run one raw record through the stages, and add what results."""
         vehicle = self.vehicle
         if isinstance(record, ImuRaw):
-            self._take_imu(record, self.chain.imu(record), now_us, out)
+            self._feed_imu(record, self.chain.imu(record), now_us, out)
         elif isinstance(record, ImuCalibrated):
-            self._take_imu(None, self.chain.imu_calibrated(record), now_us, out)
+            self._feed_imu(None, self.chain.imu_calibrated(record), now_us, out)
         elif isinstance(record, VehicleReport):
             # Not for the recording of the fusion: it takes no part in it.
             self.perform(vehicle.on_report(record, now_us), now_us, out)
@@ -191,7 +191,7 @@ class Aircraft:
             else:
                 self.perform(vehicle.on_node_status(record, now_us), now_us, out)
 
-    def _take_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int, out: Outputs) -> None:
+    def _feed_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int, out: Outputs) -> None:
         self.state = state = self.estimator.update_imu(sample)
         out.records.append(FusedSample(self.vehicle_id, raw, sample, state))
         self.perform(self.vehicle.on_state(state, sample, now_us), now_us, out)
@@ -218,7 +218,7 @@ class Aircraft:
             self.perform(self.vehicle.say(text, now_us), now_us, out)
             return
         self._change("calibration", calibration, out)
-        self.perform(self.vehicle.take_settings("calibration", calibration), now_us, out)
+        self.perform(self.vehicle.apply_settings("calibration", calibration), now_us, out)
 
     def change(self, settings: AircraftSettings, now_us: int, out: Outputs) -> None:
         """Apply what differs from the present settings, and send the parameters that differ."""
@@ -226,13 +226,13 @@ class Aircraft:
             wanted = getattr(settings, section)
             if wanted != getattr(self.settings, section):
                 self._change(section, wanted, out)
-                self.perform(self.vehicle.take_settings(section, wanted), now_us, out)
+                self.perform(self.vehicle.apply_settings(section, wanted), now_us, out)
 
     def sign_by(self, passphrase: str, now_us: int, out: Outputs) -> None:
         """Sign, and check signatures, with another passphrase from now on."""
         self.settings = with_passphrase(self.settings, passphrase)
         vehicle = self.settings.vehicle
-        self.perform(self.vehicle.take_settings("vehicle", vehicle), now_us, out)
+        self.perform(self.vehicle.apply_settings("vehicle", vehicle), now_us, out)
 
     def _change(self, section: str, settings: Settings, out: Outputs) -> None:
         """Rebuild the stage whose settings changed; the others keep their state."""

@@ -97,9 +97,9 @@ class Pipeline:
         """Process bytes of the receiver, read at `now_us`."""
         out = Outputs()
         for record in self._link.feed(data, now_us):
-            self._take(record, now_us, out)
+            self._feed(record, now_us, out)
         if self._link.packets:
-            self._take_packets(now_us, out)
+            self._feed_packets(now_us, out)
         return out
 
     @property
@@ -107,7 +107,7 @@ class Pipeline:
         """The sources that have a transport of their own."""
         return [source for source in self.sources if source.url.transport != "receiver"]
 
-    def _take_packets(self, now_us: int, out: Outputs) -> None:
+    def _feed_packets(self, now_us: int, out: Outputs) -> None:
         """Pass packets of other programs, without their RadioHead header, to their sources."""
         taken = [*self._link.packets]
         self._link.packets.clear()
@@ -117,22 +117,24 @@ class Pipeline:
             for packet in taken:
                 content = packet.packet[RADIOHEAD_HEADER:]
                 for record in source.feed(content, now_us, packet.signal):
-                    self._take(record, now_us, out)
+                    self._feed(record, now_us, out)
 
     def feed_source(self, source: SourceInput, data: bytes, now_us: int) -> Outputs:
         """Process bytes of a source other than the receiver."""
         out = Outputs()
         for record in source.feed(data, now_us):
-            self._take(record, now_us, out)
+            self._feed(record, now_us, out)
         return out
 
-    def take(self, record: RawRecord | ImuCalibrated | VehicleReport, now_us: int) -> Outputs:
+    def feed_record(
+        self, record: RawRecord | ImuCalibrated | VehicleReport, now_us: int
+    ) -> Outputs:
         """Process one raw record of a recording."""
         out = Outputs()
-        self._take(record, now_us, out)
+        self._feed(record, now_us, out)
         return out
 
-    def _take(
+    def _feed(
         self, record: RawRecord | ImuCalibrated | VehicleReport, now_us: int, out: Outputs
     ) -> None:
         vehicle_id = record.node.vehicle_id
@@ -146,7 +148,7 @@ class Pipeline:
             # Its heartbeat comes first: before it ground stations ignore an aircraft's messages.
             aircraft.perform(aircraft.vehicle.poll(now_us), now_us, out)
         aircraft.received_us = now_us
-        aircraft.take(record, now_us, out)
+        aircraft.feed(record, now_us, out)
 
     def _aircraft_of(self, vehicle_id: int) -> Aircraft:
         aircraft = self.aircraft.get(vehicle_id)

@@ -112,7 +112,7 @@ class NavFlags(IntFlag):
 
 
 class NodeId(msgspec.Struct, frozen=True, gc=False):
-    """Which node of which aircraft a payload comes from."""
+    """The node and aircraft that a payload comes from."""
 
     vehicle_id: int
     """1 to 31; becomes the MAVLink system id unless the settings say otherwise."""

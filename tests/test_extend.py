@@ -94,7 +94,7 @@ def fly_with(settings: AircraftSettings, seconds: float) -> list[bytes]:
     frames = []
     for record in fly(SimulatorSettings(), duration_s=seconds).records():
         now_us = record.time_us
-        for out in (pipeline.take(record, now_us), pipeline.poll(now_us)):
+        for out in (pipeline.feed_record(record, now_us), pipeline.poll(now_us)):
             frames += [sent.frame for sent in out.frames]
     return frames
 

@@ -128,7 +128,7 @@ def fly(aircraft: Aircraft, begin_us: int = 1_000_000, count: int = 60) -> list[
     """Take in readings; give the ATTITUDEs that come of them."""
     out = Outputs()
     for record in readings(begin_us, count):
-        aircraft.take(record, record.time_us, out)
+        aircraft.feed(record, record.time_us, out)
         aircraft.perform(aircraft.vehicle.poll(record.time_us), record.time_us, out)
     return decode(sent for sent in out.frames if sent.message_id == ATTITUDE)
 

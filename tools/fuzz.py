@@ -170,7 +170,7 @@ def receiver(data: bytes, cuts: list[int], step_us: int) -> None:
 @cache
 def _vehicles() -> Pipeline:
     pipeline = Pipeline(PipelineSettings(AircraftSettings()))
-    pipeline.take(BaroRaw(0, NodeId(1, 0), 0, 100_000.0, 20.0), 0)
+    pipeline.feed_record(BaroRaw(0, NodeId(1, 0), 0, 100_000.0, 20.0), 0)
     return pipeline
 
 

@@ -38,7 +38,7 @@ def forked(
         yield lambda items: enumerate(map(work, items))
         return
     with no_warning_of_threads():
-        pool = multiprocessing.get_context(START).Pool(count, _begin, (_take_work, work))
+        pool = multiprocessing.get_context(START).Pool(count, _begin, (_set_work, work))
 
     def run(items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
         # Few messages, and an even load.
@@ -49,7 +49,7 @@ def forked(
         yield run
 
 
-def _take_work(work: Callable[[Any], Any]) -> None:
+def _set_work(work: Callable[[Any], Any]) -> None:
     global _work
     _work = work
 

@@ -251,7 +251,7 @@ class TableTally:
         self._nodes: dict[int, NodeStatus] = {}
 
     def add(self, block: TableBlock) -> None:
-        """Take in the next block of the file."""
+        """Add the next block of the file."""
         for _, comment in block.comments:
             if isinstance(comment, NodeStatus):
                 self._add_status(comment)
@@ -314,7 +314,7 @@ class TlogTally:
         self._vehicles = {system: _Sent(senders.vehicle(system)) for system in senders.systems()}
 
     def add(self, batch: Batch) -> None:
-        """Take in the next batch of the file."""
+        """Add the next batch of the file."""
         self._index.add(batch)
         if not len(batch):
             return

@@ -101,7 +101,7 @@ class EntryPoint(Generic[Parameters]):
 
     @property
     def parameters(self) -> list[Any]:
-        """The parameters of the function, each of which is annotated as `int` or `float`."""
+        """The parameters of the function, each annotated as `int` or `float`."""
         return [*signature(self.__wrapped__).parameters.values()]  # type: ignore[attr-defined]
 
 

@@ -145,7 +145,7 @@ class CompiledEstimator:
         return nav_state(sample.time_us, self._output)
 
     def update_baro(self, sample: BaroSample) -> None:
-        """Use one barometer sample, of which only the Kalman filter has use."""
+        """Use one barometer sample; only the Kalman filter does."""
         if (step := self._kernels.baro_step) is not None:
             step(self._at, self._gains_at, sample.alt_pressure_m)
 

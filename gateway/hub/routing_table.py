@@ -165,7 +165,7 @@ class SystemPath:
 
 
 class RoutingTable:
-    """Which client has brought frames of which system.
+    """The client from which the frames of each system came.
 
     `changed` is called when cached routes may be wrong: a system has one path more, or fewer. Of
     more than `max_origins` systems of a client, the one received longest ago is replaced.

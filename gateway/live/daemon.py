@@ -371,7 +371,7 @@ class Daemon:
         # A ground station's broadcast is both handled and forwarded: it is recorded once. Frames of
         # untrusted clients are recorded only if they had an effect.
         kept = incoming.trusted or bool(out.frames or out.records or out.orders)
-        if not incoming.forwarded and kept and self._budget.takes(client_id, len(frame), now_us):
+        if not incoming.forwarded and kept and self._budget.allows(client_id, len(frame), now_us):
             self._record(frame)
         self._perform(out)
 
@@ -402,7 +402,7 @@ class Daemon:
             if message_id not in UNRECORDED and (
                 to is None
                 or to == RECORDED_ONLY
-                or self._budget.takes(to, len(sent.frame), self.now_us())
+                or self._budget.allows(to, len(sent.frame), self.now_us())
             ):
                 self._recorder.frame(sent.frame)
 

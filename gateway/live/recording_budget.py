@@ -30,7 +30,7 @@ class RecordingBudget:
         """Discard the quota of a client that has gone."""
         self._trusted.pop(client_id, None)
 
-    def takes(self, client_id: int, size: int, now_us: int) -> bool:
+    def allows(self, client_id: int, size: int, now_us: int) -> bool:
         """Return whether a frame from a client, or to it alone, is recorded."""
         bucket = self._trusted.get(client_id, self._untrusted)
         bucket.refill(now_us)

@@ -94,7 +94,7 @@ class SourcePort:
         self._complaint = reason
         self._source.lost(reason)
 
-    def _take(self, data: bytes) -> None:
+    def _feed(self, data: bytes) -> None:
         self._on_bytes(self._source, data)
 
     async def _serial(self) -> None:
@@ -121,7 +121,7 @@ class SourcePort:
             else:
                 reason = "the device hung up"
             if data:
-                self._take(data)
+                self._feed(data)
             elif not lost.done():
                 lost.set_result(reason)
 
@@ -135,7 +135,7 @@ class SourcePort:
     async def _udp(self) -> None:
         url = self._source.url
         transport, protocol = await asyncio.get_running_loop().create_datagram_endpoint(
-            lambda: _Datagrams(self._take), local_addr=(url.address, url.port)
+            lambda: _Datagrams(self._feed), local_addr=(url.address, url.port)
         )
         self._opened()
         try:
@@ -168,7 +168,7 @@ class SourcePort:
         self._opened()
         try:
             while data := await reader.read(READ_SIZE):
-                self._take(data)
+                self._feed(data)
             self._lost("the other side closed the connection")
         finally:
             writer.close()
@@ -179,7 +179,7 @@ class SourcePort:
         await asyncio.get_running_loop().connect_read_pipe(lambda: protocol, sys.stdin)
         self._opened()
         while data := await reader.read(READ_SIZE):
-            self._take(data)
+            self._feed(data)
 
     async def _file(self) -> None:
         """Follow a file; one that is shorter than what was read was written again."""
@@ -188,7 +188,7 @@ class SourcePort:
             self._opened()
             while True:
                 while data := file.read(READ_SIZE):
-                    self._take(data)
+                    self._feed(data)
                     await asyncio.sleep(0)
                 if os.stat(path).st_size < file.tell():  # noqa: PTH116
                     self._lost("the file was shortened")
@@ -199,13 +199,13 @@ class SourcePort:
 class _Datagrams(asyncio.DatagramProtocol):
     """Pass on datagrams; errors of the network are none of a receiver's."""
 
-    def __init__(self, take: Callable[[bytes], None]) -> None:
-        self._take = take
+    def __init__(self, feed: Callable[[bytes], None]) -> None:
+        self._feed = feed
         self.closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     def datagram_received(self, data: bytes, _address: object) -> None:
         """Pass on a datagram, which ends its last line."""
-        self._take(data)
+        self._feed(data)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
         """End the wait."""

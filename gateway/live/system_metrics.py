@@ -74,7 +74,7 @@ class SystemMetrics:
         self._streams: dict[int, _Stream] = {}
 
     def feed(self, frame: MavFrame, now_us: int, *, is_received: bool) -> None:
-        """Take in a frame of a vehicle, received or of our own."""
+        """Process a frame of a vehicle, received or of our own."""
         system_id = frame.origin[0]
         known = self._vehicles.states
         if system_id not in known and len(self._present(now_us)) >= MAX_SYSTEMS:

@@ -1,7 +1,7 @@
 """Carriers of an output's bytes: UDP, TCP, TLS, a listening port, or a serial line.
 
 Outputs are slow and periodic, so the transports of asyncio serve: a peer that does not keep up
-loses whole messages, of which the next are newer.
+loses whole messages, and the next ones are newer.
 """
 
 import asyncio

@@ -35,7 +35,7 @@ FPM_PER_MPS: Final = 60 * FEET_PER_M
 UNKNOWN_U12, UNKNOWN_CLIMB = 0xFFF, 0x800
 UNKNOWN_ANGLE, UNKNOWN_U16 = 0x7FFF, 0xFFFF
 SELF_ASSIGNED: Final = 1
-"""Type of our addresses; 24 bits of which the last eight are the system id."""
+"""Type of our addresses; 24 bits, the last eight are the system id."""
 FIRST_ADDRESS: Final = 0xF00000
 UNMANNED: Final = 14
 """Emitter category of an unmanned aircraft."""

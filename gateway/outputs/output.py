@@ -62,7 +62,7 @@ class Output(Client):
         raise NotImplementedError
 
     def transmit(self, frame: MavFrame) -> None:
-        """Take in one frame."""
+        """Process one frame."""
         self.vehicles.feed(frame, self.context.now_us())
 
     def tick(self, now_us: int) -> None:

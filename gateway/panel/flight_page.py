@@ -200,7 +200,7 @@ def render_page(flight: PageFlight) -> str:
     packed["modules"] = _packed(json.dumps(sources))
     css = "\n".join(
         [
-            # No rule that is used here has a picture.
+            # These rules draw no pictures.
             re.sub(r"url\([^)]*\)", "none", (folder / LEAFLET_CSS).read_text()),
             (WEB / "panel.css").read_text(),
         ]

@@ -103,8 +103,8 @@ def zip_stream(files: Sequence[Path]) -> Generator[bytes]:
                 with packed.open(info, "w", force_zip64=True) as entry:
                     while chunk := file.read(CHUNK):
                         entry.write(chunk)
-                        yield pieces.taken()
-    yield pieces.taken()
+                        yield pieces.take()
+    yield pieces.take()
 
 
 def open_regular(path: Path) -> BinaryIO:

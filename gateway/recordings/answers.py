@@ -167,8 +167,8 @@ class LogAnswers:
         """Parameters that a station has set, by system and name, until their value comes."""
         self._kept = 0
 
-    def note(self, batch: Batch, senders: Senders) -> None:
-        """Take in the next records, after `senders` has."""
+    def add(self, batch: Batch, senders: Senders) -> None:
+        """Use the next records, after `senders` has."""
         systems = batch.origins >> 8
         vehicles = {each: senders.vehicle(each).component for each in np.unique(systems).tolist()}
         pairs = np.unique(systems << 32 | batch.message_ids)
@@ -176,23 +176,23 @@ class LogAnswers:
         for i in np.flatnonzero(np.isin(batch.message_ids, _READ)).tolist():
             if self._kept < MAX_KEPT:
                 vehicle, time_us = vehicles[int(systems[i])], int(batch.time_us[i])
-                self.note_frame(batch.frame(i), time_us, senders.stations, vehicle)
+                self.add_frame(batch.frame(i), time_us, senders.stations, vehicle)
 
-    def note_frame(
+    def add_frame(
         self,
         frame: bytes,
         time_us: int,
         stations: Set[int] = frozenset(),
         vehicle: int = AUTOPILOT,
     ) -> None:
-        """Take in one frame: an answer or a part of a mission; others are ignored.
+        """Use one frame: an answer or a part of a mission; others are ignored.
 
         `vehicle` is the component of its system that is the vehicle.
         """
         message_id, (system, component) = message_id_of(frame), origin_of(frame)
         self.seen.add((system, message_id))
         if message_id in _MISSION:
-            self._note_mission(frame, time_us, is_station(system << 8 | component, stations))
+            self._add_mission(frame, time_us, is_station(system << 8 | component, stations))
         elif message_id == _PARAM_SET:
             name = payload_of(frame, _SET_NAME.stop)[_SET_NAME]
             if len(self._set) < MAX_KEPT:
@@ -206,7 +206,7 @@ class LogAnswers:
                 course.add(time_us, frame)
                 self._kept += 1
 
-    def _note_mission(self, frame: bytes, time_us: int, is_upload: bool) -> None:
+    def _add_mission(self, frame: bytes, time_us: int, is_upload: bool) -> None:
         vehicle = frame_of(frame).target[0] if is_upload else origin_of(frame)[0]
         name, message = MESSAGE_NAMES[message_id_of(frame)], fields_of(frame)
         kind = message["mission_type"]

@@ -168,7 +168,7 @@ class _Newest:
         self._seen: set[str] = set()
 
     def add(self, row: LogRow) -> None:
-        """Take in the next row."""
+        """Add the next row."""
         self.now_us = row.time_us
         self._rows[row.topic, row.instance] = row
         self._seen.add(row.topic)
@@ -388,7 +388,7 @@ class RecordTranslator:
             yield mavlink.MAVLink_statustext_message(event.severity, piece, self._texts, number)
 
     def _item(self, event: LoggedItem) -> Iterator[Any]:
-        """Take in an item of a new mission, or of the one that is there; yield a complete one."""
+        """Process an item of a new mission, or of the one that is there; yield a complete one."""
         if self._mission.get(event.seq) == event:
             return
         if event.seq == 0 or any(item.count != event.count for item in self._mission.values()):

@@ -123,7 +123,7 @@ class Codec(Generic[Read]):
         self.read: Callable[..., Read] = eval(
             f"lambda c, vehicle_id=0, **known: record({', '.join(read)}, **known)", scope
         )
-        """Make a record of its cells, of which the first is not NaN."""
+        """Make a record of its cells; the first is not NaN."""
 
 
 RAW_CODEC: Final = Codec(
@@ -284,7 +284,7 @@ class RowBuilder:
     def add(
         self, record: BaroRaw | GpsFix | FusedSample | ImuRaw | ImuCalibrated | NavState
     ) -> list[TableRow]:
-        """Take the next record and return the rows that it completes.
+        """Process the next record and return the rows that it completes.
 
         A state without a sample, such as an autopilot's, goes with the next sample.
         """

@@ -147,7 +147,7 @@ class FlownFigures:
         self._sequence = int(numbers[-1])
 
     def add(self, message: VehicleMessage) -> None:
-        """Take the next message of the vehicle."""
+        """Process the next message of the vehicle."""
         fields, at = message.fields, message.position
         if message.text is not None:
             self.errors += message.text.severity <= ERROR
@@ -199,7 +199,7 @@ def read_recording(path: Path, system_id: int | None, progress: Progress) -> Con
     for batch in source.batches(progress):
         if len(batch):
             first_us, last_us = first_us or int(batch.time_us[0]), int(batch.time_us[-1])
-        answers.note(batch, source.senders)
+        answers.add(batch, source.senders)
         facts.add_batch(batch, sender.origin)
         for message in reader.feed_batch(batch):
             facts.add(message)

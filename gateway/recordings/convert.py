@@ -339,7 +339,7 @@ class Pieces:
         self._size = 0
 
     def write(self, data: bytes) -> int:
-        """Take more of the file."""
+        """Write more of the file."""
         self._written.append(bytes(data))
         self._size += len(data)
         return len(data)
@@ -355,7 +355,7 @@ class Pieces:
         """Close the stream."""
         self.closed = True
 
-    def taken(self) -> bytes:
+    def take(self) -> bytes:
         """Return the bytes that were written since the last call."""
         data = b"".join(self._written)
         self._written.clear()

@@ -366,10 +366,10 @@ class FrameClock:
             fields = fields_of(frame)
             for name in names:
                 if own_us := fields[name] * _UNITS_US[name]:
-                    self._take(own_us, (*origin_of(frame), message_id, name))
+                    self._update(own_us, (*origin_of(frame), message_id, name))
         return round(self._line_us) if self._by_size else self._now_us
 
-    def _take(self, own_us: int, key: tuple[int | str, ...]) -> None:
+    def _update(self, own_us: int, key: tuple[int | str, ...]) -> None:
         is_civil = FIRST_CIVIL_US < own_us < LAST_CIVIL_US
         if is_civil and self.civil_us_at_zero is None:
             self.civil_us_at_zero = own_us - self._now_us

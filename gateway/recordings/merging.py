@@ -46,7 +46,7 @@ class FrameSample:
         """Time of each frame; None if it occurs again."""
 
     def add(self, batch: Batch) -> None:
-        """Take in the next batch of the file."""
+        """Add the next batch of the file."""
         if not len(batch):
             return
         least, greatest = int(batch.time_us.min()), int(batch.time_us.max())
@@ -106,7 +106,7 @@ class Alignment:
     """Of each file to the first one; None if it has no copies of frames of another file."""
 
     def add(self, batches: Iterable[Batch]) -> None:
-        """Take in the next file."""
+        """Add the next file."""
         sample = FrameSample()
         for batch in batches:
             sample.add(batch)
@@ -161,7 +161,7 @@ class Copies:
         self._order: deque[bytes] = deque()
 
     def is_copy(self, time_us: int, file: int, frame: bytes) -> bool:
-        """Take the next frame of a file, in the order of aligned times."""
+        """Process the next frame of a file, in the order of aligned times."""
         entries = self._pending.get(frame)
         for entry in entries or ():
             if file not in entry.seen and abs(time_us - entry.time_us) <= WINDOW_US:

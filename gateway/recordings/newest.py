@@ -118,8 +118,8 @@ class NewestState:
         self._source = ""
         self._origin: Position | None = None
 
-    def take(self, name: str, fields: Fields, now_us: int) -> bool:
-        """Take in a message; return whether it brought a new position."""
+    def update(self, name: str, fields: Fields, now_us: int) -> bool:
+        """Use a message; return whether it brought a new position."""
         self.fields[name] = fields
         self.heard_us[name] = now_us
         if name == "GPS_GLOBAL_ORIGIN":
@@ -278,7 +278,7 @@ class NewestVehicles:
         self.components = VehicleComponents()
 
     def feed(self, frame: MavFrame, now_us: int) -> NewestState | None:
-        """Take in a frame of `STATE_IDS`; return the state of its vehicle, if it is of one."""
+        """Process a frame of `STATE_IDS`; return the state of its vehicle, if it is of one."""
         message_id, (system_id, component_id) = frame.message_id, frame.origin
         if message_id not in DEFINITIONS or not 0 < system_id < FIRST_GROUND_STATION:
             return None
@@ -288,5 +288,5 @@ class NewestVehicles:
         if not self.components.includes(system_id, component_id, autopilot):
             return None
         state = self.states.setdefault(system_id, NewestState())
-        state.take(MESSAGE_NAMES[message_id], fields, now_us)
+        state.update(MESSAGE_NAMES[message_id], fields, now_us)
         return state

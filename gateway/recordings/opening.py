@@ -78,7 +78,7 @@ class TlogFile:
             batch = source.timeline.apply(scanner.feed(data, final=not data))
             self.index.add(batch)
             if answers is not None:
-                answers.note(batch, self.index.senders)
+                answers.add(batch, self.index.senders)
             offset += len(data)
             if progress is not None:
                 progress(len(data))
@@ -163,7 +163,7 @@ class FusedTlog:
         batch = self._scanner.feed(made, final=self._ended)
         self.index.add(batch)
         if self._answers is not None:
-            self._answers.note(batch, self.index.senders)
+            self._answers.add(batch, self.index.senders)
         self._size += len(made)
         return not self._ended
 
@@ -263,7 +263,7 @@ def _open_made(
     if estimates != "own":
         fusion = RecordedFusion(parts, options)
         for frame in fusion.introduction():
-            flight.answers.note_frame(frame, 0)
+            flight.answers.add_frame(frame, 0)
         add(fusion.frames(), end_of(parts[-1], options))
         flight.remarks += [f"{parts[0]}: {remark}" for remark in fusion.remarks]
 

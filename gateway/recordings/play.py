@@ -291,7 +291,7 @@ class Player:
             track = self._next_track()
             if track is None:
                 break
-            frames.append(self._take(track))
+            frames.append(self._next_frame(track))
         self._anchor = (now_us, self.position_us)
         return frames
 
@@ -338,7 +338,7 @@ class Player:
             self._skip_gap(track, now_us)
             if self._due_us(track) > now_us:
                 break
-            frames.append(self._take(track))
+            frames.append(self._next_frame(track))
         return frames
 
     def _seek_tracks(self, time_us: int) -> list[bytes]:
@@ -358,7 +358,7 @@ class Player:
                 found, earliest_us = track, time_us
         return found
 
-    def _take(self, track: Track) -> bytes:
+    def _next_frame(self, track: Track) -> bytes:
         self.position_us = track.peek_us() or self.position_us
         self.sent += 1
         frame = track.take()

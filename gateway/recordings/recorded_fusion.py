@@ -103,7 +103,7 @@ class Replay:
         self._follow = follow
         self._now_us: int | None = None
 
-    def take(self, row: Line) -> Iterator[tuple[int, Outputs]]:
+    def feed(self, row: Line) -> Iterator[tuple[int, Outputs]]:
         """Process one row, a change of settings, a mark, or a state to restore."""
         if isinstance(row, TableHeader):
             if self._follow:
@@ -125,7 +125,7 @@ class Replay:
                 continue
             yield from self._wait(record.time_us)
             now_us = self._now_us if self._now_us is not None else record.time_us
-            yield now_us, self._pipeline.take(record, now_us)
+            yield now_us, self._pipeline.feed_record(record, now_us)
 
     def _wait(self, until_us: int) -> Iterator[tuple[int, Outputs]]:
         """Run the timed actions before the next record; the clock never goes back."""
@@ -361,7 +361,7 @@ class RecordedFusion:
         for piece in (piece for block in self._table.blocks for piece in block.pieces(PIECE)):
             fusion.block(piece)
             lines = (e for e in piece.events(header.vehicle_id) if isinstance(e, Line))
-            for now_us, out in (each for line in lines for each in replay.take(line)):
+            for now_us, out in (each for line in lines for each in replay.feed(line)):
                 for sent in out.frames:
                     is_kept = sent.client_id in (None, RECORDED_ONLY)
                     if is_kept and sent.message_id not in UNRECORDED:

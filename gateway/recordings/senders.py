@@ -79,7 +79,7 @@ class Senders:
         """First origin of LOCAL_POSITION_NED by sender."""
 
     def add(self, batch: Batch) -> None:
-        """Take in the next batch of a file."""
+        """Add the next batch of a file."""
         if not len(batch):
             return
         self.origins |= set(np.unique(batch.origins).tolist())
@@ -125,7 +125,7 @@ class Senders:
         return sorted({origin >> 8 for origin in vehicles})
 
     def merge(self, other: "Senders") -> None:
-        """Take in the senders of another file of the same recording."""
+        """Add the senders of another file of the same recording."""
         self.origins |= other.origins
         self.stations |= other.stations
         self.heartbeats = {**other.heartbeats, **self.heartbeats}

@@ -76,7 +76,7 @@ class TextJoiner:
         """By sender and id."""
 
     def feed(self, frame: bytes, time_us: int) -> list[JoinedText]:
-        """Take a STATUSTEXT, and return the texts that are complete now, or wait no longer."""
+        """Process a STATUSTEXT, and return the texts that are complete now, or wait no longer."""
         found = self.poll(time_us)
         payload = payload_of(frame, _SIZE)
         text = payload[1 : 1 + TEXT_BYTES].split(b"\0", 1)[0]

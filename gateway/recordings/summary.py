@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 GAP_US: Final = 2 * US_PER_S
 """Every vehicle sends a heartbeat a second: a longer pause is a gap."""
 MAX_GAPS: Final = 1000
-MENDED: Final = "{} with a damaged time, each taken to be as old as the one before"
+DAMAGED_TIME: Final = "{} with a damaged time, each taken to be as old as the one before"
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ class TimesSpan:
         return self._before_us + self._newest_us - self._begin_us
 
     def add(self, time_us: int) -> None:
-        """Take in the time of the next record."""
+        """Add the time of the next record."""
         if self.first_us is None:
             self.first_us = self._begin_us = self._newest_us = time_us
         elif abs(time_us - self._last_us) > DAY_US:
@@ -146,7 +146,7 @@ class TimesSpan:
         self._last_us = time_us
 
     def add_all(self, times_us: IntArray) -> None:
-        """Take in the times of the next records, of which there is at least one."""
+        """Add the times of the next records, at least one."""
         before_us = times_us[0] if self.first_us is None else self._last_us
         steps_us = np.diff(times_us, prepend=before_us)
         for i in np.flatnonzero(steps_us > GAP_US)[: MAX_GAPS - len(self.gaps)].tolist():
@@ -171,7 +171,7 @@ class TlogSummary:
         self._span = TimesSpan()
 
     def add(self, batch: Batch) -> None:
-        """Take in the next batch of the file."""
+        """Add the next batch of the file."""
         self._index.add(batch)
         if not len(batch):
             return
@@ -204,7 +204,7 @@ class TlogSummary:
             damaged_bytes=index.damaged_bytes,
             damaged_runs=len(index.damage),
             unfinished_bytes=index.unfinished,
-            remarks=(MENDED.format(counted(index.mended, "record")),) if index.mended else (),
+            remarks=(DAMAGED_TIME.format(counted(index.mended, "record")),) if index.mended else (),
         )
 
     def _vehicle(self, system_id: int, duration_s: float) -> VehicleInfo:
@@ -238,7 +238,7 @@ class TableSummary:
         self._span = TimesSpan()
 
     def add(self, block: TableBlock, header: TableHeader | None) -> None:
-        """Take in the next block of the file."""
+        """Add the next block of the file."""
         self._header = header
         for _, comment in block.comments:
             if isinstance(comment, TableMark):

@@ -204,16 +204,16 @@ class TableReader:
         return 1 if self.header is None else self.header.vehicle_id
 
     def feed(self, data: bytes, *, final: bool = False) -> list[TableEvent]:
-        """Take the next bytes of the file, and return their rows and other lines one by one.
+        """Process the next bytes of the file, and return their rows and other lines one by one.
 
         See `feed_block`.
         """
         return [*self.feed_block(data, final=final).events(self.vehicle_id)]
 
     def feed_block(self, data: bytes, *, final: bool = False) -> TableBlock:
-        """Take the next bytes of the file."""
+        """Process the next bytes of the file."""
         text, newline, rest = (self._rest + data).rpartition(b"\n")
-        block = self._take(text + newline) if newline else TableBlock(NO_ROWS)
+        block = self._read_text(text + newline) if newline else TableBlock(NO_ROWS)
         if len(rest) > MAX_LINE or (self._skipped and not newline):
             self._skipped += len(rest)
             rest = b""
@@ -226,8 +226,8 @@ class TableReader:
             block = TableBlock(block.cells, (*block.comments, (len(block), cut)))
         return block
 
-    def _take(self, text: bytes) -> TableBlock:
-        """Take whole lines: all at once where they are rows alone."""
+    def _read_text(self, text: bytes) -> TableBlock:
+        """Read whole lines: all at once if all of them are rows."""
         if self._width and not self._skipped and b"#" not in text:
             cells = self._read(text)
             if cells is not None and not normalise(cells):
@@ -244,7 +244,7 @@ class TableReader:
             elif self._width and line.rstrip(b"\r") and not line.startswith(b"#"):
                 rows.append(line)
                 lines.append(self.lines)
-            elif (comment := self._take_other(line)) is not None:
+            elif (comment := self._comment_of(line)) is not None:
                 comments.append((self.lines, comment))
         return self._joined(rows, np.array(lines, np.int64), comments)
 
@@ -277,7 +277,7 @@ class TableReader:
         return np.column_stack([cells, np.full(len(cells), np.nan)])[:, self._indices]
 
     def _read_singly(self, rows: list[bytes]) -> tuple[FloatArray, dict[int, str]]:
-        """Read rows of which some are none: those are reported, and stay empty."""
+        """Read rows one by one; malformed ones are reported, and stay empty."""
         cells = np.full((len(rows), len(COLUMNS)), np.nan)
         faults: dict[int, str] = {}
         for row, line in enumerate(rows):
@@ -287,8 +287,8 @@ class TableReader:
                 faults[row] = str(error)
         return cells, faults
 
-    def _take_other(self, line: bytes) -> TableComment | None:
-        """Take a line that is no row: of the head, empty, or between rows."""
+    def _comment_of(self, line: bytes) -> TableComment | None:
+        """Read a line of the head, or one between rows that is no row."""
         try:
             return self._read_other(line)
         except ValueError as error:
@@ -297,7 +297,7 @@ class TableReader:
     def _read_other(self, line: bytes) -> TableComment | None:
         text = line.decode("utf-8-sig" if self.lines == 1 else "utf-8").rstrip("\r")
         if text and not text.startswith("#"):
-            self._take_names(text.split(","))
+            self._read_names(text.split(","))
         elif text.startswith(FORMAT_PREFIX) and text != FORMAT_LINE:
             version = text.removeprefix(FORMAT_PREFIX)
             raise ValueError(f"table version {version!r}; this mavgate reads 1, a newer one more")
@@ -310,7 +310,7 @@ class TableReader:
                 return found
         return None
 
-    def _take_names(self, names: list[str]) -> None:
+    def _read_names(self, names: list[str]) -> None:
         if "time_us" not in names:
             raise ValueError("no line of column names with time_us before the first row")
         self._width = len(names)

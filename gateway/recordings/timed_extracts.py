@@ -154,7 +154,7 @@ class _Shown:
         return "" if distance_m is None else f"{distance_m:.0f} m flown"
 
     def update(self, message: VehicleMessage) -> None:
-        """Take the next message of the vehicle."""
+        """Process the next message of the vehicle."""
         self.newest_us = message.time_us
         fields, at = message.fields, message.position
         if message.message_id == HEARTBEAT_ID:

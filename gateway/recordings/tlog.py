@@ -214,7 +214,7 @@ class TlogScanner:
         """Time of the newest record."""
 
     def feed(self, data: bytes, *, final: bool = False) -> Batch:
-        """Take the next bytes of the file."""
+        """Process the next bytes of the file."""
         data = self._rest + data if self._rest else data
         room = len(data) // SMALLEST_RECORD + 1
         columns = np.empty((COLUMNS, room), np.int64)
@@ -295,7 +295,7 @@ class Timeline:
         self._date_shift_us: int | None = None
 
     def add(self, batch: Batch) -> None:
-        """Take in the recorded times of the next batch of the file."""
+        """Add the recorded times of the next batch of the file."""
         if not len(batch):
             return
         times_us = batch.time_us

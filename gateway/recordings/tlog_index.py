@@ -44,7 +44,7 @@ class TlogIndex:
         self._times = array("q")
 
     def add(self, batch: Batch) -> None:
-        """Take in the next batch of the file."""
+        """Add the next batch of the file."""
         for run in batch.damage:
             self._add_damage(run)
         self.mended += batch.mended

@@ -97,7 +97,7 @@ class VehicleReader:
         return known
 
     def feed_batch(self, batch: Batch) -> Iterator[VehicleMessage]:
-        """Take the next batch of the recording."""
+        """Process the next batch of the recording."""
         for origin in np.unique(batch.origins).tolist():
             self.vehicle(origin >> 8)
         ids = {*self._wanted, STATUSTEXT_ID, ORIGIN_ID}
@@ -107,7 +107,7 @@ class VehicleReader:
             yield from self.feed(record)
 
     def feed(self, record: TlogRecord) -> Iterator[VehicleMessage]:
-        """Take the next record."""
+        """Process the next record."""
         frame, time_us = record.frame, record.time_us
         system_id, component_id = origin_of(frame)
         origin, message_id = system_id << 8 | component_id, message_id_of(frame)
@@ -128,7 +128,7 @@ class VehicleReader:
             yield self._message(vehicle, message_id, record)
 
     def flush(self) -> Iterator[VehicleMessage]:
-        """Return the texts of which no more will come."""
+        """Return the texts that will not become longer."""
         return map(_of_text, self._joiner.flush())
 
     def _message(

@@ -42,7 +42,7 @@ class CsvLines:
         self._wanted = {each if isinstance(each, str) else each.column for each in wanted}
 
     def line(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:
-        """Take one line: that with the names, or one with values."""
+        """Process one line: that with the names, or one with values."""
         if self._is_header(line):
             self._header = line
             return []

@@ -91,7 +91,7 @@ class LineSplitter:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[str | Fault]:
-        """Take any chunk, and return the lines that it completes."""
+        """Decode any chunk, and return the lines that it completes."""
         *lines, rest = (self._rest + data).split(b"\n")
         found: list[str | Fault] = [
             line.decode("utf-8", "replace").strip()

@@ -49,7 +49,7 @@ class NmeaReader:
         """Arrival and fields of the newest VTG, GSA and GST."""
 
     def line(self, line: str, arrival_us: int) -> list[GpsFix | VehicleReport | Fault]:
-        """Take one sentence."""
+        """Process one sentence."""
         found = SENTENCE.fullmatch(line)
         if found is None:
             return [_fault("nmea", line, "no NMEA sentence")]

@@ -38,7 +38,7 @@ class SourceDecoder(Protocol):
     """The decoder of one kind of source."""
 
     def feed(self, data: bytes, arrival_us: int) -> list[SourceRecord | Fault]:
-        """Take any chunk, and return the records and faults that it completes; never raise."""
+        """Decode any chunk, and return the records and faults that it completes; never raise."""
         ...
 
     def reset(self) -> None:

@@ -78,7 +78,7 @@ class SourceTrial:
         self._has_mag = self._has_fix = self._has_height = self._has_attitude = False
         self._header = ""
 
-    def take(self, event: SourceRecord | Fault) -> int:
+    def feed(self, event: SourceRecord | Fault) -> int:
         """Count a record or a fault; return how many of its kind there were."""
         kind = f"fault {event.kind}" if isinstance(event, Fault) else type(event).__name__
         self.counts[kind] += 1

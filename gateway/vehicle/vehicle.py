@@ -367,7 +367,7 @@ class Vehicle:
         """Announce an event of the gateway, such as a recording that stopped."""
         return self._finish(self._announcements.say(text, now_us))
 
-    def take_settings(self, section: str, settings: Settings) -> list[Action]:
+    def apply_settings(self, section: str, settings: Settings) -> list[Action]:
         """Apply a section that was changed elsewhere, and send the parameters that differ."""
         if isinstance(settings, VehicleSettings) and section == OWN_SECTION:
             self._reconfigure(settings)

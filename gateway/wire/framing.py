@@ -78,7 +78,7 @@ class FrameDecoder:
         """Bytes of it that were dropped, because it is too long."""
 
     def feed(self, data: bytes) -> list[bytes | Fault]:
-        """Take any chunk of the line, and return the contents of the frames that it completes.
+        """Decode any chunk of the line, and return the contents of the frames that it completes.
 
         They are without CRC, and in order with every fault. Never raises on data.
         """

@@ -157,7 +157,7 @@ class Link:
         self._next_frame_seq: int | None = None
 
     def feed(self, data: bytes, arrival_us: int) -> list[RawRecord]:
-        """Take any chunk of the line, read at a time of the gateway clock, and return its records.
+        """Decode any chunk, read at a time of the gateway clock, and return its records.
 
         They are in the order of their arrival, without duplicates; the times of one node's IMU
         records strictly grow. Never raises on data: faults are counted.

@@ -98,7 +98,7 @@ class ClockTracker:
         return (1.0 / (1.0 + self._skew) - 1.0) * 1e6
 
     def observe(self, remote_u32: int, arrival_us: int) -> int:
-        """Take in one packet and return its time on the local clock.
+        """Process one packet and return its time on the local clock.
 
         Parameters
         ----------
@@ -255,7 +255,7 @@ class GpsTime:
         self._offsets_us: dict[int, deque[int]] = {}
 
     def update(self, vehicle_id: int, utc_us: int, time_us: int) -> int | None:
-        """Take in the UTC of a fix and its arrival on the gateway clock.
+        """Process the UTC of a fix and its arrival on the gateway clock.
 
         The arrival is used as the time of the fix: late by the latency, so never in the future.
         Returns UTC at the zero of the gateway clock; None while there are too few fixes.

@@ -40,7 +40,7 @@ def make_daemon(folder: Path, passphrase: str = "") -> Daemon:
         vehicle=VehicleSettings(signing_passphrase=passphrase),
     )
     made = Daemon(settings, {}, lambda: settings)
-    made._perform(made._pipeline.take(BaroRaw(0, NodeId(1, 0), 0, 1e5, 20.0), 0))
+    made._perform(made._pipeline.feed_record(BaroRaw(0, NodeId(1, 0), 0, 1e5, 20.0), 0))
     return made
 
 

@@ -24,7 +24,7 @@ def taken(budget: RecordingBudget, clients: list[int], seconds: int, size: int =
     for step in range(seconds * 100):
         for client_id in clients:
             for _ in range(20_000 // size):
-                total += size * budget.takes(client_id, size, step * SECOND_US // 100)
+                total += size * budget.allows(client_id, size, step * SECOND_US // 100)
     return total
 
 
@@ -46,7 +46,7 @@ def test_budget_of_a_trusted_client_is_independent_of_untrusted_ones() -> None:
 def test_ground_station_at_its_usual_rate_is_recorded_completely() -> None:
     budget = RecordingBudget()
     budget.note(1, 0, trusted=True)
-    assert all(budget.takes(1, 280, n * SECOND_US // 200) for n in range(20_000))
+    assert all(budget.allows(1, 280, n * SECOND_US // 200) for n in range(20_000))
 
 
 def test_client_that_loses_trust_or_leaves_loses_its_own_budget() -> None:
@@ -56,7 +56,7 @@ def test_client_that_loses_trust_or_leaves_loses_its_own_budget() -> None:
     assert taken(budget, [1], 1) <= UNTRUSTED_RATE * (BURST_S + 1)
     budget.note(2, 0, trusted=True)
     budget.remove_client(2)
-    assert not budget.takes(2, 60_000, SECOND_US)
+    assert not budget.allows(2, 60_000, SECOND_US)
 
 
 SHIFT_US = 5_000_000

@@ -85,7 +85,7 @@ def fly(settings: AircraftSettings, records: list[RawRecord]) -> tuple[bytes, li
     pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
     lines, states = [encode_head(header_for(settings, 1))], []
     for record in records:
-        for action in pipeline.take(record, record.time_us).records:
+        for action in pipeline.feed_record(record, record.time_us).records:
             if isinstance(action, FusedSample | BaroRaw | GpsFix):
                 lines += map(row_to_line, rows.add(action))
             if isinstance(action, FusedSample):
@@ -114,7 +114,7 @@ def fly_from_the_middle(
             state = pipeline.aircraft[1].fusion_state
             builder.flush()
             rows.clear()
-        for action in pipeline.take(record, record.time_us).records:
+        for action in pipeline.feed_record(record, record.time_us).records:
             if isinstance(action, FusedSample | BaroRaw | GpsFix):
                 rows += builder.add(action)
     assert state is not None

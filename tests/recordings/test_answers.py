@@ -40,7 +40,7 @@ class Day:
         batch = TlogScanner().feed(self.data, final=True)
         index, found = TlogIndex(), LogAnswers()
         index.add(batch)
-        found.note(batch, index.senders)
+        found.add(batch, index.senders)
         time_us = self.now_us if at_us is None else at_us
         return VehicleAnswers(found, 3, played_as, lambda: time_us)
 

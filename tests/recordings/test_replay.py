@@ -69,7 +69,7 @@ def test_settings_changed_in_flight_are_changed_in_replay(rng: np.random.Generat
     }
     records = make_flight(rng, 30)
     for number, record in enumerate(records):
-        out = pipeline.take(record, record.time_us)
+        out = pipeline.feed_record(record, record.time_us)
         if number in changes:
             pipeline.aircraft[1].perform([changes[number]], record.time_us, out)
         for action in out.records:
@@ -103,7 +103,7 @@ def test_flight_resumed_from_a_state_gives_bit_equal_states(
     pipeline = Pipeline(PipelineSettings(other, fused=played))
     Fusion(1, other, follow=True, played=played).block(block_of([state, rows[0]]))
     for line in (state, rows[0]):
-        for _ in Replay(pipeline).take(line):
+        for _ in Replay(pipeline).feed(line):
             pass
     assert pipeline.aircraft[1].fusion_state.home == state.home
 
@@ -154,7 +154,7 @@ def test_replay_sends_messages_at_their_rates(rng: np.random.Generator) -> None:
     sent = [
         (now_us, sent.message_id)
         for row in read(table)[1]
-        for now_us, out in replay.take(row)
+        for now_us, out in replay.feed(row)
         for sent in out.frames
     ]
     times = [now_us for now_us, _ in sent]
@@ -171,15 +171,15 @@ def test_marks_and_settings_of_the_flight_are_replayed_at_their_time(
         pipeline = Pipeline(PipelineSettings(settings))
         playing = Replay(pipeline, follow=follow)
         for row in rows:
-            *_, (last_us, _) = playing.take(row)
+            *_, (last_us, _) = playing.feed(row)
         texts = [
             (now_us, sent.message_id)
-            for now_us, out in playing.take(TableMark(last_us + 40_000, "over the gate"))
+            for now_us, out in playing.feed(TableMark(last_us + 40_000, "over the gate"))
             for sent in out.frames
             if b"over the gate" in sent.frame
         ]
         assert texts == [(last_us + 40_000, 253)]
-        changed = list(playing.take(header_for(make_settings("paper"), 1)))
+        changed = list(playing.feed(header_for(make_settings("paper"), 1)))
         assert {now_us for now_us, _ in changed} == ({last_us + 40_000} if follow else set())
         estimator = pipeline.aircraft[1].settings.estimation.estimator
         assert estimator == ("paper" if follow else "eskf")

@@ -50,7 +50,7 @@ def one_by_one(lines: list[Line], settings: AircraftSettings) -> Iterator[TableR
     """Fuse as if every record came live."""
     replay, builder = Replay(Pipeline(PipelineSettings(settings))), RowBuilder()
     for line in lines:
-        for record in (record for _, out in replay.take(line) for record in out.records):
+        for record in (record for _, out in replay.feed(line) for record in out.records):
             if isinstance(record, FusedSample | BaroRaw | GpsFix):
                 yield from builder.add(record)
         yield from builder.flush()

@@ -79,7 +79,7 @@ def test_trial_names_rates_what_is_missing_and_a_map() -> None:
     trial.look_at(text)
     shown = []
     for event in decode(text + gga()):
-        trial.take(event)
+        trial.feed(event)
         shown.append(describe(event))
     assert shown[-1] == "GPS fix 48.117300 11.516667 545.4 m, 9 satellites"
     assert shown[0].startswith("not used (text): 'time,acc_x,acc_y,acc_z'")

@@ -42,7 +42,7 @@ class Flight:
             self._keep(self.pipeline.poll(self.now_us))
 
     def take(self, record: Any) -> None:
-        self._keep(self.pipeline.take(record, self.now_us))
+        self._keep(self.pipeline.feed_record(record, self.now_us))
 
     def line(self, **content: object) -> None:
         data = json.dumps(content).encode() + b"\n"

@@ -140,7 +140,7 @@ def test_signed_frame_is_accepted_unchecked_without_a_key(clock: ManualClock) ->
 
 def change(station: GroundStation, passphrase: str) -> None:
     settings = VehicleSettings(signing_passphrase=passphrase)
-    station.vehicle.take_settings("vehicle", settings)
+    station.vehicle.apply_settings("vehicle", settings)
 
 
 def test_changed_passphrase_takes_effect_at_once(station: GroundStation) -> None:

@@ -46,7 +46,7 @@ class Bench:
         for _ in range(round(seconds * 100)):
             self.time_us += 10_000
             raw = replace(LEVEL, time_us=self.time_us, node_time_us=self.time_us, **changes)
-            out = self.pipeline.take(raw, self.time_us)
+            out = self.pipeline.feed_record(raw, self.time_us)
             fused += [record for record in out.records if isinstance(record, FusedSample)]
             self.reported += decode(out.frames)
             self.reported += decode(self.pipeline.poll(self.time_us).frames)

@@ -331,7 +331,7 @@ class _Collecting:
         self.limit_s = MAG_LIMIT_S if turned else seconds
 
     def add(self, records: Iterable[RawRecord]) -> bool:
-        """Take the next records; return whether they are enough."""
+        """Process the next records; return whether they are enough."""
         raws, seconds = self.raws, self._seconds
         for record in records:
             if record.node.vehicle_id != self._vehicle:

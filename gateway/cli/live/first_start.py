@@ -273,7 +273,7 @@ def _observe(
 ) -> LinkReport:
     """Read the receiver until something holds, at most for a time; shows progress."""
 
-    def take(records: list[RawRecord]) -> bool:
+    def feed(records: list[RawRecord]) -> bool:
         for record in records:
             if isinstance(record, NodeStatus):
                 seen.statuses[record.node.vehicle_id, record.node.node_id] = record
@@ -287,7 +287,7 @@ def _observe(
     )  # fmt: skip
     bar.add_task("", total=None)
     with bar:
-        return asyncio.run(listen(serial, take, limit_s))[0]
+        return asyncio.run(listen(serial, feed, limit_s))[0]
 
 
 @contextmanager

@@ -42,13 +42,13 @@ def try_source(
 async def _listen(source: SourceInput, seconds: float) -> SourceTrial:
     trial, clock = SourceTrial(), GatewayClock()
 
-    def take(found: SourceInput, data: bytes) -> None:
+    def show(found: SourceInput, data: bytes) -> None:
         trial.look_at(data.decode("utf-8", "replace"))
         for event in found.decoder.feed(data, clock()):
-            if trial.take(event) <= SHOWN:
+            if trial.feed(event) <= SHOWN:
                 print(printable(describe(event)))
 
-    port = SourcePort(source, take)
+    port = SourcePort(source, show)
     port.start()
     await asyncio.sleep(seconds)
     port.close()

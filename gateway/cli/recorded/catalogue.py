@@ -37,7 +37,7 @@ WHOLE: Final = ("vehicle", "duration", "highest", "gps_outages", "faults")
 
 
 class _IndexByDefault(TyperGroup):
-    """A group whose first word is a folder to index, where it is none of its commands."""
+    """A command group; a first argument that is not one of its commands is a folder to index."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the command in its place."""

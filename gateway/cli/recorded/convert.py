@@ -223,7 +223,7 @@ def _read_anonymity(
 
 
 def _print_changes(anonymiser: Anonymiser) -> None:
-    """Print how many fields of which message were changed."""
+    """Print the number of changed fields of each message."""
     table = table_of("message", "field", "changed", left=2)
     for (message, field), count in sorted(anonymiser.changed.items()):
         table.add_row(message, field, str(count))

@@ -78,7 +78,7 @@ class _Recording:
         answers = LogAnswers()
         for source in self.sources:
             for batch in source.batches(self.progress):
-                answers.note(batch, self.senders)
+                answers.add(batch, self.senders)
         return RecordedPlan(answers, self.senders.vehicle(self.system_id))
 
     def first_us(self) -> int:

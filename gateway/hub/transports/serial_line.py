@@ -144,6 +144,6 @@ class SerialClient(QueuedClient):
             self._broke(error)
             return
         if data:
-            self.take(data, self.context.now_us())
+            self.feed(data, self.context.now_us())
         else:
             self._broke(OSError("the device hung up"))

@@ -109,7 +109,7 @@ class QueuedClient(Client):
     def _is_own(self, origin: Origin) -> bool:
         return self.context.is_own((self._system_here(origin[0]), origin[1]))
 
-    def take(self, data: bytes, now_us: int) -> None:
+    def feed(self, data: bytes, now_us: int) -> None:
         """Process a chunk of the stream: frames with compiled routes by the step."""
         forwarding = self.context.forwarding
         if not self.routes or not forwarding.is_compiled:
@@ -239,7 +239,7 @@ class StreamClient(QueuedClient):
 
     def accept(self, data: bytes, now_us: int) -> None:
         """Process received bytes."""
-        self.take(data, now_us)
+        self.feed(data, now_us)
 
     def _write(self, sock: socket.socket, data: bytes) -> bool:
         """Write; keep the bytes that the socket does not accept and wait for room."""

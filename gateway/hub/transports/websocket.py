@@ -177,7 +177,7 @@ class WebStream(StreamClient):
 
     def _receive_payload(self, found: WsInput, now_us: int) -> None:
         if found.payload:
-            self.take(found.payload, now_us)
+            self.feed(found.payload, now_us)
         if found.text_size:
             self.count_garbage(found.text_size)
 

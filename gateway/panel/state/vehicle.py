@@ -47,7 +47,7 @@ class VehicleState:
     def update(self, message: Any, now_us: int) -> None:
         """Update the state by one decoded message of this system's autopilot."""
         name = message.get_type()
-        has_moved = self.state.take(name, vars(message), now_us)
+        has_moved = self.state.update(name, vars(message), now_us)
         self.texts.poll(now_us)
         if name == "STATUSTEXT":
             self.texts.feed(message, now_us)

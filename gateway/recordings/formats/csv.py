@@ -324,7 +324,7 @@ def _cells_of(line: str, delimiter: str) -> list[str]:
 
 
 def _begun(names: Iterable[str]) -> frozenset[str]:
-    """Return all axes of the vectors of which at least one is among the names."""
+    """Return all axes of the vectors that have at least one axis among the names."""
     return frozenset[str]().union(*(axes for axes in VECTORS if not axes.isdisjoint(names)))
 
 

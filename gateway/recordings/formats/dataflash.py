@@ -129,7 +129,7 @@ class LogClock(Generic[Item]):
         """Items whose times agree with each other, but not with those before."""
 
     def feed(self, own_us: int | None, item: Item) -> list[tuple[int, Item]]:
-        """Take the next item with its time on the autopilot's clock; return those that are timed.
+        """Process an item with its time on the autopilot's clock; return those that are timed.
 
         One without a time is as old as the one before.
         """
@@ -214,17 +214,17 @@ class ArdupilotReader:
         return {*self._handlers, *KINDS}
 
     def feed(self, name: str, message: Message) -> list[Imported]:
-        """Take the next message."""
+        """Process the next message."""
         kind = KINDS.get(name, name)
         if kind not in self._handlers or sensor_of(name, message) != self._sensors.get(kind, 0):
             return []
-        return self._take(self.clock.feed(own_us_of(name, message), (kind, message)))
+        return self._handle(self.clock.feed(own_us_of(name, message), (kind, message)))
 
     def flush(self) -> list[Imported]:
         """Return the records that still wait at the end of the log."""
-        return [*self._take(self.clock.flush()), *self._flush_fix()]
+        return [*self._handle(self.clock.flush()), *self._flush_fix()]
 
-    def _take(self, timed: Iterable[tuple[int, tuple[str, Message]]]) -> list[Imported]:
+    def _handle(self, timed: Iterable[tuple[int, tuple[str, Message]]]) -> list[Imported]:
         """Handle messages at their times."""
         found: list[Imported] = []
         for time_us, (kind, message) in timed:
@@ -463,7 +463,7 @@ def open_log(path: Path, options: ReadOptions, damage: PrintedDamage) -> Any:
 
 
 class MessageReader(Protocol[Item]):
-    """Takes the messages of a log one by one."""
+    """Processes the messages of a log one by one."""
 
     @property
     def names(self) -> set[str]:
@@ -471,7 +471,7 @@ class MessageReader(Protocol[Item]):
         ...
 
     def feed(self, name: str, message: Message) -> list[Item]:
-        """Take the next message."""
+        """Process the next message."""
         ...
 
     def flush(self) -> list[Item]:

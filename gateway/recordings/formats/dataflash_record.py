@@ -114,7 +114,7 @@ class RowReader:
         return {*table().topics, "ORGN", *KINDS}
 
     def feed(self, name: str, message: Message) -> list[Entry]:
-        """Take the next message."""
+        """Process the next message."""
         timed = own_us_of(name, message) if _has_time(name, message) else None
         return [
             entry

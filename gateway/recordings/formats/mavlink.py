@@ -220,8 +220,8 @@ class AutopilotReader:
         """The row that waits for its sample, if any."""
 
     def feed(self, batch: Batch) -> FloatArray:
-        """Take the next records of the recording, of which every checksum was checked."""
-        taken = self._taken(batch)
+        """Process the next records of the recording; their checksums are right."""
+        taken = self._chosen(batch)
         message_ids, recorded_us = batch.message_ids[taken], batch.time_us[taken]
         fields = {
             int(one): columns_of(batch, taken[message_ids == one], int(one))
@@ -237,7 +237,7 @@ class AutopilotReader:
         rows, self._open = self._open, self._open[:0]
         return rows
 
-    def _taken(self, batch: Batch) -> IntArray:
+    def _chosen(self, batch: Batch) -> IntArray:
         """Choose the messages of the vehicle that are no poorer than others of their kind."""
         wanted = np.flatnonzero(np.isin(batch.message_ids, _WANTED))
         ranks = np.zeros(len(wanted), np.int64)

@@ -187,7 +187,7 @@ class FoxgloveView:
         self._vehicles: dict[int, _Vehicle] = {}
 
     def feed(self, message: VehicleMessage) -> Iterator[Shown]:
-        """Take the next message of a vehicle; GPS_RAW_INT and ESTIMATOR_STATUS are used too."""
+        """Process the next message of a vehicle; GPS_RAW_INT and ESTIMATOR_STATUS are used too."""
         frame, time_us = f"vehicle_{message.system_id}", message.time_us
         vehicle = self._vehicles.setdefault(message.system_id, _Vehicle(frame))
         if message.text is not None:
@@ -354,7 +354,7 @@ def write(flight: FlightToWrite) -> Iterator[bytes]:
             topics.add(topic, schema_of_message(kind), fields, time_us, frame.sequence)
         for message in reader.feed(record):
             topics.add_shown(view.feed(message), message.time_us)
-        if data := pieces.taken():
+        if data := pieces.take():
             yield data
     for message in reader.flush():
         topics.add_shown(view.feed(message), message.time_us)
@@ -366,4 +366,4 @@ def write(flight: FlightToWrite) -> Iterator[bytes]:
         origin_facts = {"latitude": lat_deg, "longitude": lon_deg, "altitude_amsl_m": alt_m}
         writer.add_metadata("origin of the frame map", origin_facts)
     writer.finish()  # type: ignore[no-untyped-call]
-    yield pieces.taken()
+    yield pieces.take()

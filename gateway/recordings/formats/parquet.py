@@ -91,12 +91,12 @@ def _write_table(table: RecordedTable) -> Iterator[bytes]:
             comments = ""
             if len(rows) == ROWS:
                 writer.write_table(_batch(rows, schema))
-                yield pieces.taken()
+                yield pieces.take()
                 rows.clear()
         writer.write_table(_batch(rows, schema))
         if comments:
             writer.add_key_value_metadata({END: comments})
-    yield pieces.taken()
+    yield pieces.take()
 
 
 def _writer(pieces: Pieces, schema: pa.Schema) -> pq.ParquetWriter:
@@ -200,12 +200,12 @@ def _write_messages(flight: FlightToWrite, name: str) -> Iterator[bytes]:
                 rows.append((record.time_us, *origin_of(record.frame), *values))
             if len(rows) == ROWS:
                 writer.write_table(_batch(rows, schema))
-                yield pieces.taken()
+                yield pieces.take()
                 rows.clear()
         if name not in met:
             raise FlightError(f"the flight contains no {name}, but {', '.join(sorted(met))}")
         writer.write_table(_batch(rows, schema))
-    yield pieces.taken()
+    yield pieces.take()
 
 
 def _message_field(kind: Any, name: str) -> pa.Field:

@@ -452,7 +452,7 @@ def _lost_head(rest: Iterator[bytes], before: bytes) -> Iterator[bytes]:
 
 
 def load(path: Path, options: ReadOptions, topics: list[str] | None) -> tuple[Any, int, Before]:
-    """Read a log, of which some or all topics; also the bytes at its ends that were left out."""
+    """Read some or all topics of a log, and the bytes at its ends that were left out."""
     whole = read_chunks(path, options.progress, options.unpacked_limit)
     rest, before = skip_to(ULOG_BEGIN, whole)
     with temporary_copy(path, chain(_lost_head(rest, before.text), rest)) as content:

@@ -86,7 +86,7 @@ METHODS: Final[dict[tuple[int, int, int], tuple[str, Method | None]]] = {
 class _Run:
     kind: str
     at_rest: Method | None
-    asked: tuple[float, ...]
+    method: tuple[float, ...]
     """The parameters that request it."""
     command: Command
     began_us: int
@@ -179,7 +179,7 @@ class Calibrator(Service):
         if self._in_flight():
             return DENIED, _text("calibration failed: in flight")
         if self._run is not None:
-            return (IN_PROGRESS if run.asked == self._run.asked else NOT_NOW), []
+            return (IN_PROGRESS if run.method == self._run.method else NOT_NOW), []
         self._run = run
         return IN_PROGRESS, _text(f"calibration started: 2 {run.kind}")
 

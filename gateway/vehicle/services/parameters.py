@@ -361,7 +361,7 @@ class Metadata:
         return Metadata(self._table, system_id)
 
     def describes(self, names: Collection[str]) -> bool:
-        """Return whether parameters, of which there are some, are those of this version."""
+        """Return whether parameters, at least one, are those of this version."""
         return bool(names) and set(names) <= self._table.parameters.keys()
 
     def announcement(self, now_us: int) -> Any:

@@ -107,7 +107,7 @@ class _Trouble:
 
 @dataclass(slots=True)
 class _Radio:
-    """Failed sends of the last seconds, of which some are no trouble."""
+    """Failed sends of the last seconds; a few are usual."""
 
     failed: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=MAX_REPORTS))
     """Time of each report and the number of failed sends that it added."""

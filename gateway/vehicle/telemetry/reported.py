@@ -63,7 +63,7 @@ class Reported:
         self._newest: dict[str, tuple[int, Any]] = {}
         """Time and value of other fields."""
 
-    def take(self, report: VehicleReport) -> None:
+    def update(self, report: VehicleReport) -> None:
         """Take over the fields that a report has."""
         for name in ("attitude_rad", "channels_us"):
             if value := getattr(report, name):

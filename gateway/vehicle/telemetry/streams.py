@@ -49,8 +49,8 @@ class Pace:
         self._last_us: int | None = None
         self._period_us = 0
 
-    def take(self, time_us: int) -> int:
-        """Take in the time of a sample, and return the present period in us; 0 at the first."""
+    def update(self, time_us: int) -> int:
+        """Use the time of a sample; return the present period in us; 0 at the first."""
         period_us = self._period_us
         if self._last_us is not None and 0 < (gap_us := time_us - self._last_us) <= MAX_PERIOD_US:
             period_us = period_us or gap_us
@@ -80,7 +80,7 @@ class Stream:
 
     def offer(self, time_us: int) -> bool:
         """Return whether the sample of this time is to be sent."""
-        return self.offer_paced(time_us, self._pace.take(time_us))
+        return self.offer_paced(time_us, self._pace.update(time_us))
 
     def offer_paced(self, time_us: int, period_us: int) -> bool:
         """Do the same where several streams are carried by the same samples, of a known pace."""

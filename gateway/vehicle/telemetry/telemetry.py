@@ -185,7 +185,7 @@ class Telemetry:
         self._state_streams = [(self.streams[m], self._builders[m]) for m in STATE_MESSAGES]
         """Schedule and builder of each message that IMU samples carry."""
         self._timed = [*TIMED_MESSAGES]
-        self._take_added()
+        self._add_registered()
         self._polled = False
 
     def _own_builders(self) -> dict[int, Builder]:
@@ -224,7 +224,7 @@ class Telemetry:
         """Add a message that another service builds."""
         self._builders[message_id] = builder
 
-    def _take_added(self) -> None:
+    def _add_registered(self) -> None:
         for added in ADDED_MESSAGES.values():
             if added.message_id in self.streams:
                 raise ValueError(f"message {added.message_id} is sent by every vehicle already")
@@ -278,7 +278,7 @@ class Telemetry:
         ):
             self._reference_alt_m = state.alt_amsl_m
         self.motion.update(state, self._ground_alt_m)
-        period_us = self._pace.take(time_us)
+        period_us = self._pace.update(time_us)
         return [] if time_us + period_us < self._state_due_us else self._carried(time_us, period_us)
 
     def _carried(self, time_us: int, period_us: int) -> list[Answer]:
@@ -303,7 +303,7 @@ class Telemetry:
     def on_report(self, report: VehicleReport) -> list[Answer]:
         """Take in a part of the state that the vehicle's own autopilot reports."""
         reported, time_us = self.health.reported, report.time_us
-        reported.take(report)
+        reported.update(report)
         found: list[Answer] = [Reply(message) for message in named_values(report)]
         if report.attitude_rad is not None:
             found += self._on_reported(time_us, ATTITUDE_MESSAGES)

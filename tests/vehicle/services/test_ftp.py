@@ -131,7 +131,7 @@ def test_packed_parameters_are_decoded_by_mavproxy(ftp: FtpClient) -> None:
 def test_client_that_read_the_packed_parameters_is_sent_changes(ftp: FtpClient) -> None:
     ftp.read(b"@PARAM/param.pck")
     changed = VehicleSettings(takeoff_speed_mps=7.0)
-    [value] = ftp.station.receive(ftp.station.vehicle.take_settings("vehicle", changed))
+    [value] = ftp.station.receive(ftp.station.vehicle.apply_settings("vehicle", changed))
     assert (value.param_id, value.param_value) == ("VEH_TKOFF_SPEED", 7.0)
 
 

@@ -125,7 +125,7 @@ def test_change_is_not_sent_to_a_removed_client(station: GroundStation) -> None:
     station.send(read("TUNING_ORDER"))
     station.vehicle.remove_client(station.client_id)
     changed = VehicleSettings(takeoff_speed_mps=7.0)
-    assert station.receive(station.vehicle.take_settings("vehicle", changed)) == []
+    assert station.receive(station.vehicle.apply_settings("vehicle", changed)) == []
 
 
 def test_changed_rate_takes_effect_at_once(station: GroundStation) -> None:

@@ -177,5 +177,5 @@ class ZenohClient(Client):
 
 
 def _cost_of(payload: Payload) -> float:
-    """Return the part of a turn of a message: no client is read for longer at a time."""
+    """Return the share of the time limit of a client's turn that a message uses."""
     return part_of_turn(payload[1], READ_BYTES)

@@ -224,7 +224,7 @@ def payload_of(sample: "zenoh.Sample") -> Payload:
 
 
 def part_of_turn(size: int, bytes_at_once: int) -> float:
-    """Return the part of a turn of the loop that a message of this size takes."""
+    """Return the share of a turn of the loop that a message of this size takes."""
     return max(1 / AT_ONCE, min(size, MAX_MESSAGE) / bytes_at_once)
 
 
@@ -242,7 +242,7 @@ def handle_turn(
 class LoopQueue(Generic[Item]):
     """Pass items from a thread to the loop, in order; when too many wait the oldest are dropped.
 
-    `handle` is called with each item on the loop. `cost` returns the part of a turn that an item
+    `handle` is called with each item on the loop. `cost` returns the share of a turn that an item
     takes, and `pause_s` for how many seconds nothing may be handled.
     """
 
