@@ -84,7 +84,7 @@ SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
 """A segment of a Zenoh key or of a path without special characters."""
 COMMON_OPTIONS: Final = frozenset(
     {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted", "monitor", "mavlink"}
-    | {*FILTER_OPTIONS, "as"}
+    | {*FILTER_OPTIONS, "as", "cache"}
 )
 ALIASES: Final = {
     "udpin": "udp-listen",
@@ -247,6 +247,9 @@ class Endpoint:
     """Whether its clients may change state; None: loopback and configured peers except fleets."""
     mavlink: int = 0
     """Version of all frames sent there; 0 for 2, or for 1 to a client that has only sent 1."""
+    cache: bool | None = None
+    """Whether answers of its vehicles are kept for other stations; False: its own stations are
+    answered by the vehicles alone."""
     monitor: bool = False
     """Send all traffic, addressed frames included, and ignore everything received."""
     origins: frozenset[str] = frozenset()
@@ -282,9 +285,9 @@ def parse_endpoint(url: str) -> Endpoint:
 
     Options are `name`, `allow`, `deny` (message names or numbers, separated by commas), `rate`
     (`NAME:hertz`, separated by commas), `pack` (bytes), `wait` (milliseconds), `budget` (bytes a
-    second), `trusted` and `monitor` (yes or no), `mavlink` (1 or 2), `systems`, `not-systems`,
-    `components` (ids, separated by commas), `as` (see `new_ids_from`), and of some kinds `origins`
-    (separated by commas), `path`, `site`, `keys` and `config`.
+    second), `trusted`, `monitor` and `cache` (yes or no), `mavlink` (1 or 2), `systems`,
+    `not-systems`, `components` (ids, separated by commas), `as` (see `new_ids_from`), and of some
+    kinds `origins` (separated by commas), `path`, `site`, `keys` and `config`.
 
     Raises ValueError if anything in it is not understood; the text says what is allowed.
     """
@@ -297,14 +300,13 @@ def parse_endpoint(url: str) -> Endpoint:
         added = {key: options.pop(key) for key in added_kind.options & options.keys()}
         site, keys = options.get("site", ""), options.get("keys", SITE_KEYS)
         _check_fleet(kind, site, keys)
-        parts = (f"{key}={value}" for key, value in (options | added).items() if key in PARTS)
-        location = "?".join([f"{kind}:{rest}", *parts])
+        parts = [f"{key}={value}" for key, value in (options | added).items() if key in PARTS]
         endpoint = Endpoint(
             url=url,
             kind=kind,
             host=host,
             port=port,
-            location=location,
+            location=(location := "?".join([f"{kind}:{rest}", *parts])),
             name=name_from(options.get("name", location)),
             allow=messages_from(options.get("allow", "")),
             deny=messages_from(options.get("deny", "")),
@@ -315,6 +317,7 @@ def parse_endpoint(url: str) -> Endpoint:
             pack_wait_s=number_from(options.get("wait", "0"), "wait", 0, MAX_WAIT_MS) / MS_PER_S,
             budget=_budget(kind, port, options.get("budget")),
             trusted=yes_or_no("trusted", options.get("trusted")),
+            cache=yes_or_no("cache", options.get("cache")),
             monitor=yes_or_no("monitor", options.get("monitor")) or False,
             mavlink=number_from(options.get("mavlink", "0"), "mavlink", 0, 2),
             origins=_origins(options.get("origins", "")),

@@ -319,7 +319,9 @@ class Hub:
         self._fanout.settle()
         notes = self._router.clash_notes(self.now_us())
         return tuple(
-            self._clients[key].stats(self._router.origins(key), notes.get(key, ""))
+            self._clients[key].stats(
+                self._router.origins(key), notes.get(key, ""), self._router.cached(key)
+            )
             for key in sorted(self._clients)
         )
 

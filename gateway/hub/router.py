@@ -28,7 +28,8 @@ from gateway.hub.routing_table import (
 from gateway.hub.stats import HubCounters
 from gateway.hub.systems import commands
 from gateway.hub.transports.base import Client, HubContext, OnForeign
-from gateway.records import Incoming
+from gateway.recordings.answer_cache import AnswerCache
+from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
@@ -72,6 +73,8 @@ class Router:
         self._untrusted = RoutingTable(max_origins=MAX_UNTRUSTED_SYSTEMS)
         self._duplicates = DuplicateFilter()
         self._requests = RequestQueue()
+        self._cache = AnswerCache(context.signer)
+        self._cache_timer: asyncio.TimerHandle | None = None
         self._serving: int | None = None
         self._turn: asyncio.Handle | None = None
         self._pause: asyncio.TimerHandle | None = None
@@ -79,6 +82,12 @@ class Router:
     def origins(self, client_id: int) -> tuple[Origin, ...]:
         """Return the systems and components received from a client."""
         return self._table.origins(client_id) or self._untrusted.origins(client_id)
+
+    def cached(self, client_id: int) -> tuple[str, ...]:
+        """List the kept answers of the systems of a client."""
+        systems = sorted({system for system, _ in self.origins(client_id)})
+        now_us = self._context.now_us()
+        return tuple(text for each in systems if (text := self._cache.describe(each, now_us)))
 
     def routed_vehicles(self) -> set[int]:
         """Return the systems of trusted clients that are no ground stations."""
@@ -98,6 +107,8 @@ class Router:
 
     def reconfigure(self, client: Client) -> None:
         """Apply a client's changed options; one no longer trusted leaves the routing table."""
+        for system, _ in self.origins(client.client_id):
+            self._cache.remove(system)
         if client.trusted:
             self._untrusted.remove(client.client_id)
         else:
@@ -106,12 +117,13 @@ class Router:
 
     def remove(self, client_id: int) -> None:
         """Remove all state of a client that has gone."""
+        self._cache.remove_client(client_id)
         for part in (self._table, self._untrusted, self.links, self._requests):
             part.remove(client_id)
 
     def close(self) -> None:
         """Stop answering."""
-        for handle in (self._turn, self._pause):
+        for handle in (self._turn, self._pause, self._cache_timer):
             if handle is not None:
                 handle.cancel()
 
@@ -222,7 +234,44 @@ class Router:
                 # The first request has been answered on one link only.
                 self._ask(client, frame, forwarded=False)
 
+    def _keep(self, client: Client, frame: MavFrame, now_us: int) -> None:
+        """Keep the answers of a client's vehicles, if its endpoint says so."""
+        if client.endpoint.cache and client.trusted:
+            request = self._cache.add(frame, now_us)
+            if request is not None:
+                self._fanout.deliver(request, (client.client_id,), NOBODY)
+
+    def _ask_cache(
+        self, client: Client, frame: MavFrame, clients: list[int], now_us: int
+    ) -> MavFrame | None:
+        """Answer a request by kept answers; return what the vehicle must get."""
+        kept = all(self._clients[key].endpoint.cache for key in clients)
+        answers, passed = self._cache.handle(
+            client.client_id,
+            frame,
+            now_us,
+            may_answer=kept and client.endpoint.cache is not False,
+        )
+        self._send_cached(answers)
+        return passed
+
+    def _send_cached(self, answers: list[Outgoing]) -> None:
+        for each in answers:
+            if each.client_id is not None:
+                links = self.links.group(each.client_id)
+                self._fanout.deliver(each.header or frame_of(each.frame), links, NOBODY)
+        due_us = self._cache.next_due_us()
+        if due_us is not None and self._cache_timer is None:
+            wait_s = max(due_us - self._context.now_us(), 0) / US_PER_S
+            loop = asyncio.get_running_loop()
+            self._cache_timer = loop.call_later(wait_s, self._poll_cache)
+
+    def _poll_cache(self) -> None:
+        self._cache_timer = None
+        self._send_cached(self._cache.poll(self._context.now_us()))
+
     def _route_addressed(self, client: Client, frame: MavFrame, now_us: int) -> None:
+        self._keep(client, frame, now_us)
         ours = frame.target[0] in self._vehicles.systems(now_us)
         clients = (
             self._table.clients_to(frame.target, client.client_id, now_us) if client.trusted else []
@@ -232,6 +281,10 @@ class Router:
         if ours:
             self._ask(client, frame, forwarded=bool(clients))
         if clients:
+            passed = self._ask_cache(client, frame, clients, now_us)
+            if passed is None:
+                return
+            frame = passed
             self._count(frame)
         elif not ours:
             self.counters.unroutable += 1
@@ -247,6 +300,7 @@ class Router:
         now_us: int,
     ) -> None:
         message_id = frame.message_id
+        self._keep(client, frame, now_us)
         telemetry = message_id not in TARGET_OFFSETS and message_id not in UNADDRESSED_REQUESTS
         own = self._vehicles.systems(now_us)
         allowed = client.endpoint.systems
@@ -273,7 +327,9 @@ class Router:
             rejects = partial(self._is_rejected, client, path) if is_shared else None
             reaches = partial(self._reaches, client, frame)
             route = self._fanout.make_route(frame, client, path, rejects, reaches)
-            if telemetry and (self._rejects is None or not client.may_return):
+            is_kept = client.endpoint.cache and self._cache.reads(message_id)
+            is_plain = self._rejects is None or not client.may_return
+            if telemetry and is_plain and not is_kept:
                 self._fanout.keep_route(route, client, key)
             else:
                 self._fanout.others[source_id, key] = route

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, NO_TARGET, offset_of
+from gateway.wire.mavlink_messages import MESSAGE_IDS, boot_time_us
 from gateway.wire.mavlink_splitter import MavFrame
 
 Origin = tuple[int, int]
@@ -46,14 +46,6 @@ NEW: Final = -1
 LATE: Final = 0
 """Results of `DuplicateFilter.check`; client ids are positive."""
 
-US_PER_MS: Final = 1000
-BOOT_TIME_BYTES: Final = 4
-BOOT_TIME_OFFSETS: Final = {
-    message_id: offset
-    for message_id in MESSAGE_NAMES
-    if (offset := offset_of(message_id, "time_boot_ms")) != NO_TARGET
-}
-"""Where messages contain the time since the start of their sender, in ms."""
 REPORTED_US: Final = 3 * US_PER_S
 """Most vehicles send such messages several times a second."""
 SAME_START_US: Final = 5 * US_PER_S
@@ -136,10 +128,9 @@ class SystemPath:
 
     def note_boot(self, frame: MavFrame, now_us: int) -> None:
         """Compute when the system started, if a frame contains its time since then."""
-        offset = BOOT_TIME_OFFSETS.get(frame.message_id)
-        if offset is not None:
-            time_ms = int.from_bytes(frame.payload[offset : offset + BOOT_TIME_BYTES], "little")
-            self.booted_us, self.booted_heard_us = now_us - time_ms * US_PER_MS, now_us
+        booted_us = boot_time_us(frame, now_us)
+        if booted_us is not None:
+            self.booted_us, self.booted_heard_us = booted_us, now_us
 
     def is_another_vehicle(self, other: "SystemPath", now_us: int) -> bool:
         """Return whether another path of the same id leads to another vehicle.

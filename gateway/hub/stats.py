@@ -76,6 +76,8 @@ class ClientStats:
     """Frames sent to a port on which nobody listened; they do not count as loss."""
     refused: int = 0
     """Frames that could not be renumbered."""
+    cached: tuple[str, ...] = ()
+    """The kept answers of the systems behind it, with their ages; see `AnswerCache.describe`."""
     note: str = ""
     """A problem of the systems behind it that the settings solve, such as two with one id."""
 

@@ -102,12 +102,14 @@ class _Missions(MissionService):
     def __init__(self, answers: Answers) -> None:
         super().__init__(lambda *_: [], lambda *_: [])
         self._answers = answers
+        self._read: dict[int, Sequence[bytes]] = {}
         self._mavlink: Any = mavlink.MAVLink(None)
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         kind = int(getattr(request.message, "mission_type", MISSION))
-        if kind in KINDS:
-            recorded = self._answers.mission(kind) or ()
+        recorded = self._answers.mission(kind) or ()
+        if kind in KINDS and self._read.get(kind) is not recorded:
+            self._read[kind] = recorded
             items = (read_item(self._mavlink.decode(bytearray(frame))) for frame in recorded)
             self.items[kind] = tuple(items)
         return super().handle(request, now_us)
@@ -164,7 +166,13 @@ class RecordedVehicle:
     Metadata of the parameters is used where the recorded ones are those that it describes.
     """
 
-    def __init__(self, system_id: int, answers: Answers, metadata: Metadata | None = None) -> None:
+    def __init__(
+        self,
+        system_id: int,
+        answers: Answers,
+        metadata: Metadata | None = None,
+        files: FtpService | None = None,
+    ) -> None:
         self.system_id = system_id
         self.metadata = metadata
         """Of the recorded parameters; None if they are of another version."""
@@ -176,7 +184,7 @@ class RecordedVehicle:
             _Commands(system_id, answers, self.metadata),
             _Parameters(answers),
             _Missions(answers),
-            FtpService({} if self.metadata is None else self.metadata.files),
+            files or FtpService({} if self.metadata is None else self.metadata.files),
         )
         self._answers = answers
         self._texts = Announcer(TEXTS_AT_ONCE, TEXT_INTERVAL_US)

@@ -12,6 +12,8 @@ import numpy as np
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
+from gateway.records import MavFrame
+
 _TYPES: Final = {"uint8_t": "B", "uint16_t": "H", "uint32_t": "I", "char": "c"}
 NO_TARGET: Final = -1
 MAX_ID_V1: Final = 255
@@ -105,6 +107,26 @@ MESSAGE_IDS: Final[dict[str, int]] = {name: number for number, name in MESSAGE_N
 def ids_of(*names: str) -> frozenset[int]:
     """Return the ids of messages by their names."""
     return frozenset(MESSAGE_IDS[name] for name in names)
+
+
+US_PER_MS: Final = 1000
+BOOT_TIME_BYTES: Final = 4
+BOOT_TIME_OFFSETS: Final = {
+    message_id: offset
+    for message_id in MESSAGE_NAMES
+    if (offset := offset_of(message_id, "time_boot_ms")) != NO_TARGET
+}
+"""Where messages contain the time since the start of their sender, in ms."""
+
+
+def boot_time_us(frame: MavFrame, now_us: int) -> int | None:
+    """Compute when the sender of a frame started; None if the frame does not contain it."""
+    offset = BOOT_TIME_OFFSETS.get(frame.message_id)
+    if offset is None:
+        return None
+    time_ms = int.from_bytes(frame.payload[offset : offset + BOOT_TIME_BYTES], "little")
+    # 0 is sent by those that do not know the time.
+    return now_us - time_ms * US_PER_MS if time_ms else None
 
 
 @cache

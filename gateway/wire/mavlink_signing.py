@@ -44,6 +44,8 @@ from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, MavFrame
 KEY_BYTES: Final = 32
 HASH_BYTES: Final = 6
 OWN_LINK: Final = 0
+KEPT_LINK: Final = 255
+"""Of kept answers: a stream of its own, since the vehicle's clock may differ from ours."""
 EPOCH_2015_US: Final = 1_420_070_400_000_000
 TICK_US: Final = 10
 TICKS_PER_S: Final = 100_000
@@ -139,10 +141,22 @@ class FrameSigner:
 
     def renewal(self, frame: MavFrame) -> Sign | None:
         """Return the signer of a changed frame, by the key of its signature; None without it."""
-        for key in {self.shared_key, *self.keys.values()} - {b""}:
-            if is_genuine(key, frame.data):
-                return renewed(key, frame.data)
-        return None
+        key = self.key_of(frame)
+        return None if key is None else renewed(key, frame.data)
+
+    def key_of(self, frame: MavFrame) -> bytes | None:
+        """Return the key by which a signed frame is genuine; None if it is not known."""
+        keys = {self.shared_key, *self.keys.values()} - {b""}
+        return next((key for key in keys if is_genuine(key, frame.data)), None)
+
+    def signed(self, frame: MavFrame, key: bytes, now_us: int) -> MavFrame:
+        """Return an answer in the name of another system, signed by its key."""
+        return edit_frame(frame, sign=self._sign(key, KEPT_LINK, now_us)) or frame
+
+    def _sign(self, key: bytes, link: int, now_us: int) -> Sign:
+        timestamp = self._clock.timestamp(now_us) if self._clock else 0
+        self._newest = max(self._newest + 1, timestamp)
+        return partial(signature, key, link, self._newest)
 
     def sequence_and_sign(
         self, frame: MavFrame, sequence: int, now_us: int, system: int | None = None
@@ -158,8 +172,7 @@ class FrameSigner:
             if frame.sequence == sequence:
                 return frame
             return edit_frame(frame, sequence=sequence) or frame
-        self._newest = max(self._newest + 1, self._clock.timestamp(now_us))
-        sign = partial(signature, key, OWN_LINK, self._newest)
+        sign = self._sign(key, OWN_LINK, now_us)
         return edit_frame(frame, sequence=sequence, sign=sign) or frame
 
 

@@ -272,6 +272,8 @@ def _print_clients(console: Console, snapshot: Record) -> None:
     for client in snapshot["clients"]:
         for text in filter(None, (client["reason"], client["note"])):
             console.print(f"{client['name']}: {text}", style="yellow", soft_wrap=True)
+        for text in client["cached"]:
+            console.print(f"{client['name']}: kept of {text}", soft_wrap=True)
 
 
 def _listeners(listeners: Sequence[Record]) -> Table:

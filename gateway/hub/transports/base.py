@@ -511,8 +511,10 @@ class Client:
         bucket.refill(self.context.now_us())
         return 0 if self.trusted else bucket.wait_us()
 
-    def stats(self, systems: tuple[Origin, ...], note: str = "") -> ClientStats:
-        """Return the client's present figures; the hub passes the systems behind it and a note."""
+    def stats(
+        self, systems: tuple[Origin, ...], note: str = "", cached: tuple[str, ...] = ()
+    ) -> ClientStats:
+        """Return the client's present figures; the hub passes what it has of the systems."""
         renumbering = self.renumbering
         counters = {name: getattr(self.counters, name) for name in ClientCounters.__slots__}
         return ClientStats(
@@ -529,6 +531,7 @@ class Client:
             heard_us=self.heard_us,
             round_trip_us=self.round_trip_us,
             refused=renumbering.refused if renumbering else 0,
+            cached=cached,
             note=note or (renumbering.reason if renumbering else ""),
             **counters,
         )

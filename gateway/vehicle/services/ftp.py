@@ -152,6 +152,11 @@ class FtpService(TransferService):
         for number in [n for n, s in self._sessions.items() if s.client_id == client_id]:
             self._drop(number)
 
+    def has_session(self, request: Request, packet: Packet) -> bool:
+        """Return whether the session of a request is one of this client's here."""
+        session = self._sessions.get(packet.session)
+        return session is not None and session.client_id == request.client_id
+
     def _drop(self, number: int) -> None:
         self._sessions.pop(number)
         self._transfers.pop(number, None)
@@ -227,10 +232,9 @@ class FtpService(TransferService):
 
     def _content(self, request: Request, packet: Packet) -> bytes:
         """Return the file of the client's session."""
-        session = self._sessions.get(packet.session)
-        if session is None or session.client_id != request.client_id:
+        if not self.has_session(request, packet):
             raise _RefusedError(FtpError.INVALID_SESSION)
-        return session.content
+        return self._sessions[packet.session].content
 
     def _content_from(self, request: Request, packet: Packet) -> bytes:
         """Return the rest of the file from the requested offset."""
@@ -274,6 +278,11 @@ def _path(packet: Packet) -> tuple[str, str]:
     text = packet.data.split(b"\0", 1)[0].decode("utf-8", "replace")
     path, _, query = _SCHEME.sub("", text.strip()).partition("?")
     return "/" + "/".join(part for part in path.split("/") if part not in ("", ".")), query
+
+
+def full_path(packet: Packet) -> str:
+    """Return the path of a request, with the query behind it."""
+    return "?".join(filter(None, _path(packet)))
 
 
 def _reply(request: Request, packet: Packet) -> Reply:

@@ -1,0 +1,174 @@
+"""Answers of foreign vehicles on slow links, kept for further ground stations.
+
+The first station loads parameters, missions and metadata over the link; what passes is kept, and
+others are answered from it. A vehicle that signs is answered for only if the gateway has its key:
+requests must be signed by it too, and the answers are.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.live_answers import HASH_NAME, NOTED_IDS, PARAMETERS, LiveAnswers
+from gateway.recordings.senders import AUTOPILOT
+from gateway.records import Incoming, Outgoing
+from gateway.units import US_PER_S
+from gateway.vehicle.cached_vehicle import CachedVehicle
+from gateway.vehicle.plan import KINDS
+from gateway.vehicle.service import Request
+from gateway.wire.frame_editing import edit_frame
+from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
+
+MAX_VEHICLES: Final = 16
+"""Of `MAX_BYTES` each; the one that was heard longest ago gives way."""
+CHECK_US: Final = 10 * US_PER_S
+"""Time limit of the answer that checks a list; a link delays it by some seconds."""
+
+
+@dataclass(slots=True)
+class _Entry:
+    """One vehicle."""
+
+    live: LiveAnswers
+    vehicle: CachedVehicle
+    heard_us: int = 0
+    sequence: int = 0
+    """Of the next answer."""
+    key: bytes | None = b""
+    """With which it signs: empty if it does not, None if the gateway does not have it."""
+    checked: tuple[int, MavFrame] | None = None
+    """When a list was answered while its checksum was requested, and the request."""
+
+
+class AnswerCache:
+    """The kept answers of all vehicles by system id."""
+
+    def __init__(self, signer: FrameSigner) -> None:
+        self._signer = signer
+        self._entries: dict[int, _Entry] = {}
+
+    @staticmethod
+    def reads(message_id: int) -> bool:
+        """Return whether a message without a target is read here."""
+        return message_id in NOTED_IDS
+
+    def add(self, frame: MavFrame, now_us: int) -> MavFrame | None:
+        """Take in a frame of a vehicle; return a request that must be sent to it after all."""
+        system, component = frame.origin
+        if component != AUTOPILOT:
+            entry = self._entries.get(system)
+            if entry is not None and frame.message_id == mavlink.MAVLINK_MSG_ID_PARAM_VALUE:
+                entry.vehicle.other_lists = True
+            return None
+        entry = self._entry(system)
+        key = self._signer.key_of(frame) if frame.signed else b""
+        if key != entry.key:
+            # Without signatures anybody could have sent it before.
+            entry.live.clear()
+            entry.key = key
+        entry.heard_us = now_us
+        had = entry.live.missing
+        entry.live.add(frame, now_us)
+        if entry.checked is not None and had is not None and entry.live.missing is None:
+            (since_us, request), entry.checked = entry.checked, None
+            return request if now_us - since_us <= CHECK_US else None
+        return None
+
+    def handle(
+        self, client_id: int, frame: MavFrame, now_us: int, *, may_answer: bool
+    ) -> tuple[list[Outgoing], MavFrame | None]:
+        """Answer a station's request, or take in what it writes.
+
+        Returns the answers, and what must be sent to the vehicle.
+        """
+        entry = self._entries.get(frame.target[0])
+        if entry is None:
+            return [], frame
+        request = entry.vehicle.read(Incoming(client_id, frame.data, trusted=True), now_us)
+        if request is None:
+            return [], frame
+        if may_answer and self._fits(entry, frame) and entry.live.is_fresh(now_us):
+            answers = entry.vehicle.answer(request, now_us)
+            if answers is not None:
+                passed = self._check(entry, request, frame, now_us)
+                return [self._numbered(entry, each, now_us) for each in answers], passed
+        entry.live.add_request(request.message, frame, now_us)
+        return [], frame
+
+    def poll(self, now_us: int) -> list[Outgoing]:
+        """Return the next of every list and file that is under way."""
+        return [
+            self._numbered(entry, each, now_us)
+            for entry in self._entries.values()
+            for each in entry.vehicle.poll(now_us)
+            if isinstance(each, Outgoing)
+        ]
+
+    def next_due_us(self) -> int | None:
+        """Return when `poll` has something to send."""
+        due = (entry.vehicle.next_due_us() for entry in self._entries.values())
+        return min((time_us for time_us in due if time_us is not None), default=None)
+
+    def remove(self, system: int) -> None:
+        """Drop what is held of a vehicle, as when its link gets other options."""
+        self._entries.pop(system, None)
+
+    def remove_client(self, client_id: int) -> None:
+        """Drop what was kept for a station that has gone."""
+        for entry in self._entries.values():
+            entry.vehicle.remove_client(client_id)
+
+    def describe(self, system: int, now_us: int) -> str:
+        """List what is held of a vehicle, with the age of each part; empty if nothing is."""
+        entry = self._entries.get(system)
+        if entry is None or not entry.live.since_us:
+            return ""
+        live = entry.live
+        counts = {PARAMETERS: len(live.parameters()), "files": len(live.files)}
+        counts |= {name: len(live.mission(kind) or ()) for kind, name in KINDS.items()}
+        parts = (
+            f"{name}{f' ({counts[name]})' if name in counts else ''} "
+            f"{(now_us - since_us) // US_PER_S} s"
+            for name, since_us in live.since_us.items()
+        )
+        return f"system {system}: {', '.join(parts)}"
+
+    def _entry(self, system: int) -> _Entry:
+        entry = self._entries.get(system)
+        if entry is None:
+            if len(self._entries) >= MAX_VEHICLES:
+                del self._entries[min(self._entries, key=lambda each: self._entries[each].heard_us)]
+            live = LiveAnswers(system)
+            entry = self._entries[system] = _Entry(live, CachedVehicle(system, live))
+        return entry
+
+    def _fits(self, entry: _Entry, request: MavFrame) -> bool:
+        """Return whether a request is signed as the vehicle is."""
+        return entry.key is not None and entry.key == (
+            self._signer.key_of(request) if request.signed else b""
+        )
+
+    def _check(
+        self, entry: _Entry, request: Request, frame: MavFrame, now_us: int
+    ) -> MavFrame | None:
+        """Return the request of the checksum in the place of that of a list that has one."""
+        is_list = request.message.get_type() == "PARAM_REQUEST_LIST"
+        if not is_list or entry.live.hash_frame is None or frame.signed:
+            return None
+        entry.checked = now_us, frame
+        message = mavlink.MAVLink_param_request_read_message(
+            frame.target[0], AUTOPILOT, HASH_NAME.encode(), -1
+        )
+        sender = mavlink.MAVLink(None, *frame.origin)
+        sender.seq = frame.sequence
+        return frame_of(bytes(message.pack(sender)))
+
+    def _numbered(self, entry: _Entry, answer: Outgoing, now_us: int) -> Outgoing:
+        frame = edit_frame(frame_of(answer.frame), sequence=entry.sequence, drop_signature=True)
+        entry.sequence = (entry.sequence + 1) & 0xFF
+        assert frame is not None
+        if entry.key:
+            frame = self._signer.signed(frame, entry.key, now_us)
+        return Outgoing(frame.data, answer.message_id, answer.client_id, frame)

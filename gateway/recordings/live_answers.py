@@ -1,0 +1,311 @@
+"""The answers of a live vehicle, as they pass between it and ground stations.
+
+| what                       | where from                       | dropped by                     |
+| -------------------------- | -------------------------------- | ------------------------------ |
+| parameters                 | PARAM_VALUE, the newest of each  | PARAM_SET: this one; another   |
+|                            | name                             | checksum, some commands: all   |
+| mission, fence, rally      | a whole download, or an upload   | the begin of an upload;        |
+| points                     | that the vehicle has accepted    | another id or another home     |
+| version, metadata          | AUTOPILOT_VERSION,               | another version                |
+|                            | COMPONENT_METADATA               |                                |
+| files of metadata          | a file that was read whole       | a write by MAVLink FTP         |
+
+All of it is dropped when the vehicle restarts or reports another version. What a station writes is
+dropped when it is sent, and kept again when the vehicle confirms it: a lost confirmation does no
+harm.
+"""
+
+import struct
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.answers import ALL_KINDS, Items, LogAnswers
+from gateway.recordings.status_texts import text_of
+from gateway.recordings.tlog import payload_of
+from gateway.units import US_PER_S
+from gateway.vehicle.plan import KINDS
+from gateway.vehicle.services.ftp import ACK, WRITING, FtpError, Opcode, decode_packet, full_path
+from gateway.wire.frame_editing import edit_frame
+from gateway.wire.mavlink_messages import BOOT_TIME_OFFSETS, boot_time_us, ids_of
+from gateway.wire.mavlink_splitter import MavFrame
+
+HASH_NAME: Final = "_HASH_CHECK"
+"""PX4's checksum of all parameters."""
+SHOWN_IDS: Final = ids_of("AUTOPILOT_VERSION", "PROTOCOL_VERSION", "COMPONENT_METADATA")
+"""Messages that stay the same until a restart."""
+NOTED_IDS: Final = (
+    SHOWN_IDS | BOOT_TIME_OFFSETS.keys() | ids_of("PARAM_VALUE", "MISSION_CURRENT", "HOME_POSITION")
+)
+"""Messages to all that are read here."""
+CHANGING: Final = frozenset(
+    (
+        mavlink.MAV_CMD_PREFLIGHT_STORAGE, mavlink.MAV_CMD_PREFLIGHT_CALIBRATION,
+        mavlink.MAV_CMD_PREFLIGHT_SET_SENSOR_OFFSETS, mavlink.MAV_CMD_DO_START_MAG_CAL,
+        mavlink.MAV_CMD_DO_ACCEPT_MAG_CAL,
+    )
+)  # fmt: skip
+"""Commands after which any parameter or mission may be another."""
+NO_INDEX: Final = 0xFFFF
+"""In the PARAM_VALUE that confirms a setting, of ArduPilot and of the checksum."""
+RESTART_US: Final = 5 * US_PER_S
+"""A start that is later by this is another one; a congested link delays frames by less."""
+FRESH_US: Final = 10 * US_PER_S
+"""A vehicle whose time since its start is not received for so long may have restarted."""
+PACKED: Final = "/param.pck"
+"""ArduPilot's file of all parameters."""
+METADATA_FILES: Final = (".json", ".json.xz", ".json.gz", PACKED)
+MAX_BYTES: Final = 1_000_000
+"""Of one vehicle: a thousand parameters are 40 kB, the metadata of PX4 some 300 kB."""
+MAX_READS: Final = 8
+"""Files that are being read."""
+READING: Final = (Opcode.READ_FILE, Opcode.BURST_READ_FILE)
+PARAMETERS: Final = "parameters"
+
+_VALUE: Final = struct.Struct("<4sHH16sB")
+_PLAN_IDS: Final = struct.Struct("<2xH2xIII")
+"""MISSION_CURRENT: number of items, then the ids of mission, fence and rally points."""
+_HOME_BYTES: Final = 12
+
+
+@dataclass(slots=True)
+class _Reading:
+    """A file that a station reads."""
+
+    path: str
+    session: int = -1
+    size: int = MAX_BYTES
+    chunks: dict[int, bytes] = field(default_factory=dict)
+
+    def content(self) -> bytes | None:
+        """Return the whole file; None if some of it is missing."""
+        if sum(map(len, self.chunks.values())) < self.size:
+            return None
+        found = bytearray()
+        for begin in sorted(self.chunks):
+            if begin > len(found):
+                return None
+            found[begin:] = self.chunks[begin]
+        return bytes(found) if len(found) == self.size else None
+
+
+class LiveAnswers:
+    """What one vehicle has answered since its start; see `recorded_vehicle.Answers`."""
+
+    def __init__(self, system_id: int) -> None:
+        self.system_id = system_id
+        self._ordered: dict[str, bytes] | None = None
+        """The parameters in their order, while they stay the same."""
+        self._booted_us: int | None = None
+        self._timed_us = 0
+        """When its time since the start was received last."""
+        self.clear()
+
+    def clear(self) -> None:
+        """Drop everything."""
+        self.files: dict[str, bytes] = {}
+        """By path and query."""
+        self.since_us: dict[str, int] = {}
+        """When each part became complete, by its name."""
+        self._log = LogAnswers()
+        self._shown: dict[int, bytes] = {}
+        self._home = b""
+        self._plan_ids: dict[int, int] = {}
+        self._readings: dict[tuple[int, int], _Reading] = {}
+        self._drop_parameters()
+
+    def is_fresh(self, now_us: int) -> bool:
+        """Return whether the vehicle certainly has not restarted."""
+        return self._booted_us is not None and now_us - self._timed_us <= FRESH_US
+
+    @property
+    def size(self) -> int:
+        """The bytes that are held."""
+        items = [each for kind in KINDS for each in self.mission(kind) or ()]
+        reads = [each for one in self._readings.values() for each in one.chunks.values()]
+        parts = (self._values.values(), self.files.values(), items, reads)
+        return sum(len(each) for part in parts for each in part)
+
+    def has_message(self, message_id: int) -> bool:
+        """Return whether a message is held."""
+        return message_id in self._shown
+
+    def frames(self, message_id: int) -> list[bytes]:
+        """Return the frames that answer a request for a message."""
+        return [self._shown[message_id]] if message_id in self._shown else []
+
+    def mission(self, kind: int) -> Items | None:
+        """Return the frames of the items; None if they are not known."""
+        course = self._log.missions.get((self.system_id, kind))
+        return None if course is None else course.values[-1]
+
+    def parameters(self) -> dict[str, bytes]:
+        """Return the PARAM_VALUE frames by name, in the order of their indices."""
+        if self._ordered is None:
+            order = sorted(self._values, key=self._indices.__getitem__)
+            self._ordered = {name: self._values[name] for name in order}
+        return self._ordered
+
+    @property
+    def missing(self) -> int | None:
+        """The number of parameters that are not known; None if none is known."""
+        return self._count - len(self._values) if self._values else None
+
+    def add(self, frame: MavFrame, now_us: int) -> None:
+        """Take in a frame of the vehicle."""
+        booted_us = boot_time_us(frame, now_us)
+        if booted_us is not None:
+            if self._booted_us is not None and booted_us - self._booted_us > RESTART_US:
+                self.clear()
+            self._booted_us, self._timed_us = booted_us, now_us
+        match frame.message_id:
+            case mavlink.MAVLINK_MSG_ID_PARAM_VALUE:
+                self._add_parameter(frame, now_us)
+            case mavlink.MAVLINK_MSG_ID_MISSION_CURRENT:
+                self._add_plan_ids(frame)
+            case mavlink.MAVLINK_MSG_ID_HOME_POSITION:
+                self._add_home(frame)
+            case mavlink.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL:
+                self._add_file(frame, now_us)
+            case shown if shown in SHOWN_IDS:
+                self._add_shown(frame, now_us)
+            case _:
+                self._add_mission(frame, now_us, is_upload=False)
+
+    def add_request(self, message: Any, frame: MavFrame, now_us: int) -> None:
+        """Take in a request that a station sends to the vehicle."""
+        match message.get_type():
+            case "PARAM_SET" if message.param_id != HASH_NAME:
+                self._values.pop(message.param_id, None)
+                self._drop_dependent()
+            case "COMMAND_LONG" | "COMMAND_INT" if message.command in CHANGING:
+                self._drop_parameters()
+                self._drop_missions(ALL_KINDS)
+            case "FILE_TRANSFER_PROTOCOL":
+                self._add_file_request(bytes(message.payload), frame.origin)
+            case "MISSION_COUNT" | "MISSION_CLEAR_ALL" | "MISSION_WRITE_PARTIAL_LIST":
+                self._drop_missions(message.mission_type)
+                self._add_mission(frame, now_us, is_upload=True)
+            case "MISSION_ITEM" | "MISSION_ITEM_INT":
+                self._add_mission(frame, now_us, is_upload=True)
+
+    def _drop_missions(self, kind: int) -> None:
+        for each in KINDS if kind == ALL_KINDS else (kind,):
+            self._log.missions.pop((self.system_id, each), None)
+            self._plan_ids.pop(each, None)
+            self.since_us.pop(KINDS.get(each, ""), None)
+
+    def _drop_parameters(self) -> None:
+        self._values: dict[str, bytes] = {}
+        self._indices: dict[str, int] = {}
+        self._count = 0
+        self._drop_dependent()
+        self.since_us.pop(PARAMETERS, None)
+
+    def _drop_dependent(self) -> None:
+        """Drop all that another value of a parameter makes wrong."""
+        self._ordered = None
+        self.hash_frame: bytes | None = None
+        """PARAM_VALUE of the checksum that fits the parameters."""
+        kept = self.files.items()
+        self.files = {path: content for path, content in kept if PACKED not in path}
+        readings = self._readings.items()
+        self._readings = {key: one for key, one in readings if PACKED not in one.path}
+
+    def _add_parameter(self, frame: MavFrame, now_us: int) -> None:
+        value, count, index, raw_name, kind = _VALUE.unpack(payload_of(frame.data, _VALUE.size))
+        name = text_of(raw_name)
+        if name == HASH_NAME:
+            if self.hash_frame is not None and payload_of(self.hash_frame, 4) != value:
+                self._drop_parameters()
+            self.hash_frame = frame.data
+            return
+        if index == NO_INDEX:
+            index = self._indices.get(name, NO_INDEX)
+        if self._indices.get(name, index) != index or self._count not in (0, count):
+            # Others are switched on or off: all have other indices.
+            self._drop_parameters()
+        self._count = count
+        known = self._values.get(name)
+        if known is not None and _value_of(known) != (value, kind):
+            self._drop_dependent()
+        if index < count and self.size < MAX_BYTES:
+            fields = {"param_index": index, "param_count": count}
+            kept = edit_frame(frame, fields=fields, drop_signature=True)
+            self._values[name], self._indices[name] = (kept or frame).data, index
+            self._ordered = None
+        if len(self._values) == count:
+            self.since_us.setdefault(PARAMETERS, now_us)
+
+    def _add_plan_ids(self, frame: MavFrame) -> None:
+        # The dialect lacks the ids; the number of items serves a vehicle without ids.
+        count, *ids = _PLAN_IDS.unpack(payload_of(frame.data, _PLAN_IDS.size))
+        for kind, number in zip(KINDS, (ids[0] or count, *ids[1:]), strict=True):
+            if self._plan_ids.setdefault(kind, number) != number:
+                self._drop_missions(kind)
+
+    def _add_home(self, frame: MavFrame) -> None:
+        # Item 0 of ArduPilot's missions is home.
+        home = payload_of(frame.data, _HOME_BYTES)
+        if self._home not in (b"", home):
+            self._drop_missions(mavlink.MAV_MISSION_TYPE_MISSION)
+        self._home = home
+
+    def _add_shown(self, frame: MavFrame, now_us: int) -> None:
+        version = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
+        known = self._shown.get(version)
+        is_other = known is not None and payload_of(known, 255) != payload_of(frame.data, 255)
+        if frame.message_id == version and is_other:
+            self.clear()
+        self._shown[frame.message_id] = frame.data
+        self.since_us["version"] = now_us
+
+    def _add_mission(self, frame: MavFrame, now_us: int, *, is_upload: bool) -> None:
+        before = {kind: self.mission(kind) for kind in KINDS}
+        if self.size < MAX_BYTES:
+            system, component = frame.origin
+            stations = {system << 8 | component} if is_upload else set()
+            self._log.add_frame(frame.data, now_us, stations)
+        for kind, name in KINDS.items():
+            if self.mission(kind) is not before[kind]:
+                course = self._log.missions[self.system_id, kind]
+                del course.values[:-1], course.times[:-1]
+                self._plan_ids.pop(kind, None)
+                self.since_us[name] = now_us
+
+    def _add_file_request(self, payload: bytes, station: tuple[int, int]) -> None:
+        packet = decode_packet(payload)
+        if packet.opcode in WRITING:
+            self.clear()
+        elif packet.opcode == Opcode.OPEN_FILE_RO:
+            path = full_path(packet)
+            self._readings.pop(station, None)
+            if path.partition("?")[0].endswith(METADATA_FILES) and len(self._readings) < MAX_READS:
+                self._readings[station] = _Reading(path)
+
+    def _add_file(self, frame: MavFrame, now_us: int) -> None:
+        reading = self._readings.get(frame.target)
+        packet = decode_packet(payload_of(frame.data, 254)[3:])
+        if reading is None:
+            return
+        if packet.request_opcode == Opcode.OPEN_FILE_RO and packet.opcode == ACK:
+            reading.session = packet.session
+            reading.size = int.from_bytes(packet.data[:4], "little")
+        elif packet.session != reading.session or packet.request_opcode not in READING:
+            return
+        elif packet.opcode == ACK and self.size < MAX_BYTES:
+            reading.chunks[packet.offset] = packet.data
+        elif packet.data[:1] == bytes((FtpError.EOF,)):
+            # ArduPilot does not know the size of a file that it makes while it is read.
+            reading.size = sum(map(len, reading.chunks.values()))
+        content = reading.content()
+        if content:
+            self.files[reading.path] = content
+            self.since_us["files"] = now_us
+            del self._readings[frame.target]
+
+
+def _value_of(frame: bytes) -> tuple[bytes, int]:
+    value, _, _, _, kind = _VALUE.unpack(payload_of(frame, _VALUE.size))
+    return value, kind

@@ -1,0 +1,136 @@
+"""A live vehicle of another system, as far as it has answered before.
+
+| asked                              | answered here                              | else       |
+| ---------------------------------- | ------------------------------------------ | ---------- |
+| PARAM_REQUEST_LIST                 | if all but a few parameters are known      | passed on  |
+| PARAM_REQUEST_READ                 | if it is known; the checksum never         | passed on  |
+| MISSION_REQUEST_LIST and its items | if the whole mission is known              | passed on  |
+| REQUEST_MESSAGE                    | version and metadata                       | passed on  |
+| files                              | those that were read before                | passed on  |
+| anything that changes something    |                                            | passed on  |
+"""
+
+from collections.abc import Mapping
+from typing import Final, Protocol
+
+from gateway.records import Incoming, Outgoing
+from gateway.vehicle.plan import ACCEPTED
+from gateway.vehicle.recorded_vehicle import PARAM_VALUE, Answers, RecordedVehicle
+from gateway.vehicle.service import Request
+from gateway.vehicle.services.commands import (
+    REQUEST_MESSAGE,
+    SHORTHANDS,
+    read_command,
+    requested_message,
+)
+from gateway.vehicle.services.ftp import FtpService, Opcode, decode_packet, full_path
+from gateway.vehicle.services.parameter_service import BY_NAME
+
+MOST_MISSING: Final = 16
+"""Parameters of a list that may be missing: a station requests them one by one."""
+MAX_DOWNLOADS: Final = 64
+IN_SESSION: Final = (Opcode.TERMINATE_SESSION, Opcode.READ_FILE, Opcode.BURST_READ_FILE)
+
+
+class HeldAnswers(Answers, Protocol):
+    """What a vehicle has answered before."""
+
+    @property
+    def files(self) -> Mapping[str, bytes]:
+        """The files by path and query."""
+
+    @property
+    def missing(self) -> int | None:
+        """The number of parameters that are not known; None if none is known."""
+
+    @property
+    def hash_frame(self) -> bytes | None:
+        """PARAM_VALUE of the checksum of the parameters."""
+
+
+class _Files(FtpService):
+    """Files whose content depends on the query too."""
+
+    def __init__(self, answers: HeldAnswers) -> None:
+        super().__init__({})
+        self._answers = answers
+
+    def holds(self, request: Request) -> bool:
+        """Return whether a request is for a file that is held; else its client opens another."""
+        packet = decode_packet(bytes(request.message.payload))
+        if packet.opcode in IN_SESSION:
+            return self.has_session(request, packet)
+        if packet.opcode == Opcode.OPEN_FILE_RO and full_path(packet) in self._answers.files:
+            return True
+        self.remove_client(request.client_id)
+        return False
+
+    def _generate(self, path: str, query: str, _request: Request) -> bytes:
+        return self._answers.files["?".join(filter(None, (path, query)))]
+
+
+class CachedVehicle(RecordedVehicle):
+    """Answers what is held, for one autopilot."""
+
+    def __init__(self, system_id: int, answers: HeldAnswers) -> None:
+        self._held = answers
+        self._files = _Files(answers)
+        super().__init__(system_id, answers, files=self._files)
+        self._downloads: dict[tuple[int, int, int, int], None] = {}
+        """Missions that are being sent: client, system, component and kind."""
+        self.other_lists = False
+        """Whether other components of the system have parameters too."""
+
+    def read(self, incoming: Incoming, now_us: int) -> Request | None:
+        """Read a request; None if it is none for this vehicle."""
+        return self._reader.read(incoming, now_us)
+
+    def answer(self, request: Request, now_us: int) -> list[Outgoing] | None:
+        """Answer a request; None if only the vehicle can."""
+        kind = request.message.get_type()
+        service = self._by_message.get(kind)
+        if service is None or not self._holds(request):
+            return None
+        if kind == "MISSION_ACK":
+            return []
+        answers = service.handle(request, now_us)
+        found = [each for each in self._finish(answers) if isinstance(each, Outgoing)]
+        if kind == "PARAM_REQUEST_LIST" and self._held.hash_frame is not None:
+            found.insert(0, Outgoing(self._held.hash_frame, PARAM_VALUE, request.client_id))
+        return found
+
+    def _holds(self, request: Request) -> bool:
+        message, missing = request.message, self._held.missing
+        match message.get_type():
+            case "PARAM_REQUEST_LIST":
+                is_for_others = self.other_lists and not message.target_component
+                return missing is not None and missing <= MOST_MISSING and not is_for_others
+            case "PARAM_REQUEST_READ" if message.param_index == BY_NAME:
+                return message.param_id in self._held.parameters()
+            case "PARAM_REQUEST_READ":
+                return missing == 0 and message.param_index < len(self._held.parameters())
+            case "MISSION_REQUEST_LIST" | "MISSION_REQUEST" | "MISSION_REQUEST_INT":
+                return self._holds_mission(request)
+            case "MISSION_ACK" if message.type == ACCEPTED:
+                return self._downloads.pop(_download(request), 0) is None
+            case "COMMAND_LONG" | "COMMAND_INT":
+                command = read_command(request)
+                is_known = command.number == REQUEST_MESSAGE or command.number in SHORTHANDS
+                return is_known and self._held.has_message(requested_message(command))
+            case "FILE_TRANSFER_PROTOCOL":
+                return self._files.holds(request)
+        return False
+
+    def _holds_mission(self, request: Request) -> bool:
+        if self._held.mission(request.message.mission_type) is None:
+            return False
+        if request.message.get_type() == "MISSION_REQUEST_LIST":
+            if len(self._downloads) >= MAX_DOWNLOADS:
+                self._downloads.pop(next(iter(self._downloads)))
+            self._downloads[_download(request)] = None
+        return True
+
+
+def _download(request: Request) -> tuple[int, int, int, int]:
+    kind = request.message.mission_type
+    return request.client_id, request.system_id, request.component_id, kind

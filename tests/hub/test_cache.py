@@ -1,0 +1,141 @@
+"""Requests to a vehicle behind an endpoint with `cache=yes` are answered by kept answers."""
+
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.hub.hub import Hub
+from gateway.wire.mavlink_splitter import frame_of
+from tests.hub.conftest import Rig, Station
+from tests.ports import free_port
+
+COUNT = 30
+
+
+class Scene:
+    """A vehicle on the first port, whose parameters were sent, and two stations."""
+
+    def __init__(self, rig: Rig, hub: Hub, vehicle: Station, stations: list[Station]) -> None:
+        self.rig, self.hub, self.vehicle, self.stations = rig, hub, vehicle, stations
+
+    def telemetry(self) -> None:
+        self.vehicle.send(self.vehicle.sender.attitude(20_000))
+
+    def parameter(self, index: int, value: float) -> None:
+        name = b"P%d" % index
+        message = mavlink.MAVLink_param_value_message(name, value, 9, COUNT, index)
+        self.vehicle.send(self.vehicle.sender.pack(message))
+
+    def ask(self, station: int, message: Any) -> None:
+        one = self.stations[station]
+        one.send(one.sender.pack(message))
+
+    async def values(self, station: int, count: int) -> list[Any]:
+        """Return the next parameters that a station is sent."""
+        found: list[Any] = []
+        reader = mavlink.MAVLink(None)
+        while len(found) < count:
+            frame = frame_of(await self.stations[station].receive())
+            message = reader.decode(bytearray(frame.data))
+            found += [message] if message.get_type() == "PARAM_VALUE" else []
+        return found
+
+    async def list_is_sent(self) -> None:
+        """Let the rest of a list be sent: ten parameters at a time."""
+        await self.rig.quiet()
+        while (timer := self.hub._router._cache_timer) is not None:
+            timer.cancel()
+            self.rig.clock.now_us += 10_000
+            self.hub._router._poll_cache()
+
+    async def asked(self) -> list[tuple[int, int]]:
+        """Return message and target of what the vehicle has been sent."""
+        await self.rig.quiet()
+        frames = map(frame_of, self.vehicle.received())
+        return [(frame.message_id, frame.target[0]) for frame in frames if frame.target[0]]
+
+
+async def scene(rig: Rig, options: str, station_options: str = "") -> Scene:
+    chosen = (options, "", station_options)
+    hub = await rig.open(
+        *(f"udp-listen:127.0.0.1:{free_port()}?trusted=yes{each}" for each in chosen)
+    )
+    ports = hub.listening_ports()
+    vehicle = rig.station(ports[0])
+    vehicle.sender = rig.sender(1)
+    stations = [await rig.call(hub, number) for number in (1, 2)]
+    one = Scene(rig, hub, vehicle, stations)
+    vehicle.send(vehicle.sender.pack(mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)))
+    one.telemetry()
+    for index in range(COUNT):
+        one.parameter(index, float(index))
+    await one.values(0, COUNT)
+    vehicle.received()
+    return one
+
+
+def listing(system: int = 1) -> Any:
+    return mavlink.MAVLink_param_request_list_message(system, 1)
+
+
+async def test_second_list_is_answered_here_and_shown(rig: Rig) -> None:
+    one = await scene(rig, "&cache=yes")
+    one.ask(1, listing())
+    await one.list_is_sent()
+    found = (await one.values(1, 2 * COUNT))[COUNT:]
+    assert [(m.param_id, m.param_value, m.get_srcSystem()) for m in found] == [
+        (f"P{i}", float(i), 1) for i in range(COUNT)
+    ]
+    assert await one.asked() == []
+    [text] = [text for client in one.hub.clients() for text in client.cached]
+    assert text == f"system 1: parameters ({COUNT}) 0 s"
+
+
+@pytest.mark.parametrize(("options", "station_options"), [("", ""), ("&cache=yes", "&cache=no")])
+async def test_request_is_passed_on_without_the_option_or_past_it(
+    rig: Rig, options: str, station_options: str
+) -> None:
+    one = await scene(rig, options, station_options)
+    one.ask(1, listing())
+    assert await one.asked() == [(mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST, 1)]
+
+
+async def test_written_value_replaces_the_kept_one(rig: Rig) -> None:
+    one = await scene(rig, "&cache=yes")
+    one.ask(0, mavlink.MAVLink_param_set_message(1, 1, b"P3", 8.0, 9))
+    assert await one.asked() == [(mavlink.MAVLINK_MSG_ID_PARAM_SET, 1)]
+    one.parameter(3, 8.0)
+    await one.values(1, COUNT + 1)
+    one.ask(1, mavlink.MAVLink_param_request_read_message(1, 1, b"P3", -1))
+    assert [m.param_value for m in await one.values(1, 1)] == [8.0]
+    assert await one.asked() == []
+
+
+async def test_renumbered_vehicle_is_answered_for_by_its_id_here(rig: Rig) -> None:
+    one = await scene(rig, "&cache=yes&as=11")
+    one.ask(1, listing(11))
+    await one.list_is_sent()
+    found = await one.values(1, 2 * COUNT)
+    assert {m.get_srcSystem() for m in found} == {11}
+    assert await one.asked() == []
+    one.ask(1, mavlink.MAVLink_param_set_message(11, 1, b"P3", 8.0, 9))
+    assert await one.asked() == [(mavlink.MAVLINK_MSG_ID_PARAM_SET, 1)]
+
+
+async def test_station_whose_filter_excludes_the_vehicle_is_sent_nothing(rig: Rig) -> None:
+    one = await scene(rig, "&cache=yes", "&systems=2")
+    one.stations[1].received()
+    one.ask(1, listing())
+    await rig.quiet()
+    assert one.stations[1].is_empty()
+    assert await one.asked() == []
+
+
+async def test_changed_options_drop_what_was_kept(rig: Rig) -> None:
+    one = await scene(rig, "&cache=yes")
+    client = next(each for each in one.hub._clients.values() if each.endpoint.cache)
+    client.reconfigure(client.endpoint)
+    one.telemetry()
+    one.ask(1, listing())
+    assert await one.asked() == [(mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST, 1)]
