@@ -16,11 +16,10 @@ from gateway.live.session import RETRY_US, RecordingSettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.index import RecordingError, list_recordings
 from gateway.recordings.table import TableHeader, TableMark, TableReader
-from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.records import FusedSample, FusionState
 from gateway.wire.timesync import ENOUGH
 from tests.conftest import ManualClock
-from tests.recordings.frames import make_frames
+from tests.recordings.frames import make_frames, read_tlog
 from tests.recordings.samples import make_baro, make_flight, make_fused
 
 pytestmark = pytest.mark.io
@@ -70,12 +69,6 @@ async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[Bench]:
     made = Bench(tmp_path / "recordings", clock)
     yield made
     made.recorder.close()
-
-
-def read_tlog(path: Path) -> list[TlogRecord]:
-    batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
-    assert batch.damage == ()
-    return list(batch.records())
 
 
 def frames_of(folder: Path) -> list[bytes]:

@@ -1,6 +1,7 @@
 """Flights fused live and recorded, for the tests of recordings."""
 
 import math
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -91,6 +92,13 @@ def fly(settings: AircraftSettings, records: list[RawRecord]) -> tuple[bytes, li
             if isinstance(action, FusedSample):
                 states.append(action.state)
     return "".join(lines).encode(), states
+
+
+@cache
+def flown_table(seconds: float) -> bytes:
+    """Return the table of a flight with the default settings."""
+    rng = np.random.default_rng(20_240_611)
+    return fly(GatewaySettings().default_aircraft, make_flight(rng, seconds))[0]
 
 
 def read(table: bytes) -> tuple[TableHeader, list[TableRow]]:

@@ -1,6 +1,7 @@
 """MAVLink frames and tlogs for the tests of recordings."""
 
 from collections.abc import Iterable
+from pathlib import Path
 
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -35,6 +36,13 @@ def make_records(count: int, system_id: int = 1) -> list[TlogRecord]:
 
 def make_tlog(records: list[TlogRecord]) -> bytes:
     return b"".join(encode_record(record.time_us, record.frame) for record in records)
+
+
+def read_tlog(path: Path) -> list[TlogRecord]:
+    """Read a tlog without damage."""
+    batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
+    assert batch.damage == ()
+    return list(batch.records())
 
 
 def senders_of(data: bytes) -> Senders:

@@ -6,22 +6,19 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.config import GatewaySettings
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
 from gateway.recordings.table import encode_head
 from gateway.recordings.tlog import encode_record
-from tests.recordings.flights import OPTIONS, fly, make_flight, read
+from tests.recordings.flights import OPTIONS, flown_table, read
 from tests.recordings.frames import START_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 
 
-def test_recording_of_two_parts_is_opened_as_one_flight(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
-    header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 12))[0])
+def test_recording_of_two_parts_is_opened_as_one_flight(tmp_path: Path) -> None:
+    header, rows = read(flown_table(12))
     half = len(rows) // 2
     parts = []
     for number, some in ((1, rows[:half]), (2, rows[half:])):
@@ -39,8 +36,8 @@ def test_recording_of_two_parts_is_opened_as_one_flight(
     assert np.isfinite(flight.baro_alt_m).sum() > 10
 
 
-def test_raw_counts_are_calibrated(tmp_path: Path, rng: np.random.Generator) -> None:
-    header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 2))[0])
+def test_raw_counts_are_calibrated(tmp_path: Path) -> None:
+    header, rows = read(flown_table(2))
     whole, bare = tmp_path / "whole.csv", tmp_path / "bare.csv"
     names = encode_head(header).splitlines()[-1].split(",")
     whole.write_text(encode_head(header) + "".join(map(row_to_line, rows)))

@@ -16,7 +16,7 @@ from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord
-from tests.recordings.flights import OPTIONS, fly, make_flight, read
+from tests.recordings.flights import OPTIONS, flown_table, fly, make_flight, read
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
@@ -65,8 +65,8 @@ def test_other_recordings_get_separate_vehicles(tmp_path: Path) -> None:
     assert [flight.shift_us for flight in flights] == [0, -200 * STEP_US, 0]
 
 
-def test_parts_of_a_table_are_fused_as_one(tmp_path: Path, rng: np.random.Generator) -> None:
-    header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 10))[0])
+def test_parts_of_a_table_are_fused_as_one(tmp_path: Path) -> None:
+    header, rows = read(flown_table(10))
     parts = []
     for number, some in ((1, rows[:200]), (2, rows[200:])):
         parts.append(tmp_path / f"a_0{number}_v1.csv")

@@ -18,7 +18,7 @@ from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender, packed
-from tests.recordings.frames import START_US, make_records, make_tlog, senders_of
+from tests.recordings.frames import START_US, make_records, make_tlog, read_tlog, senders_of
 
 pytestmark = pytest.mark.io
 
@@ -42,17 +42,11 @@ def write(tmp_path: Path) -> Write:
     return written
 
 
-def records_of(path: Path) -> list[TlogRecord]:
-    batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
-    assert batch.damage == ()
-    return list(batch.records())
-
-
 def convert(*words: object, folder: Path) -> tuple[list[TlogRecord], str]:
     """Run `mavgate convert` to a tlog; return its records and the texts."""
     out = folder / "out.tlog"
     text = run("convert", *words, "-o", out, "--force")
-    return records_of(out), text
+    return read_tlog(out), text
 
 
 MIXED = sorted(
@@ -115,7 +109,7 @@ def test_input_is_never_the_output(write: Write) -> None:
     path = write(MIXED)
     text = run("convert", path, "-o", path, "--force", "--system", 1, code=2)
     assert "name another" in text
-    assert records_of(path) == MIXED
+    assert read_tlog(path) == MIXED
 
 
 @pytest.mark.parametrize(

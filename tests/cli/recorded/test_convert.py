@@ -14,11 +14,11 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.config import GatewaySettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.table import TableFault, TableHeader, TableReader
-from gateway.recordings.tlog import TlogRecord, TlogScanner
+from gateway.recordings.tlog import TlogRecord
 from gateway.wire.mavlink_splitter import origin_of
 from tests.kit.cli import run
-from tests.recordings.flights import fly, make_flight
-from tests.recordings.frames import START_US, make_records, make_tlog
+from tests.recordings.flights import flown_table
+from tests.recordings.frames import START_US, make_records, make_tlog, read_tlog
 
 pytestmark = pytest.mark.io
 
@@ -33,16 +33,10 @@ def tlog(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def table(tmp_path: Path, rng: np.random.Generator) -> Path:
+def table(tmp_path: Path) -> Path:
     path = tmp_path / "flight.csv"
-    path.write_bytes(fly(GatewaySettings().default_aircraft, make_flight(rng, 20))[0])
+    path.write_bytes(flown_table(20))
     return path
-
-
-def read_tlog(path: Path) -> list[TlogRecord]:
-    batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
-    assert batch.damage == ()
-    return list(batch.records())
 
 
 def read_table(path: Path) -> tuple[TableHeader, list[TableRow]]:

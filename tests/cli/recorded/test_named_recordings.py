@@ -9,7 +9,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
-import numpy as np
 import pytest
 
 from gateway.analysis.flight import Flight
@@ -17,13 +16,13 @@ from gateway.cli.live.demo import recorded_line
 from gateway.cli.recorded import play
 from gateway.cli.support.options import read_options
 from gateway.cli.support.recording_options import files_of, load_flight
-from gateway.config import GatewaySettings, load
+from gateway.config import load
 from gateway.player import PlayerDaemon
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.table import encode_head
 from tests.kit.cli import invoke
-from tests.recordings.flights import fly, make_flight, read
+from tests.recordings.flights import flown_table, read
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
@@ -32,12 +31,12 @@ COUNT = 4000
 
 
 @pytest.fixture
-def config(tmp_path: Path, rng: np.random.Generator) -> Path:
+def config(tmp_path: Path) -> Path:
     """Recordings `alps` (tlog and tables of two parts) and `lake` (a tlog of system 7)."""
     folder = tmp_path / "recordings"
     folder.mkdir()
     (folder / "alps_01.tlog").write_bytes(make_tlog(make_records(COUNT)))
-    header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 12))[0])
+    header, rows = read(flown_table(12))
     header = msgspec.structs.replace(header, unix_us_at_zero=START_US)
     half = len(rows) // 2
     for number, some in ((1, rows[:half]), (2, rows[half:])):

@@ -135,7 +135,7 @@ def test_comment_lines_of_a_bomb_are_refused_in_a_moment(tmp_path: Path, command
     path = tmp_path / "bomb.csv.gz"
     with gzip.open(path, "wb") as file:
         file.write(NAMES.encode() + b"\n")
-        for _ in range(400):
+        for _ in range(20):
             file.write(b"#\n" * (1 << 20))
     words = ["-o", tmp_path / "out.csv"] if command == "fuse" else []
     begin_s = time.process_time()
