@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 MakeBench = Callable[..., Bench]
 RUNNING_S = 1.0
-RUN_S = 6.0
+RUN_S = 8.0
 CHANNEL = (868_300, 7, 250, 5, 0x12)
 """Frequency, spreading factor, bandwidth, coding and sync word of the default settings."""
 
