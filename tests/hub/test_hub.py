@@ -4,6 +4,7 @@ import itertools
 import os
 import resource
 import socket
+from collections import Counter
 from typing import Any
 from unittest.mock import Mock
 
@@ -13,7 +14,10 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.hub.transports import base, stream
-from gateway.wire.mavlink_splitter import frame_of
+from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_splitter import frame_of, message_id_of
+from tests.hub.conftest import FlyingHub
+from tests.kit.records import BARO
 
 pytestmark = pytest.mark.io
 
@@ -513,3 +517,28 @@ async def test_reports_and_round_trips_take_turns(
     assert len(set(moments)) == len(moments)
     for name in ("_report_alerts", "_measure_round_trips"):
         assert sum(1 for named, _ in done if named == name) >= 9
+
+
+async def test_antenna_tracker_gets_position_and_pressure_of_its_target(rig: Any) -> None:
+    """ArduPilot's requests two streams of the first vehicle whose heartbeat it receives."""
+    gateway = FlyingHub(rig, 1, "udp-listen:127.0.0.1:0")
+    gateway.fly()
+    tracker = rig.station(gateway.hub.listening_ports()[0])
+    tracker.sender = rig.sender(2)
+    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_ANTENNA_TRACKER, 3, 0, 0, 4, 3)
+    tracker.send(tracker.sender.pack(beat))
+    for group in (dialect.MAV_DATA_STREAM_POSITION, dialect.MAV_DATA_STREAM_RAW_SENSORS):
+        request = dialect.MAVLink_request_data_stream_message(1, 1, group, 1, 1)
+        tracker.send(tracker.sender.pack(request))
+    await rig.quiet()
+    received: Counter[int] = Counter()
+    for _ in range(100):
+        rig.clock.now_us += 50_000
+        gateway.fly()
+        pressure = msgspec.structs.replace(BARO, time_us=rig.clock())
+        gateway.perform(gateway.vehicle.on_baro(pressure, rig.clock()))
+        await rig.quiet_some()
+        received.update(map(message_id_of, tracker.received()))
+    needed = ("HEARTBEAT", "GLOBAL_POSITION_INT", "SCALED_PRESSURE")
+    counts = [received[MESSAGE_IDS[name]] for name in needed]
+    assert all(4 <= count <= 7 for count in counts), counts

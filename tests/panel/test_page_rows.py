@@ -166,6 +166,7 @@ def test_row_marked_position_and_distance(page: Page, demo: Process) -> None:
     show(page, "map")
     view = page.locator("section[data-view='map']")
     expect(view.locator(".pin.home")).to_be_visible()
+    expect(view.locator("[data-role='sight']")).to_have_text(re.compile(r"from home \d{1,3}°"))
     canvas = view.locator(".map-canvas")
     canvas.click(position={"x": 300, "y": 250})
     ask = view.locator(".map-ask")

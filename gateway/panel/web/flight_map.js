@@ -189,6 +189,7 @@ export default {
         <span v-if="has_fixes" class="key fix">GPS</span>
         <span class="key circle" v-if="circle">95 % within {{ circle }}</span>
         <span class="key mark" v-if="way" data-role="way">{{ way }}</span>
+        <span class="key home" v-if="sight" data-role="sight">{{ sight }}</span>
       </div>
     </div>`,
   props: { styles: Array, full: Boolean, may_mark: Boolean, base: String },
@@ -200,7 +201,7 @@ export default {
       return numbers.length === 2 && Math.abs(lat_deg) <= 90 && Math.abs(lon_deg) <= 180 ? { lat_deg, lon_deg } : null;
     },
   },
-  data: () => ({ follow: true, style: 0, position: "", copied: false, way: "", circle: "", paths: [], has_fixes: false, offline: false, entry: "", asked: null }),
+  data: () => ({ follow: true, style: 0, position: "", copied: false, way: "", sight: "", circle: "", paths: [], has_fixes: false, offline: false, entry: "", asked: null }),
 
   mounted() {
     const map = (this.map = L.map(this.$refs.map, {
@@ -216,6 +217,7 @@ export default {
     this.craft = {};
     this.mark = L.marker([0, 0], { icon: icon('<svg viewBox="0 0 24 24" class="pin mark"><path d="M12 1v22M1 12h22M12 5a7 7 0 1 0 .1 0z"/></svg>', 26), interactive: false, keyboard: false });
     this.bearing = L.polyline([], { weight: 2, dashArray: "6 6" });
+    this.antenna = L.polyline([], { weight: 1.5, dashArray: "2 5", interactive: false });
     this.home = L.marker([0, 0], { icon: icon('<div class="pin home">H</div>', 22), interactive: false, keyboard: false });
     this.accuracy = L.circle([0, 0], { radius: 1, weight: 1, fillOpacity: 0.12, interactive: false });
     map.on("click", (event) => this.may_mark && this.ask({ lat_deg: event.latlng.lat, lon_deg: event.latlng.wrap().lng }));
@@ -303,6 +305,7 @@ export default {
       this.borders?.setStyle({ color: mavgate.colour("soft") });
       this.towns?.draw();
       this.bearing.setStyle({ color: this.mark_colour });
+      this.antenna.setStyle({ color: mavgate.colour("home") });
       this.accuracy.setStyle({ color: mavgate.colour("track"), fillColor: mavgate.colour("track") });
       for (const one of Object.values(this.craft)) {
         one.track.setStyle({ color: mavgate.colour(one.colour) });
@@ -380,6 +383,9 @@ export default {
       if (!state || state.lat_deg === null) return;
       const here = at(state);
       this.toggle(this.home, state.home, () => this.home.setLatLng(at(state.home)));
+      // Where an antenna at home points.
+      this.toggle(this.antenna, state.home, () => this.antenna.setLatLngs([at(state.home), here]));
+      this.sight = state.home ? `from home ${Math.round(mavgate.bearing_deg(at(state.home), here)) % 360}°` : "";
       const origin = state.home ? at(state.home) : (this.grid.origin ?? here);
       if (String(origin) !== String(this.grid.origin)) {
         this.grid.origin = origin;
