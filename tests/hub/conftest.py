@@ -75,7 +75,6 @@ class KeepingClient(Client):
         self.words = new_client_words(client_id)
         self.now_us = 0
         self.sent: list[tuple[int, MavFrame]] = []
-        self.write = lambda data: self.transmit(frame_of(data))
         self._direct = direct
 
     @property
@@ -92,6 +91,10 @@ class KeepingClient(Client):
     def transmit(self, frame: MavFrame) -> None:
         assert frame == frame_of(frame.data)
         self.sent.append((self.now_us, frame))
+
+    def send_rest(self, frames: Iterable[bytes], *_: int) -> None:
+        for data in frames:
+            self.transmit(frame_of(data))
 
 
 class FlyingHub:

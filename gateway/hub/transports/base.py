@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import os
 import socket
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -52,7 +51,6 @@ VERSION_PROBE_US: Final = 5 * US_PER_S
 RETRY_US: Final = US_PER_S
 """Between attempts to reopen a socket."""
 
-Write = Callable[[bytes], object]
 OnForeign = Callable[[Sequence[bytes]], None]
 """Called with frames of other systems that are forwarded, in their order."""
 STALE_AFTER_US: Final = 3 * US_PER_S
@@ -61,16 +59,6 @@ SHARE: Final = 4
 """Divisor: one host keeps a quarter of a full port's clients when others connect."""
 FEW: Final = 4
 """Clients that one host keeps in any case, such as a ground station, a script and a display."""
-
-
-def not_open(data: bytes) -> int:
-    """Write function of a client without an open socket; raises OSError."""
-    raise ConnectionError(f"{len(data)} bytes for a socket that is not open")
-
-
-def raise_error(number: int) -> None:
-    """Raise the OSError of an error number of the system."""
-    raise OSError(number, os.strerror(number))
 
 
 @contextmanager
@@ -149,10 +137,10 @@ class Targets:
         self.address = address_of(self._memory)
 
     def send(self, frame: MavFrame, now_us: int) -> None:
-        """Send a frame to every client; it is not counted as sent to direct ones."""
-        self._send_others(frame, now_us)
+        """Send a frame to every client."""
         for client in self.direct:
-            client.send_rest((frame.data,))
+            client.transmit(frame)
+        self._send_others(frame, now_us)
 
     def finish(self, run: list[bytes], failures: list[list[int]], now_us: int) -> None:
         """Do for a run of frames what the compiled step has left."""
@@ -186,7 +174,6 @@ class Route:
     ) -> None:
         self.message_id = message_id
         self.frames = self.size = 0
-        """Not yet in the counters of the direct clients."""
         self._targets = targets
         self._source = source
         self._path = path
@@ -224,18 +211,20 @@ class Route:
             self._on_foreign((frame.data,))
 
     def settle(self) -> tuple[int, int]:
-        """Add the common counts to the clients' counters; return the frames and bytes."""
-        frames, size, words = self.frames, self.size, self._words
+        """Count what the compiled step has forwarded; return the frames and bytes of all."""
+        words = self._words
         if words is not None and (count := words[kernel.FRAMES]):
-            self._source.count_received(count, words[kernel.SIZE], words[kernel.HEARD_US])
-            self._path.count(count, self._source.client_id, words[kernel.HEARD_US])
-            frames, size = frames + count, size + words[kernel.SIZE]
+            size, heard_us = words[kernel.SIZE], words[kernel.HEARD_US]
             words[kernel.FRAMES] = words[kernel.SIZE] = 0
-        self.frames = self.size = 0
-        if frames:
+            self._source.count_received(count, size, heard_us)
+            self._path.count(count, self._source.client_id, heard_us)
             for client in self._targets.direct:
-                client.counters.sent += frames
+                client.counters.sent += count
                 client.counters.bytes_sent += size
+            self.frames += count
+            self.size += size
+        frames, size = self.frames, self.size
+        self.frames = self.size = 0
         return frames, size
 
 
@@ -261,8 +250,6 @@ class Client:
     counters: ClientCounters = field(default_factory=ClientCounters)
     routes: dict[bytes, Route] = field(default_factory=dict)
     """Cached routes of frames from here, by `MavFrame.key`; the fan-out clears them."""
-    write: Write = field(default=not_open)
-    """Sends one datagram at once or raises OSError; only of a client that is direct."""
     words: Words = field(init=False)
     """Its state in the compiled step."""
     loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop)
@@ -370,7 +357,7 @@ class Client:
 
     @property
     def is_direct(self) -> bool:
-        """Whether a frame may be passed to `write` directly."""
+        """Whether the compiled step may send to it."""
         return False
 
     @property
@@ -402,19 +389,11 @@ class Client:
             self._only_version1 = now_us - self._version1_since_us >= VERSION_PROBE_US
         return self.is_mavlink1 != before
 
-    def send_rest(self, frames: Iterable[bytes], number: int = 0, _part: int = 0) -> None:
-        """Send frames that will be counted as sent; the number is that of the first one's error."""
-        for data in frames:
-            try:
-                if number:
-                    raise_error(number)
-                self.write(data)
-            except OSError as error:
-                self.recover_uncounted(data, error)
-            number = 0
+    def send_rest(self, frames: Iterable[bytes], number: int, part: int) -> None:
+        """Send what the compiled step has not sent, though it counts it as sent.
 
-    def recover_uncounted(self, data: bytes, error: OSError) -> None:
-        """Handle a failed `write` whose frame will still be counted as sent."""
+        `number` is that of the first frame's error, and `part` the bytes of it that were sent.
+        """
         raise NotImplementedError
 
     @property

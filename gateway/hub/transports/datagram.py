@@ -6,7 +6,7 @@ import os
 import socket
 import struct
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from functools import partial
 from typing import Final
 
@@ -15,14 +15,7 @@ from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import Endpoint
 from gateway.hub.routing_table import HEARTBEAT_ID, Origin
 from gateway.hub.send_queue import Packer
-from gateway.hub.transports.base import (
-    RETRY_US,
-    STALE_AFTER_US,
-    Client,
-    Write,
-    new_socket,
-    not_open,
-)
+from gateway.hub.transports.base import RETRY_US, STALE_AFTER_US, Client, new_socket
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import DatagramSplitter, MavFrame, message_id_of, read_datagram
 
@@ -45,12 +38,20 @@ UNPROVEN_IDLE_US: Final = 5 * US_PER_S
 """A peer that has not proven that it receives is removed after this time without a frame."""
 
 Address = tuple[str | int, ...]
+Write = Callable[[bytes], object]
+
+
+def not_open(data: bytes) -> int:
+    """Write function of a client without an open socket; raises OSError."""
+    raise ConnectionError(f"{len(data)} bytes for a socket that is not open")
 
 
 class DatagramClient(Client):
     """A peer behind a datagram socket; base of unicast, broadcast and multicast."""
 
     refused_us: int | None = None
+    write: Write = staticmethod(not_open)
+    """Sends one datagram at once or raises OSError."""
     _socket: socket.socket | None = None
     _direct: Write = staticmethod(not_open)
     _output = -1
@@ -66,7 +67,7 @@ class DatagramClient(Client):
 
     @property
     def is_direct(self) -> bool:
-        """Whether a frame may be passed to `write` directly."""
+        """Whether the compiled step may send to it."""
         return self._packer is None and self.is_unchanged
 
     @property
@@ -155,10 +156,15 @@ class DatagramClient(Client):
         self.become("open")
         self.refused_us = None
 
-    def recover_uncounted(self, data: bytes, error: OSError) -> None:
-        """Handle a failed send whose frame will still be counted as sent."""
-        self._count_sent(-1, -len(data))
-        self._recover(data, 1, error)
+    def send_rest(self, frames: Iterable[bytes], number: int, part: int) -> None:  # noqa: ARG002
+        """Send what the compiled step has not sent, though it counts it as sent."""
+        for data in frames:
+            self._count_sent(-1, -len(data))
+            if number:
+                self._recover(data, 1, OSError(number, os.strerror(number)))
+            else:
+                self._send_packed([data])
+            number = 0
 
     def _packer_of(self, endpoint: Endpoint) -> Packer | None:
         if not endpoint.pack_bytes:

@@ -166,8 +166,8 @@ class StreamClient(QueuedClient):
         """Whether frames are sent as they are, unless others wait."""
         return self.is_unchanged
 
-    def send_rest(self, frames: Iterable[bytes], _number: int = 0, part: int = 0) -> None:
-        """Send frames that will be counted as sent; the first was sent up to `part`."""
+    def send_rest(self, frames: Iterable[bytes], number: int, part: int) -> None:  # noqa: ARG002
+        """Send what the compiled step has not sent, though it counts it as sent."""
         for data in frames:
             self.counters.bytes_sent -= len(data) - part
             if part and self._socket is not None:
