@@ -29,7 +29,7 @@ from gateway.recordings.trimming import NOTHING_WITHIN
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle
-from gateway.wire.frame_editing import edit_frame
+from gateway.wire.frame_editing import renumbered
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 
 READY_S: Final = 3.0
@@ -260,11 +260,11 @@ class _Numbering:
         read = frame_of(frame)
         added = self._added.get(read.origin, 0)
         sequence = self._last[read.origin] = read.sequence + added & 0xFF
-        return (edit_frame(read, sequence=sequence) or read).data if added else frame
+        return renumbered(read, sequence).data if added else frame
 
     def inserted(self, frame: bytes) -> bytes:
         """Return an answer or a repeated frame, numbered in between the recorded frames."""
         read = frame_of(frame)
         sequence = self._last[read.origin] = self._last.get(read.origin, 0xFF) + 1 & 0xFF
         self._added[read.origin] = self._added.get(read.origin, 0) + 1
-        return (edit_frame(read, sequence=sequence) or read).data
+        return renumbered(read, sequence).data

@@ -13,19 +13,9 @@
     serial:DEVICE:BAUD       a telemetry radio or an autopilot on a serial port
 
 IPv6 addresses are written in brackets. Options follow as in any URL:
-`?name=tablet&deny=RAW_IMU&pack=1100`. The spellings of other programs are read with their meaning:
-
-| written                                        | by                         | here             |
-| ---------------------------------------------- | -------------------------- | ---------------- |
-| `udpin:`, `udpin://`, `udps:`                  | MAVProxy, MAVSDK, mavp2p   | `udp-listen:`    |
-| `udpout:`, `udpout://`, `udpc:`                | MAVProxy, MAVSDK, mavp2p   | `udp:`           |
-| `HOST:PORT`                                    | MAVProxy, mavlink-router   | `udp:`           |
-| `udpbcast:`, `udpb:`                          | pymavlink, mavp2p          | `udp-broadcast:` |
-| `tcp://`, `tcpout:`, `tcpout://`, `tcpc:`      | MAVSDK, pymavlink, mavp2p  | `tcp:`           |
-| `tcpin:`, `tcpin://`, `tcps:`                  | MAVProxy, MAVSDK, mavp2p   | `tcp-listen:`    |
-| `ws://`, `wss://`                              | browsers, pymavlink        | `ws:`, `wss:`    |
-| `wsserver:`                                    | pymavlink                  | `ws-listen:`     |
-| `serial://DEV:BAUD`, `DEV:BAUD`, `DEV,BAUD`    | MAVSDK, routers, MAVProxy  | `serial:`        |
+`?name=tablet&deny=RAW_IMU&pack=1100`. The spellings of MAVProxy, MAVSDK, pymavlink, mavlink-router
+and mavp2p are read with their meaning: the words of `ALIASES`, `//` after the kind, `HOST:PORT` for
+`udp:`, and `DEVICE:BAUD` or `DEVICE,BAUD` for `serial:`.
 
 `udp://` listens in MAVSDK, binds and sends in MAVROS, and looks like `udp:`, which sends here: it
 is refused, and so is an address to send to that can only be one to listen on.

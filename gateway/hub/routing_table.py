@@ -170,9 +170,6 @@ class RoutingTable:
         self._of_client: dict[int, dict[Origin, SystemPath]] = {}
         self._to: dict[Origin, dict[int, SystemPath]] = {}
         """The same paths by system and component."""
-        self._components: dict[int, set[Origin]] = {}
-        """By system."""
-        self._streams: dict[Origin, FrameStream] = {}
 
     def register(self, client_id: int, origin: Origin, now_us: int) -> SystemPath | None:
         """Register a client's frame of a system; return the path, or None without room for it."""
@@ -244,10 +241,8 @@ class RoutingTable:
 
         Stale ones only if there is no other, and never the sender. Component 0 is all of it.
         """
-        system, component = target
-        exact = self._to.get(target, {}) if component else {}
-        known = self._components.get(system, set())
-        for origins in ({target} if exact.keys() - {source_id} else set(), known):
+        exact = [target] if target[1] and self._to.get(target, {}).keys() - {source_id} else []
+        for origins in (exact, [origin for origin in self._to if origin[0] == target[0]]):
             found: dict[int, bool] = {}
             for origin in origins:
                 for client_id, path in self._to[origin].items():
@@ -266,21 +261,16 @@ class RoutingTable:
                 return None
             del known[stalest]
             self._drop(client_id, stalest)
-        stream = self._streams.setdefault(origin, FrameStream())
-        known[origin] = path = SystemPath(now_us, now_us, stream)
-        self._to.setdefault(origin, {})[client_id] = path
-        self._components.setdefault(origin[0], set()).add(origin)
+        paths = self._to.setdefault(origin, {})
+        stream = next((path.stream for path in paths.values()), FrameStream())
+        known[origin] = paths[client_id] = path = SystemPath(now_us, now_us, stream)
         return path
 
     def _drop(self, client_id: int, origin: Origin) -> None:
         paths = self._to[origin]
         del paths[client_id]
         if not paths:
-            del self._to[origin], self._streams[origin]
-            components = self._components[origin[0]]
-            components.discard(origin)
-            if not components:
-                del self._components[origin[0]]
+            del self._to[origin]
 
 
 class FrameMemory(Generic[Note]):

@@ -30,7 +30,7 @@ from gateway.recordings.tlog import SEEK_BYTES, STRIDE, Batch, TlogRecord, TlogS
 from gateway.recordings.tlog_index import TlogIndex
 from gateway.recordings.tlog_scan import IntArray
 from gateway.units import US_PER_S
-from gateway.wire.frame_editing import edit_frame
+from gateway.wire.frame_editing import edit_frame, renumbered
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 
@@ -184,8 +184,7 @@ class Track:
                 frame = batch.frame(i)
                 if count := left_out[origin]:
                     read = frame_of(frame)
-                    edited = edit_frame(read, sequence=read.sequence - count & 0xFF)
-                    frame = (edited or read).data
+                    frame = renumbered(read, read.sequence - count & 0xFF).data
                 yield TlogRecord(int(batch.time_us[i]), frame)
 
     def _left_out(self, batch: Batch) -> IntArray:

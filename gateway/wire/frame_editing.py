@@ -88,10 +88,21 @@ def edit_frame(
         content[FLAGS] = SIGNED if sign is not None else 0
     edited = bytes(content)
     edited += mcrf4xx(edited[1:] + extra).to_bytes(CRC_SIZE, "little")
-    if fields or sign is not None or system is not None or component is not None:
-        return frame_of(edited + sign(edited) if is_v2 and sign is not None else edited)
-    number = edited[at]
-    return MavFrame(edited, frame.key, message_id, frame.origin, frame.target, number, False)
+    return frame_of(edited + sign(edited) if is_v2 and sign is not None else edited)
+
+
+def renumbered(frame: MavFrame, sequence: int) -> MavFrame:
+    """Return a frame with another sequence number; one of an unknown message, or signed, as it is.
+
+    The same as `edit_frame` in a third of the time: filters have it done to most frames of ours.
+    """
+    data, extra = frame.data, CRC_EXTRA.get(frame.message_id)
+    if extra is None or frame.signed:
+        return frame
+    at = SEQUENCE_V2 if data[0] == START_V2 else SEQUENCE_V1
+    content = data[1:at] + sequence.to_bytes() + data[at + 1 : -CRC_SIZE]
+    data = data[:1] + content + mcrf4xx(content + extra).to_bytes(CRC_SIZE, "little")
+    return MavFrame(data, frame.key, frame.message_id, frame.origin, frame.target, sequence, False)
 
 
 def _write(content: bytearray, message_id: int, fields: Mapping[str, Any]) -> None:

@@ -38,7 +38,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-from gateway.wire.frame_editing import Sign, edit_frame
+from gateway.wire.frame_editing import Sign, edit_frame, renumbered
 from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, MavFrame
 
 KEY_BYTES: Final = 32
@@ -169,9 +169,7 @@ class FrameSigner:
         """
         key = self.keys.get(frame.origin[0] if system is None else system) if self.keys else None
         if key is None or self._clock is None:
-            if frame.sequence == sequence:
-                return frame
-            return edit_frame(frame, sequence=sequence) or frame
+            return frame if frame.sequence == sequence else renumbered(frame, sequence)
         sign = self._sign(key, OWN_LINK, now_us)
         return edit_frame(frame, sequence=sequence, sign=sign) or frame
 

@@ -135,7 +135,7 @@ class TestBounds:
         for client in range(400):
             table.register(client, (client % 255, 190), 0)
             table.remove(client)
-        assert (table._to, table._of_client, table._components) == ({}, {}, {})
+        assert (table._to, table._of_client) == ({}, {})
 
 
 def frame(number: int, content: bytes | None = None) -> MavFrame:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.wire.frame_editing import edit_frame
+from gateway.wire.frame_editing import edit_frame, renumbered
 from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_NAMES, layout_of
 from gateway.wire.mavlink_signing import signature
 from gateway.wire.mavlink_splitter import MavFrame, frame_of, to_mavlink1
@@ -58,6 +58,8 @@ def test_header_fields_change_alone(message: Any, version: int, changes: dict[st
         changes.get("component", 1),
     )
     assert edit_frame(edited, sequence=0, system=1, component=1) == before
+    if "sequence" in changes:
+        assert renumbered(edited, 7) == edit_frame(edited, sequence=7)
 
 
 FIELDS: dict[str, tuple[Any, dict[str, Any], dict[str, Any]]] = {
@@ -121,7 +123,9 @@ def test_field_that_does_not_exist_or_fit_raises_value_error(
 
 class TestSignature:
     def test_signed_frame_is_not_edited_without_a_decision(self) -> None:
-        assert edit_frame(frame(ATTITUDE, signed=True), sequence=3) is None
+        signed = frame(ATTITUDE, signed=True)
+        assert edit_frame(signed, sequence=3) is None
+        assert renumbered(signed, 3) is signed
 
     def test_dropped_signature_leaves_an_unsigned_frame(self) -> None:
         edited = edit_frame(frame(ATTITUDE, signed=True), system=42, drop_signature=True)
