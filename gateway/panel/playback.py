@@ -24,7 +24,6 @@ from gateway.recordings.columns import TableRow
 from gateway.recordings.files import TLOG, format_of, open_tlog, read_chunks
 from gateway.recordings.index import RecordingError, find_recording, parts_together
 from gateway.recordings.positions import TrackPoint
-from gateway.recordings.reading import recorded_frames
 from gateway.recordings.senders import FIRST_GROUND_STATION, Senders
 from gateway.recordings.table import TableReader
 from gateway.recordings.vehicle_reader import VehicleReader
@@ -89,9 +88,9 @@ def _of_tlogs(parts: Sequence[Path]) -> list[RecordedAircraft]:
         senders.merge(source.senders)
     reader, begin_us = VehicleReader(senders), None
     points: defaultdict[int, list[TrackPoint]] = defaultdict(list)
-    for record in recorded_frames(sources):
-        begin_us = record.time_us if begin_us is None else begin_us
-        for message in reader.feed(record):
+    for batch in (batch for source in sources for batch in source.batches()):
+        begin_us = int(batch.time_us[0]) if begin_us is None and len(batch) else begin_us
+        for message in reader.feed_batch(batch):
             if (at := message.position) is not None:
                 point = TrackPoint(message.time_us, at.lat_deg, at.lon_deg, at.alt_amsl_m)
                 _note_height(point, points[message.system_id])

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -32,7 +31,6 @@ from gateway.recordings.formats.maps import (
 )
 from gateway.recordings.joining import joined_tables
 from gateway.recordings.merging import batched
-from gateway.recordings.moment import time_us_of
 from gateway.recordings.reading import (
     beside_id,
     check_vehicle,
@@ -41,7 +39,6 @@ from gateway.recordings.reading import (
     is_table,
     open_record,
     open_rows,
-    recorded_frames,
 )
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, aircraft_of
@@ -50,7 +47,7 @@ from gateway.recordings.senders import Senders
 from gateway.recordings.table import encode_block, encode_head
 from gateway.recordings.tlog import Batch, Stamper, TlogRecord
 from gateway.recordings.tlog_editing import TlogEditor, TlogEdits, first_position
-from gateway.recordings.trimming import NOTHING_WITHIN, Limits, trimmed
+from gateway.recordings.trimming import Limits, trimmed
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 
 NOT_FUSED: Final = "raw samples, settings and the states' digits"
@@ -95,6 +92,8 @@ class FlightToWrite:
         self.is_mavlink = kinds == {TLOG}
         """Whether the frames are the recorded ones, and the rows are derived from them."""
         self._estimates = estimates_of(files, fuse=fuse, both=both)
+        self.has_messages = self.is_mavlink or self._estimates != "fused"
+        """Whether they hold the messages of vehicles, as MAVLink or an autopilot's own record."""
         self._as_recorded = not fuse and all(is_table(file) for file in files)
         self.fusions: list[RecordedFusion] = []
         """Those that were made to write it."""
@@ -109,18 +108,12 @@ class FlightToWrite:
             self.files = self._files_of(options.system_id)
 
     def frames(self) -> Iterator[TlogRecord]:
-        """Yield the MAVLink: as recorded, or as the gateway would send it for the rows."""
-        if not self.is_mavlink:
-            return _within(self._sent(), self._limits)
-        recorded = recorded_frames(self._open(), self.options.progress)
-        first = next(recorded, None)
-        if first is None:
-            raise FlightError(f"{', '.join(map(str, self.files))}: {NO_RECORDING}")
-        return _within(chain([first], recorded), self._limits)
+        """Yield the MAVLink that is kept: as recorded, or as the gateway would send it."""
+        return (record for batch in self.chosen() for record in batch.records())
 
     def tlog(self) -> Iterator[bytes]:
         """Yield the MAVLink as a tlog, with the edits."""
-        sources, edits = self._open() if self.is_mavlink else [], self._edits
+        sources, edits = self._open(), self._edits
         if edits.anonymity is not None:
             self.anonymiser = Anonymiser(edits.anonymity, first_position(sources))
             edits = replace(edits, frames=(self.anonymiser, *edits.frames))
@@ -131,8 +124,7 @@ class FlightToWrite:
         """Yield the MAVLink that is kept, of all messages, not edited."""
         choice = replace(self._edits.choice, messages=frozenset())
         editor = TlogEditor(replace(self._edits, choice=choice), self._limits, self.remark)
-        sources = self._open() if self.is_mavlink else []
-        return editor.chosen(self._batches(editor, sources), self.senders)
+        return editor.chosen(self._batches(editor, self._open()), self.senders)
 
     def _batches(self, editor: TlogEditor, sources: list[TlogSource]) -> Iterator[Batch]:
         if self.is_mavlink:
@@ -140,11 +132,15 @@ class FlightToWrite:
         return batched(self._sent())
 
     def _open(self) -> list[TlogSource]:
-        """Open the files as MAVLink; their senders are known then."""
+        """Open the files that are MAVLink; their senders are known then."""
+        if not self.is_mavlink:
+            return []
         sources = [open_tlog(file) for file in self.files]
         for source in sources:
             self.senders.merge(source.senders)
             self._remarks += [f"{source.path}: {text}" for text in source.remarks]
+        if not self.senders.origins:
+            raise FlightError(f"{', '.join(map(str, self.files))}: {NO_RECORDING}")
         # A tlog may also be made of a ground station's frames.
         if self.options.system_id not in {origin >> 8 for origin in self.senders.origins}:
             check_vehicle(self.files, self.options.system_id, self.senders.systems())
@@ -154,10 +150,9 @@ class FlightToWrite:
         self, wanted: Iterable[int] = (), system_id: int | None = None
     ) -> Iterator[VehicleMessage]:
         """Yield the positions, attitudes and texts of the vehicles, and other messages by id."""
-        frames = self.frames()
-        reader = VehicleReader(self.senders, wanted, system_id)
-        for record in frames:
-            yield from reader.feed(record)
+        batches, reader = self.chosen(), VehicleReader(self.senders, wanted, system_id)
+        for batch in batches:
+            yield from reader.feed_batch(batch)
         yield from reader.flush()
 
     def table(self) -> RecordedTable:
@@ -201,10 +196,10 @@ class FlightToWrite:
 
     def lacks(self, ending: str) -> str:
         """Return the content that a format cannot hold, once all is written; empty for none."""
-        if self._logs:
+        if self._logs and ending == ".tlog":
             return "; ".join(filter(None, (log.lacks for log in self._logs)))
         lacks = LACKS[ending]
-        return lacks.of_tlogs if self.is_mavlink else lacks.of_tables
+        return lacks.of_tlogs if self.has_messages else lacks.of_tables
 
     def remark(self, text: str) -> None:
         """Add a remark for the user."""
@@ -281,7 +276,7 @@ def _drawn(draw: Callable[[str, list[VehicleTrack]], Iterator[str]]) -> Write:
 
 
 def _vehicles(flight: FlightToWrite) -> list[VehicleTrack]:
-    if flight.is_mavlink:
+    if flight.has_messages:
         found = tracks_of_messages(flight.vehicle_messages(DRAWN_IDS, flight.options.system_id))
     else:
         tables = (one.table() for one in flight.by_aircraft())
@@ -313,21 +308,6 @@ add_writer(".gpx", _drawn(to_gpx), Lacks(*NOT_DRAWN))
 add_writer(".geojson", _drawn(to_geojson), Lacks(*NOT_DRAWN))
 add_writer(".mcap", _packaged("mcap", "MCAP"), Lacks(of_tables=NOT_FUSED))
 add_writer(".parquet", _packaged("parquet", "Parquet"), Lacks(of_tlogs=NOT_IN_TABLE))
-
-
-def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecord]:
-    begin, end = limits
-    first_us: int | None = None
-    is_empty = limits != (None, None)
-    for record in records:
-        first_us = record.time_us if first_us is None else first_us
-        if end is not None and record.time_us > time_us_of(end, first_us):
-            break
-        if begin is None or record.time_us >= time_us_of(begin, first_us):
-            yield record
-            is_empty = False
-    if is_empty:
-        raise FlightError(NOTHING_WITHIN)
 
 
 class Pieces:

@@ -4,7 +4,6 @@ Readers that need large packages are imported with the first file of their forma
 """
 
 import codecs
-import heapq
 import math
 from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
@@ -28,7 +27,6 @@ from gateway.recordings.files import (
     Estimates,
     FlightError,
     Progress,
-    TlogSource,
     encoding_of,
     format_of,
     open_tlog,
@@ -45,7 +43,7 @@ from gateway.recordings.recorded_table import (
 )
 from gateway.recordings.senders import FIRST_GROUND_STATION
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
-from gateway.recordings.tlog import ORDER_US, TlogRecord
+from gateway.recordings.tlog import ORDER_US
 from gateway.toml_file import TomlError, read_toml
 from gateway.units import counted
 
@@ -125,17 +123,6 @@ def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
     all.
     """
     return READERS[format_of(path)](path, options)
-
-
-def recorded_frames(
-    sources: Iterable[TlogSource], progress: Progress | None = None
-) -> Iterator[TlogRecord]:
-    """Yield the records of tlogs, merged by time."""
-    streams = [
-        (record for batch in source.batches(progress) for record in batch.records())
-        for source in sources
-    ]
-    return heapq.merge(*streams, key=lambda record: record.time_us)
 
 
 def read_column_map(path: Path) -> ColumnMap:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.recordings.anonymising import Anonymity
-from gateway.recordings.files import NO_RECORDING, FlightError, Progress, TlogSource
+from gateway.recordings.files import FlightError, Progress, TlogSource
 from gateway.recordings.merging import WINDOW_US, Alignment, Copies, batched, by_time
 from gateway.recordings.selection import FrameChoice, while_armed, within
 from gateway.recordings.senders import Senders
@@ -143,6 +143,18 @@ class TlogEditor:
 
     def apply(self, batches: Iterable[Batch], senders: Senders) -> Iterator[bytes]:
         """Yield the bytes of the new tlog; raises FlightError if nothing is left."""
+        total = 0
+        for batch in self.chosen(batches, senders):
+            total += len(batch)
+            yield self._edited(batch)
+        if total == self._left_out.total():
+            raise FlightError(NOTHING_LEFT)
+        for message_id, count in sorted(self._left_out.items()):
+            name = MESSAGE_NAMES.get(message_id, f"unknown message {message_id}")
+            self._remark(f"left out {counted(count, 'frame')} of {name}")
+
+    def chosen(self, batches: Iterable[Batch], senders: Senders) -> Iterator[Batch]:
+        """Yield the records that are kept, not edited; raises FlightError if nothing is left."""
         edits, total, kept = self._edits, 0, 0
 
         def all_records() -> Iterator[Batch]:
@@ -151,27 +163,17 @@ class TlogEditor:
                 total += len(batch)
                 yield batch
 
-        for batch in self.chosen(all_records(), senders):
+        cut: Iterable[Batch] = within(all_records(), self._limits)
+        if edits.armed_margin_s is not None:
+            cut = while_armed(cut, senders, edits.armed_margin_s)
+        for batch in map(edits.choice.apply, cut):
             kept += len(batch)
-            yield self._edited(batch)
-        kept -= self._left_out.total()
+            yield batch
         if not kept:
             is_cut = self._limits != (None, None) and edits.are_none
-            raise FlightError(
-                NO_RECORDING if not total else NOTHING_WITHIN if is_cut else NOTHING_LEFT
-            )
+            raise FlightError(NOTHING_WITHIN if is_cut else NOTHING_LEFT)
         if not edits.are_none:
             self._remark(f"kept {kept} of {counted(total, 'record')}")
-        for message_id, count in sorted(self._left_out.items()):
-            name = MESSAGE_NAMES.get(message_id, f"unknown message {message_id}")
-            self._remark(f"left out {counted(count, 'frame')} of {name}")
-
-    def chosen(self, batches: Iterable[Batch], senders: Senders) -> Iterator[Batch]:
-        """Yield the records that are kept, before they are edited."""
-        cut: Iterable[Batch] = within(batches, self._limits)
-        if self._edits.armed_margin_s is not None:
-            cut = while_armed(cut, senders, self._edits.armed_margin_s)
-        return map(self._edits.choice.apply, cut)
 
     def _edited(self, batch: Batch) -> bytes:
         shift_us = sum(edit.shift_us(batch) for edit in self._edits.frames)

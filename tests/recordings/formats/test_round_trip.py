@@ -133,7 +133,7 @@ def table_of(path: Path) -> list[TableRow]:
 def points_of(path: Path) -> int:
     """Count the points of the tracks that a map has to show."""
     flight = FlightToWrite([path], OPTIONS)
-    if flight.is_mavlink:
+    if flight.has_messages:
         tracks = tracks_of_messages(flight.vehicle_messages())
     else:
         table = flight.table()
