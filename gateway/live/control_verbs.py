@@ -24,6 +24,8 @@ from gateway.status import RecorderStatus
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
 
+MAX_FRAMES: Final = 200
+"""Of an answer: each has some 60 bytes, and a line of the control socket holds 64 kB."""
 MAX_SAMPLES: Final = 400
 """Between two requests: some seconds, and less than a line of the control socket may hold."""
 IDLE_US: Final = 5 * US_PER_S
@@ -180,6 +182,19 @@ def client_verbs(hub: Hub) -> Verbs:
         return hub.endpoints()
 
     return {"clients.list": hub.clients, "clients.add": add, "clients.remove": remove}
+
+
+def introduction_verb(introduction: Callable[[int], list[bytes]]) -> Verbs:
+    """Return the handler of `vehicle.introduction`: parameters, version and plans as frames."""
+
+    def get(vehicle_id: VehicleId, first: int = 0) -> list[bytes]:
+        try:
+            frames = introduction(vehicle_id)
+        except LookupError as error:
+            raise ControlError(f"the gateway has no aircraft {vehicle_id}") from error
+        return frames[first : first + MAX_FRAMES]
+
+    return {"vehicle.introduction": get}
 
 
 class ImuTap:

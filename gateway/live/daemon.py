@@ -23,7 +23,14 @@ from gateway.config import (
 )
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
-from gateway.live.control_verbs import ImuTap, RecorderVerbs, SerialVerbs, client_verbs, mark_verbs
+from gateway.live.control_verbs import (
+    ImuTap,
+    RecorderVerbs,
+    SerialVerbs,
+    client_verbs,
+    introduction_verb,
+    mark_verbs,
+)
 from gateway.live.kept_files import PlanFiles, TimestampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.other_gateways import conflicts, identity_verb, log_other_gateways
@@ -189,6 +196,7 @@ class Daemon:
             SerialVerbs(self._serial, is_simulated=self._receiver is not None).verbs(),
             client_verbs(self._hub),
             self._imu.verbs(),
+            introduction_verb(self._introduction),
         )
 
     def start(self) -> None:

@@ -4,7 +4,6 @@ The messages of its table follow its rows; HEARTBEAT, SYS_STATUS, HOME_POSITION 
 repeated. Before them are the modes, parameters and missions, as if a station had asked for them.
 """
 
-import math
 import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,8 +21,9 @@ from gateway.recordings.message_table import (
 )
 from gateway.recordings.tlog import Stamper, TlogRecord
 from gateway.records import NAN
-from gateway.units import DEGE7_PER_DEG, US_PER_S
+from gateway.units import US_PER_S
 from gateway.vehicle.encoding import Encoder
+from gateway.vehicle.plan import MISSION, Item, write_item
 
 UINT32: Final = 0xFFFFFFFF
 BEAT_US: Final = US_PER_S
@@ -79,16 +79,12 @@ class LoggedParameter:
 
 @dataclass(frozen=True, slots=True)
 class LoggedItem:
-    """An item of a mission."""
+    """An item of a mission, a fence, or rally points."""
 
     seq: int
     count: int
-    frame: int
-    command: int
-    params: tuple[float, float, float, float]
-    lat_deg: float
-    lon_deg: float
-    alt_m: float
+    item: Item
+    kind: int = MISSION
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +122,12 @@ class AutopilotLog:
     """The instance of a topic that is used where one is needed, if it is not the first."""
     parameters: Mapping[str, float | int] = field(default_factory=dict)
     """Those at its begin."""
+    defaults: Mapping[str, float] = field(default_factory=dict)
+    """Those of the firmware, where the log has them."""
     modes: Mapping[int, str] = field(default_factory=dict)
     """Names of the custom modes."""
-    mission: tuple[LoggedItem, ...] = ()
-    """That at its begin."""
+    plans: Mapping[int, tuple[LoggedItem, ...]] = field(default_factory=dict)
+    """The mission, fence and rally points at its begin, by kind."""
     is_armed: bool = False
     """At its begin."""
     custom_mode: int = 0
@@ -236,7 +234,7 @@ class RecordTranslator:
         self._beat_us: int | None = None
         self._own_us = 0
         self._is_armed, self._mode = log.is_armed, log.custom_mode
-        self._mission: dict[int, LoggedItem] = {item.seq: item for item in log.mission}
+        self._plans = {kind: {one.seq: one for one in plan} for kind, plan in log.plans.items()}
         self._numbers: dict[str, int] = {name: n for n, name in enumerate(log.parameters)}
         self._texts = 0
 
@@ -324,7 +322,7 @@ class RecordTranslator:
             case LoggedItem():
                 yield from self._item(event)
             case Current():
-                total = len(self._mission) or 0xFFFF
+                total = len(self._plans.get(MISSION, ())) or 0xFFFF
                 yield mavlink.MAVLink_mission_current_message(event.seq, total)
 
     def _change(self, event: LoggedParameter) -> Iterator[Any]:
@@ -361,8 +359,8 @@ class RecordTranslator:
             )
         for name, value in self._log.parameters.items():
             yield self._parameter(name, value)
-        if self._log.mission:
-            yield from self._whole_mission()
+        for kind in self._log.plans:
+            yield from self._whole_plan(kind)
 
     def _parameter(self, name: str, value: float) -> Any:
         """Encode a parameter; a whole number by its bytes, as PX4 does."""
@@ -388,28 +386,20 @@ class RecordTranslator:
             yield mavlink.MAVLink_statustext_message(event.severity, piece, self._texts, number)
 
     def _item(self, event: LoggedItem) -> Iterator[Any]:
-        """Process an item of a new mission, or of the one that is there; yield a complete one."""
-        if self._mission.get(event.seq) == event:
+        """Take in an item of a new plan, or of the one that is there; yield a complete one."""
+        known = self._plans.setdefault(event.kind, {})
+        if known.get(event.seq) == event:
             return
-        if event.seq == 0 or any(item.count != event.count for item in self._mission.values()):
-            self._mission = {}
-        if len(self._mission) < MAX_NAMES:
-            self._mission[event.seq] = event
-        wanted = range(event.count)
-        if event.count and all(seq in self._mission for seq in wanted):
-            self._mission = {seq: self._mission[seq] for seq in wanted}
-            yield from self._whole_mission()
+        if event.seq == 0 or any(one.count != event.count for one in known.values()):
+            known.clear()
+        if len(known) < MAX_NAMES:
+            known[event.seq] = event
+        if event.count and all(seq in known for seq in range(event.count)):
+            self._plans[event.kind] = {seq: known[seq] for seq in range(event.count)}
+            yield from self._whole_plan(event.kind)
 
-    def _whole_mission(self) -> Iterator[Any]:
-        items = self._mission.values()
-        yield mavlink.MAVLink_mission_count_message(0, 0, len(items), 0)
-        for item in items:
-            yield mavlink.MAVLink_mission_item_int_message(
-                0, 0, item.seq, item.frame, item.command, 0, 1, *item.params,
-                _whole(item.lat_deg * DEGE7_PER_DEG), _whole(item.lon_deg * DEGE7_PER_DEG),
-                item.alt_m, 0,
-            )  # fmt: skip
-
-
-def _whole(value: float) -> int:
-    return round(value) if math.isfinite(value) else 0
+    def _whole_plan(self, kind: int) -> Iterator[Any]:
+        plan = self._plans[kind]
+        yield mavlink.MAVLink_mission_count_message(0, 0, len(plan), kind)
+        for one in plan.values():
+            yield write_item(one.item, one.seq, kind, (0, 0), is_current=False)

@@ -8,14 +8,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from gateway.recordings.answers import AUTOPILOT_VERSION_ID, LogAnswers
-from gateway.recordings.extracts import FENCE, MISSION, RALLY, PlanItem, RecordedPlan
-from gateway.recordings.files import FlightError, Progress, open_tlog
+from gateway.recordings.answers import AUTOPILOT_VERSION_ID
+from gateway.recordings.extracts import RecordedPlan, parameter_text
+from gateway.recordings.files import FlightError
 from gateway.recordings.positions import GroundDistance
 from gateway.recordings.tlog import Batch
 from gateway.recordings.tlog_scan import TIME_SIZE
-from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
+from gateway.recordings.vehicle_reader import VehicleMessage
+from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.units import US_PER_S
+from gateway.vehicle.plan import FENCE, MISSION, RALLY, Item
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import SEQUENCE_V1, SEQUENCE_V2, START_V2
 
@@ -44,6 +46,15 @@ class Contents:
     """Items by kind, as text."""
     figures: dict[str, str] = field(default_factory=dict)
     texts: set[str] = field(default_factory=set)
+    is_flight: bool = False
+    defaults: dict[str, str] = field(default_factory=dict)
+    """Of parameters, where they are known."""
+    meanings: dict[str, str] = field(default_factory=dict)
+
+    def add_known(self, facts: Mapping[str, tuple[float, str]]) -> None:
+        """Take in the default and the meaning of parameters."""
+        self.defaults |= {name: parameter_text(value) for name, (value, _) in facts.items()}
+        self.meanings |= {name: meaning for name, (_, meaning) in facts.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +68,8 @@ class Comparison:
     """All of them, also equal ones."""
     texts: dict[str, tuple[str, str]]
     """Texts that only one side has."""
+    known: dict[str, tuple[str, str]]
+    """Default and meaning of the parameters that differ, where one of them is known."""
 
 
 def compare(first: Contents, second: Contents) -> Comparison:
@@ -66,20 +79,25 @@ def compare(first: Contents, second: Contents) -> Comparison:
         items = (dict(enumerate(side.plans[kind])) for side in (first, second))
         numbered = ({f"{kind} {number}": text for number, text in one.items()} for one in items)
         plans |= _differences(*numbered)
-    are_flights = bool(first.figures and second.figures)
+    are_flights = first.is_flight and second.is_flight
     figures = {
         name: (first.figures.get(name, ""), second.figures.get(name, ""))
-        for name in (first.figures | second.figures if are_flights else ())
+        for name in first.figures | second.figures
+        if are_flights or (name in first.figures and name in second.figures)
     }
     only = (first.texts - second.texts, second.texts - first.texts)
     texts = {text: (text, "") for text in sorted(only[0])}
     texts |= {text: ("", text) for text in sorted(only[1])}
+    parameters = _differences(first.parameters, second.parameters)
+    defaults, meanings = first.defaults | second.defaults, first.meanings | second.meanings
+    known = {name: (defaults.get(name, ""), meanings.get(name, "")) for name in parameters}
     return Comparison(
         (first.name, second.name),
-        _differences(first.parameters, second.parameters),
+        parameters,
         plans,
         figures,
         texts if are_flights else {},
+        {name: pair for name, pair in known.items() if any(pair)},
     )
 
 
@@ -106,15 +124,10 @@ def read_param_file(path: Path) -> Contents:
             value = float(text)
         except ValueError:
             continue
-        found.parameters[name] = single_text(value)
+        found.parameters[name] = parameter_text(value)
     if not found.parameters:
         raise FlightError(f"{path}: holds no parameters")
     return found
-
-
-def single_text(value: float) -> str:
-    """Return a value with the digits of a single-precision float."""
-    return f"{float(np.float32(value)):.7g}"
 
 
 class FlownFigures:
@@ -179,44 +192,45 @@ class FlownFigures:
             found["greatest vibration"] = f"{self.greatest_vibration_mps2:.1f} m/s2"
         if self.fewest_satellites is not None:
             found["fewest satellites"] = str(self.fewest_satellites)
-        share = self.lost / max(self.lost + self.received, 1)
-        found["lost frames"] = f"{self.lost} ({share:.2%})"
+        if self.received:
+            share = self.lost / (self.lost + self.received)
+            found["lost frames"] = f"{self.lost} ({share:.2%})"
         found["errors"] = str(self.errors)
         return found
 
 
-def read_recording(path: Path, system_id: int | None, progress: Progress) -> Contents:
-    """Read what is compared of a tlog; raises FlightError if it has no vehicle."""
-    source = open_tlog(path)
-    systems = source.senders.systems()
-    if not systems or (system_id is not None and system_id not in systems):
-        raise FlightError(f"{path}: no vehicle{f' {system_id}' if system_id else ''} in it")
-    chosen = system_id or systems[0]
-    sender = source.senders.vehicle(chosen)
-    answers, facts = LogAnswers(), FlownFigures()
-    reader = VehicleReader(source.senders, _IDS.values(), chosen, with_attitude=False)
-    first_us = last_us = 0
-    for batch in source.batches(progress):
-        if len(batch):
-            first_us, last_us = first_us or int(batch.time_us[0]), int(batch.time_us[-1])
-        answers.add(batch, source.senders)
-        facts.add_batch(batch, sender.origin)
+def read_recording(name: str, recording: VehicleRecording) -> Contents:
+    """Read what is compared of a recording; raises FlightError if it has no vehicle."""
+    facts, reader = FlownFigures(), recording.reader(_IDS.values())
+    last_us = 0
+    for batch in recording.batches():
+        last_us = int(batch.time_us[-1]) if len(batch) else last_us
+        if recording.flight.is_mavlink:
+            facts.add_batch(batch, reader.vehicle(recording.system_id or 0).origin)
         for message in reader.feed_batch(batch):
             facts.add(message)
     for message in reader.flush():
         facts.add(message)
-    plan = RecordedPlan(answers, sender)
+    found = contents_of(name, recording.plan())
+    found.figures |= facts.figures((last_us - recording.first_us) / US_PER_S)
+    found.texts, found.is_flight = facts.texts, True
+    defaults = recording.flight.defaults.items()
+    found.defaults = {name: parameter_text(value) for name, value in defaults}
+    return found
+
+
+def contents_of(name: str, plan: RecordedPlan) -> Contents:
+    """Return what is compared of the answers of a vehicle."""
     return Contents(
-        str(path),
-        {each.name: single_text(each.value) for each in plan.parameters()},
+        name,
+        {each.name: each.text for each in plan.parameters()},
         {name: [_item_text(item) for item in plan.items(kind)] for kind, name in KINDS.items()},
-        {**_versions(plan), **facts.figures((last_us - first_us) / US_PER_S)},
-        facts.texts,
+        _versions(plan),
     )
 
 
-def _item_text(item: PlanItem) -> str:
-    numbers = " ".join(f"{value:.7f}".rstrip("0").rstrip(".") for value in item.params)
+def _item_text(item: Item) -> str:
+    numbers = " ".join(f"{value:.7f}".rstrip("0").rstrip(".") for value in item.numbers)
     return f"command {item.command}, frame {item.frame}: {numbers}"
 
 
@@ -231,20 +245,28 @@ def _versions(plan: RecordedPlan) -> dict[str, str]:
     }
 
 
+def rows_of(found: Comparison, section: str) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return the headings and the rows of one section."""
+    rows: dict[str, tuple[str, str]] = getattr(found, section)
+    heads = (SECTIONS[section], *found.names)
+    if section != "parameters" or not found.known:
+        return heads, [(name, *pair) for name, pair in rows.items()]
+    more = ((name, *pair, *found.known.get(name, ("", ""))) for name, pair in rows.items())
+    return (*heads, "default", "meaning"), list(more)
+
+
 def as_html(found: Comparison) -> Iterator[str]:
     """Write a comparison as one page that needs nothing else."""
     title = html.escape(" and ".join(found.names))
     yield f'<!doctype html><meta charset="utf-8"><title>{title}</title>'
     yield "<style>body{font-family:sans-serif}td,th{text-align:left;padding:2px 12px}</style>"
-    for section, heading in SECTIONS.items():
+    for section in SECTIONS:
         yield f"<h2>{section.capitalize()}</h2>"
-        yield from _html_table((heading, *found.names), getattr(found, section))
+        yield from _html_table(*rows_of(found, section))
 
 
-def _html_table(heads: Iterable[str], rows: Mapping[str, tuple[str, str]]) -> Iterator[str]:
+def _html_table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
     yield "<table><tr>" + "".join(f"<th>{html.escape(head)}</th>" for head in heads) + "</tr>\n"
-    for name, pair in rows.items():
-        yield (
-            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in (name, *pair)) + "</tr>\n"
-        )
+    for row in rows:
+        yield "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>\n"
     yield "</table>\n"

@@ -194,6 +194,11 @@ class FlightToWrite:
         found = [*read, *self.fusions]
         return [*self._remarks, *(remark for source in found for remark in source.remarks)]
 
+    @property
+    def defaults(self) -> dict[str, float]:
+        """Default values of parameters that the logs of autopilots state, by name."""
+        return {name: value for log in self._logs for name, value in log.defaults.items()}
+
     def lacks(self, ending: str) -> str:
         """Return the content that a format cannot hold, once all is written; empty for none."""
         if self._logs and ending == ".tlog":

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.answers import (
@@ -23,18 +24,12 @@ from gateway.recordings.answers import (
     LogAnswers,
     VehicleAnswers,
 )
+from gateway.recordings.positions import Position, named_position
 from gateway.recordings.senders import RecordedSender
 from gateway.recordings.tlog import fields_of
-from gateway.units import DEGE7_PER_DEG
-from gateway.vehicle.plan import GLOBAL_FRAMES
-from gateway.wire.mavlink_messages import MESSAGE_IDS
-from gateway.wire.mavlink_splitter import message_id_of
+from gateway.vehicle.plan import FENCE, MISSION, RALLY, Item, read_item
 
 END_US: Final = 1 << 62
-LOCAL_SCALE: Final = 1e4
-"""Of x and y in a local frame of MISSION_ITEM_INT, per metre."""
-MISSION, FENCE, RALLY = 0, 1, 2
-"""MAV_MISSION_TYPE."""
 _INTEGERS: Final = {1: "<Bxxx", 2: "<bxxx", 3: "<Hxx", 4: "<hxx", 5: "<I", 6: "<i"}
 """How an integer lies in the four bytes of a value, by MAV_PARAM_TYPE."""
 POLYGONS: Final = {
@@ -60,31 +55,15 @@ class RecordedParameter:
 
     @property
     def text(self) -> str:
-        """Return the value with the fewest digits that give the same single-precision float."""
-        if self.value.is_integer() and abs(self.value) < 1 << 53:
-            return str(int(self.value))
-        digits = (f"{self.value:.{count}g}" for count in range(6, 10))
-        return next(
-            (one for one in digits if struct.pack("<f", float(one)) == _single(self.value)),
-            repr(self.value),
-        )
+        """Return the value as text; see `parameter_text`."""
+        return parameter_text(self.value)
 
 
-def _single(value: float) -> bytes:
-    return struct.pack("<f", value)
-
-
-@dataclass(frozen=True, slots=True)
-class PlanItem:
-    """One item of a mission, a fence, or rally points."""
-
-    seq: int
-    frame: int
-    command: int
-    current: int
-    autocontinue: int
-    params: tuple[float, ...]
-    """The seven; the last three are latitude and longitude in degrees, or metres, and height."""
+def parameter_text(value: float) -> str:
+    """Return a value with the fewest digits that give the same single-precision float."""
+    if value.is_integer() and abs(value) < 1 << 53:
+        return str(int(value))
+    return str(np.float32(value))
 
 
 class RecordedPlan:
@@ -103,24 +82,20 @@ class RecordedPlan:
             fields = fields_of(frame)
             value, kind = float(fields["param_value"]), fields["param_type"]
             if is_bytewise and kind in _INTEGERS:
-                value = float(struct.unpack(_INTEGERS[kind], _single(value))[0])
+                value = float(struct.unpack(_INTEGERS[kind], struct.pack("<f", value))[0])
             found.append(RecordedParameter(name, value, kind))
         return found
 
-    def items(self, kind: int) -> list[PlanItem]:
+    def items(self, kind: int) -> list[Item]:
         """Return the items of a mission, fence, or rally points; none if it was not recorded."""
-        return [_item_of(frame) for frame in self._answers.mission(kind) or ()]
+        read: Any = mavlink.MAVLink(None)
+        frames = self._answers.mission(kind) or ()
+        return [read_item(read.decode(bytearray(frame))) for frame in frames]
 
-    def home(self) -> tuple[float, float, float] | None:
-        """Return latitude and longitude in degrees and height above the sea of home."""
-        for frame in self._answers.frames(HOME_POSITION_ID):
-            fields = fields_of(frame)
-            return (
-                fields["latitude"] / DEGE7_PER_DEG,
-                fields["longitude"] / DEGE7_PER_DEG,
-                fields["altitude"] / 1e3,
-            )
-        return None
+    def home(self) -> Position | None:
+        """Return the position of home."""
+        fields = self.fields(HOME_POSITION_ID)
+        return None if fields is None else named_position(fields)
 
     def fields(self, message_id: int) -> dict[str, Any] | None:
         """Return the fields of the newest message of one type among the answers."""
@@ -129,25 +104,10 @@ class RecordedPlan:
 
     def _is_bytewise(self) -> bool:
         """Return whether integers are sent as their own bytes in place of a float."""
-        for frame in self._answers.frames(AUTOPILOT_VERSION_ID):
-            able = fields_of(frame)["capabilities"]
+        if (version := self.fields(AUTOPILOT_VERSION_ID)) is not None:
+            able = version["capabilities"]
             return bool(able & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
         return bool(self.heartbeat[1] == mavlink.MAV_AUTOPILOT_PX4)
-
-
-def _item_of(frame: bytes) -> PlanItem:
-    fields = fields_of(frame)
-    scale = 1.0
-    if message_id_of(frame) == MESSAGE_IDS["MISSION_ITEM_INT"]:
-        is_global = fields["frame"] in GLOBAL_FRAMES
-        is_global |= fields["frame"] == mavlink.MAV_FRAME_MISSION
-        scale = DEGE7_PER_DEG if is_global else LOCAL_SCALE
-    params = tuple(float(fields[f"param{number}"]) for number in range(1, 5))
-    at = (fields["x"] / scale, fields["y"] / scale, float(fields["z"]))
-    return PlanItem(
-        fields["seq"], fields["frame"], fields["command"], fields["current"],
-        fields["autocontinue"], (*params, *at),
-    )  # fmt: skip
 
 
 def param_file(parameters: Iterable[RecordedParameter]) -> Iterator[str]:
@@ -165,32 +125,33 @@ def qgc_params(parameters: Iterable[RecordedParameter], plan: RecordedPlan) -> I
         yield "\t".join(map(str, cells)) + "\n"
 
 
-def waypoints(items: Sequence[PlanItem]) -> Iterator[str]:
+def waypoints(items: Sequence[Item]) -> Iterator[str]:
     """Write items as a list of waypoints."""
     yield "QGC WPL 110\n"
     for number, item in enumerate(items):
-        numbers = (f"{value:.8f}" for value in item.params)
+        numbers = (f"{value:.8f}" for value in item.numbers)
         head = (number, int(number == 0), item.frame, item.command)
         yield "\t".join([*map(str, head), *numbers, str(item.autocontinue)]) + "\n"
 
 
 def qgc_plan(plan: RecordedPlan) -> str:
     """Write mission, fence and rally points as a plan of QGroundControl."""
-    items, home = plan.items(MISSION), plan.home()
+    items, at = plan.items(MISSION), plan.home()
+    home: tuple[float, ...] = (0, 0, 0) if at is None else (at.lat_deg, at.lon_deg, at.alt_amsl_m)
     is_ardupilot = plan.heartbeat[1] == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
     if is_ardupilot and items:
         # ArduPilot's first item is home.
-        home, items = (items[0].params[4], items[0].params[5], items[0].params[6]), items[1:]
+        home, items = items[0].numbers[4:], items[1:]
     mission = {
         "version": 2,
         "firmwareType": plan.heartbeat[1],
         "vehicleType": plan.heartbeat[0],
         "cruiseSpeed": CRUISE_MPS,
         "hoverSpeed": HOVER_MPS,
-        "plannedHomePosition": list(home or (0.0, 0.0, 0.0)),
+        "plannedHomePosition": list(home),
         "items": [_simple_item(item, number) for number, item in enumerate(items, 1)],
     }
-    rally = [list(item.params[4:]) for item in plan.items(RALLY)]
+    rally = [list(item.numbers[4:]) for item in plan.items(RALLY)]
     content = {
         "fileType": "Plan", "version": 1, "groundStation": "mavgate", "mission": mission,
         "geoFence": {"version": 2, **_fence(plan.items(FENCE))},
@@ -199,21 +160,21 @@ def qgc_plan(plan: RecordedPlan) -> str:
     return json.dumps(content, indent=4, allow_nan=False) + "\n"
 
 
-def _simple_item(item: PlanItem, number: int) -> Mapping[str, Any]:
-    params = [value if math.isfinite(value) else None for value in item.params]
+def _simple_item(item: Item, number: int) -> Mapping[str, Any]:
+    params = [value if math.isfinite(value) else None for value in item.numbers]
     return {
         "type": "SimpleItem", "doJumpId": number, "command": item.command, "frame": item.frame,
         "autoContinue": bool(item.autocontinue), "params": params,
     }  # fmt: skip
 
 
-def _fence(items: Sequence[PlanItem]) -> dict[str, Any]:
+def _fence(items: Sequence[Item]) -> dict[str, Any]:
     polygons: list[dict[str, Any]] = []
     circles: list[dict[str, Any]] = []
     found: dict[str, Any] = {"polygons": polygons, "circles": circles}
     left = 0
     for item in items:
-        at = list(item.params[4:6])
+        at = list(item.numbers[4:6])
         if item.command in POLYGONS:
             if not left:
                 left, inclusion = int(item.params[0]), POLYGONS[item.command]
@@ -224,5 +185,5 @@ def _fence(items: Sequence[PlanItem]) -> dict[str, Any]:
             circle = {"center": at, "radius": item.params[0]}
             circles.append({"version": 1, "inclusion": CIRCLES[item.command], "circle": circle})
         elif item.command == mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT:
-            found["breachReturn"] = list(item.params[4:])
+            found["breachReturn"] = list(item.numbers[4:])
     return found

@@ -60,8 +60,11 @@ PX4_AUTO_MODES: Final = {
     1: "READY", 2: "TAKEOFF", 3: "LOITER", 4: "MISSION", 5: "RTL", 6: "LAND", 8: "FOLLOW",
     9: "PRECLAND",
 }  # fmt: skip
-COPTERS: Final = frozenset((2, 3, 4, 13, 14, 15, 29, 35))
-ROVERS: Final = frozenset((10, 11))
+ARDUPILOT_MODES: Final = {
+    **dict.fromkeys((2, 3, 4, 13, 14, 15, 29, 35), "COPTER_MODE"),
+    **dict.fromkeys((10, 11), "ROVER_MODE"), 12: "SUB_MODE", 5: "TRACKER_MODE",
+}  # fmt: skip
+"""Enumeration of the modes by MAV_TYPE; of others it is that of aeroplanes."""
 
 
 class VehicleComponents:
@@ -248,17 +251,21 @@ class NewestState:
         beat = self.fields.get("HEARTBEAT") or self.fields.get("HIGH_LATENCY2")
         if beat is None:
             return ""
-        number, autopilot = beat["custom_mode"], beat["autopilot"]
-        if autopilot == mavlink.MAV_AUTOPILOT_PX4:
-            # HIGH_LATENCY2 has the upper half of it.
-            main, sub = (number >> 16, number >> 24) if "base_mode" in beat else (number, 0)
-            return PX4_AUTO_MODES.get(sub, "") or PX4_MODES.get(main & 0xFF, "")
-        if autopilot != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
-            return ""
-        words = "COPTER_MODE" if beat["type"] in COPTERS else "PLANE_MODE"
-        words = {True: "ROVER_MODE"}.get(beat["type"] in ROVERS, words)
-        entry = mavlink.enums[words].get(number)
-        return "" if entry is None else str(entry.name).removeprefix(f"{words}_")
+        # HIGH_LATENCY2 has the upper half of the mode of PX4.
+        is_half = "base_mode" not in beat and beat["autopilot"] == mavlink.MAV_AUTOPILOT_PX4
+        number = beat["custom_mode"] << 16 if is_half else beat["custom_mode"]
+        return mode_name(beat["autopilot"], beat["type"], number)
+
+
+def mode_name(autopilot: int, mav_type: int, number: int) -> str:
+    """Return the custom mode of a vehicle in the words of its autopilot; empty if unknown."""
+    if autopilot == mavlink.MAV_AUTOPILOT_PX4:
+        return PX4_AUTO_MODES.get(number >> 24, "") or PX4_MODES.get(number >> 16 & 0xFF, "")
+    if autopilot != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
+        return ""
+    words = ARDUPILOT_MODES.get(mav_type, "PLANE_MODE")
+    entry = mavlink.enums[words].get(number)
+    return "" if entry is None else str(entry.name).removeprefix(f"{words}_")
 
 
 def _accuracy_m(accuracy_mm: int) -> float:

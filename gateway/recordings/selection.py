@@ -1,4 +1,4 @@
-"""Records of a tlog that are kept: by sender, message, time, and while a vehicle is armed.
+"""Records of a tlog that are kept: by sender, message, time, and state of a vehicle.
 
 All of these take batches and return batches with fewer records; the frames stay as they are.
 """
@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, time_us_of
+from gateway.recordings.newest import mode_name
 from gateway.recordings.senders import Senders
 from gateway.recordings.tlog import HEARTBEAT_ID, Batch, columns_of
 from gateway.wire.mavlink_messages import MESSAGE_IDS
@@ -89,51 +90,70 @@ def within(
         yield batch.chosen((batch.time_us >= begin_us) & (batch.time_us <= end_us))
 
 
-class ArmedState:
-    """Whether any vehicle is armed, by the heartbeats of the autopilots."""
+@dataclass(frozen=True, slots=True)
+class StateChoice:
+    """The time while a vehicle is armed, or in one of some modes, and a margin on both sides."""
 
-    def __init__(self, senders: Senders) -> None:
-        self._senders = senders
-        self._armed: set[int] = set()
+    armed: bool = False
+    modes: frozenset[str] = frozenset()
+    """Names in capitals, or numbers as text; an empty set does not restrict."""
+    margin_s: float = 0.0
 
-    def armed(self, batch: Batch) -> BoolArray:
-        """Return for each record whether a vehicle is armed then."""
+    def includes(self, beat: Any) -> bool:
+        """Return whether the time after a heartbeat is chosen."""
+        number = int(beat["custom_mode"])
+        mode = mode_name(int(beat["autopilot"]), int(beat["type"]), number)
+        return (
+            not self.armed or bool(beat["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        ) and (not self.modes or not self.modes.isdisjoint((mode, str(number))))
+
+
+class ChosenState:
+    """Whether any vehicle is in a state, by the heartbeats of the autopilots."""
+
+    def __init__(self, senders: Senders, choice: StateChoice) -> None:
+        self._senders, self._choice = senders, choice
+        self._chosen: set[int] = set()
+
+    def during(self, batch: Batch) -> BoolArray:
+        """Return for each record whether a vehicle is in the state then."""
         found = np.empty(len(batch), np.bool_)
         rows = np.flatnonzero(batch.message_ids == HEARTBEAT_ID)
-        modes = columns_of(batch, rows, HEARTBEAT_ID)["base_mode"]
         at = 0
-        for row, mode in zip(rows.tolist(), modes.tolist(), strict=True):
+        for row, beat in zip(rows.tolist(), columns_of(batch, rows, HEARTBEAT_ID), strict=True):
             origin = int(batch.origins[row])
             if origin != self._senders.vehicle(origin >> 8).origin:
                 continue
-            found[at:row] = bool(self._armed)
+            found[at:row] = bool(self._chosen)
             at = row
-            if mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
-                self._armed.add(origin)
+            if self._choice.includes(beat):
+                self._chosen.add(origin)
             else:
-                self._armed.discard(origin)
-        found[at:] = bool(self._armed)
+                self._chosen.discard(origin)
+        found[at:] = bool(self._chosen)
         return found
 
 
-def while_armed(batches: Iterable[Batch], senders: Senders, margin_s: float) -> Iterator[Batch]:
-    """Yield the records while a vehicle is armed, and those of a margin before and after.
+def while_in_state(
+    batches: Iterable[Batch], senders: Senders, choice: StateChoice
+) -> Iterator[Batch]:
+    """Yield the records while a vehicle is in a state, and those of a margin before and after.
 
     Batches are held until their records are further back than the margin; raises ValueError if
     that is too long.
     """
-    if not 0.0 <= margin_s <= MAX_MARGIN_S:
-        raise ValueError(f"a margin of {margin_s:g} s; 0 to {MAX_MARGIN_S:g}")
-    state, margin_us = ArmedState(senders), math.ceil(margin_s * 1e6)
+    if not 0.0 <= choice.margin_s <= MAX_MARGIN_S:
+        raise ValueError(f"a margin of {choice.margin_s:g} s; 0 to {MAX_MARGIN_S:g}")
+    state, margin_us = ChosenState(senders, choice), math.ceil(choice.margin_s * 1e6)
     held: deque[tuple[Batch, BoolArray]] = deque()
     newest_us = _LONG_AGO_US
     for batch in batches:
         if not len(batch):
             yield batch
             continue
-        times, armed = batch.time_us, state.armed(batch)
-        before = np.maximum.accumulate(np.where(armed, times, newest_us))
-        after = np.minimum.accumulate(np.where(armed, times, _NEVER_US)[::-1])[::-1]
+        times, chosen = batch.time_us, state.during(batch)
+        before = np.maximum.accumulate(np.where(chosen, times, newest_us))
+        after = np.minimum.accumulate(np.where(chosen, times, _NEVER_US)[::-1])[::-1]
         newest_us = int(before[-1])
         first_us = int(after[0])
         for earlier, wanted in held:

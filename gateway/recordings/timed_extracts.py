@@ -3,13 +3,14 @@
 import csv
 import io
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.recordings.newest import mode_name
 from gateway.recordings.positions import GroundDistance
 from gateway.recordings.tlog import HEARTBEAT_ID
 from gateway.recordings.vehicle_reader import VehicleMessage
@@ -34,33 +35,14 @@ SUBTITLE_FIELDS: Final = ("mode", "height", "speed", "distance", "battery", "coo
 MAX_RATE_HZ: Final = 60.0
 MAX_GAP_US: Final = 5 * US_PER_S
 """A state that is older is not shown."""
-_MODES: Final = {
-    **dict.fromkeys((1, 19, 20, 21, 22, 23, 24, 25), "PLANE_MODE"),
-    **dict.fromkeys((2, 3, 4, 13, 14, 15, 29, 35), "COPTER_MODE"),
-    **dict.fromkeys((10, 11), "ROVER_MODE"), 12: "SUB_MODE", 5: "TRACKER_MODE",
-}  # fmt: skip
-"""Enumeration of ArduPilot's modes, by MAV_TYPE."""
-_PX4_MODES: Final = ("", "MANUAL", "ALTCTL", "POSCTL", "AUTO", "ACRO", "OFFBOARD", "STABILIZED")
-"""PX4's main modes, the third byte of the mode."""
-_PX4_AUTO: Final = ("AUTO", "READY", "TAKEOFF", "LOITER", "MISSION", "RTL", "LAND")
-"""Kinds of AUTO, the fourth byte."""
 _LANDED: Final = {1: "on the ground", 2: "in flight", 3: "taking off", 4: "landing"}
 """MAV_LANDED_STATE."""
 
 
-def mode_name(fields: Any) -> str:
+def _mode_of(fields: Any) -> str:
     """Return the mode in a heartbeat, by the autopilot's names or as a number."""
-    number = int(fields["custom_mode"])
-    if fields["autopilot"] == mavlink.MAV_AUTOPILOT_PX4:
-        main, sub = number >> 16 & 0xFF, number >> 24
-        if main == 4 and sub < len(_PX4_AUTO):
-            return _PX4_AUTO[sub]
-        return _PX4_MODES[main] if 0 < main < len(_PX4_MODES) else str(number)
-    enum = _MODES.get(fields["type"])
-    if fields["autopilot"] == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and enum is not None:
-        entry = mavlink.enums[enum].get(number)
-        return entry.name.removeprefix(f"{enum}_") if entry is not None else str(number)
-    return str(number)
+    number = fields["custom_mode"]
+    return mode_name(fields["autopilot"], fields["type"], number) or str(number)
 
 
 def moment_text(time_us: int) -> str:
@@ -105,7 +87,7 @@ def _event_values(message: VehicleMessage) -> list[tuple[str, str]]:
     fields = message.fields
     if message.message_id == HEARTBEAT_ID:
         is_armed = fields["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-        return [("armed", "yes" if is_armed else "no"), ("mode", mode_name(fields))]
+        return [("armed", "yes" if is_armed else "no"), ("mode", _mode_of(fields))]
     if message.message_id == LANDED_ID:
         return [("landed", _LANDED.get(fields["landed_state"], "unknown"))]
     if message.message_id == REACHED_ID:
@@ -158,7 +140,7 @@ class _Shown:
         self.newest_us = message.time_us
         fields, at = message.fields, message.position
         if message.message_id == HEARTBEAT_ID:
-            self.mode = mode_name(fields)
+            self.mode = _mode_of(fields)
         elif message.message_id == SYS_STATUS_ID:
             volts, percent = fields["voltage_battery"], fields["battery_remaining"]
             self.battery = f"{volts / 1e3:.1f} V" if volts not in (0, 0xFFFF) else ""
@@ -187,13 +169,15 @@ class Subtitle:
 
 def subtitles(
     messages: Iterable[VehicleMessage],
-    begin_us: int,
+    begin: Callable[[], int],
     names: Sequence[str] = SUBTITLE_FIELDS,
     rate_hz: float = 5.0,
 ) -> Iterator[Subtitle]:
-    """Yield the state of a vehicle at a rate; the video begins at `begin_us` of the recording."""
+    """Yield the state of a vehicle at a rate; `begin` returns when the video begins, in µs."""
     shown, step, number = _Shown(), US_PER_S / rate_hz, 0
+    begin_us: int | None = None
     for message in messages:
+        begin_us = begin() if begin_us is None else begin_us
         if message.text is not None:
             continue
         while begin_us + number * step <= message.time_us:

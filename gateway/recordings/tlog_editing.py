@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gateway.recordings.anonymising import Anonymity
 from gateway.recordings.files import FlightError, Progress, TlogSource
 from gateway.recordings.merging import WINDOW_US, Alignment, Copies, batched, by_time
-from gateway.recordings.selection import FrameChoice, while_armed, within
+from gateway.recordings.selection import FrameChoice, StateChoice, while_in_state, within
 from gateway.recordings.senders import Senders
 from gateway.recordings.tlog import Batch, encode_record
 from gateway.recordings.trimming import NOTHING_WITHIN, Limits
@@ -88,8 +88,8 @@ class TlogEdits:
     """The changes between the files that are read and the tlog that is written."""
 
     choice: FrameChoice = field(default_factory=FrameChoice)
-    armed_margin_s: float | None = None
-    """Keep only the time while a vehicle is armed, and so much before and after."""
+    state: StateChoice | None = None
+    """Keep only the time while a vehicle is in a state."""
     merge: bool | None = None
     """Leave out copies of frames that several files hold; by default if the files overlap."""
     frames: tuple[FrameEdit, ...] = ()
@@ -164,8 +164,8 @@ class TlogEditor:
                 yield batch
 
         cut: Iterable[Batch] = within(all_records(), self._limits)
-        if edits.armed_margin_s is not None:
-            cut = while_armed(cut, senders, edits.armed_margin_s)
+        if edits.state is not None:
+            cut = while_in_state(cut, senders, edits.state)
         for batch in map(edits.choice.apply, cut):
             kept += len(batch)
             yield batch

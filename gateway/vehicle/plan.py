@@ -52,6 +52,8 @@ FLOAT_FRAMES: Final = {
 }
 """The frames of MISSION_ITEM that correspond to those of integer coordinates."""
 KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally"}
+LOCAL_SCALE: Final = 1e4
+"""Of x and y of MISSION_ITEM_INT in a local frame, per metre."""
 
 
 def is_on_earth(lat_deg: float, lon_deg: float) -> bool:
@@ -179,6 +181,12 @@ class Item:
     y: int
     z: float
 
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The seven parameters of the command; a latitude and a longitude in degrees."""
+        scale = _scale(self.frame)
+        return (*self.params, self.x / scale, self.y / scale, self.z)
+
     def location(self, home_alt_m: float) -> Location | None:
         """Return its position, or None; 0, 0 means "here" to autopilots."""
         located = self.command in LOCATED_COMMANDS and self.frame in GLOBAL_FRAMES
@@ -192,7 +200,7 @@ def read_item(message: Any) -> Item:
     """Read an unchecked item from MISSION_ITEM_INT, or MISSION_ITEM with its floats in degrees."""
     x, y = message.x, message.y
     if message.get_type() == "MISSION_ITEM":
-        scale = DEGE7_PER_DEG if message.frame in GLOBAL_FRAMES else 1.0
+        scale = _scale(message.frame)
         x, y = (_integer(value * scale) for value in (x, y))
     params = (message.param1, message.param2, message.param3, message.param4)
     frame, command, autocontinue = message.frame, message.command, message.autocontinue
@@ -213,11 +221,18 @@ def write_item(
         return mavlink.MAVLink_mission_item_int_message(
             *target, sequence, item.frame, *fields, item.x, item.y, item.z, kind
         )
-    scale = DEGE7_PER_DEG if item.frame in GLOBAL_FRAMES else 1.0
+    scale = _scale(item.frame)
     frame = FLOAT_FRAMES.get(item.frame, item.frame)
     return mavlink.MAVLink_mission_item_message(
         *target, sequence, frame, *fields, item.x / scale, item.y / scale, item.z, kind
     )
+
+
+def _scale(frame: int) -> float:
+    """Return the unit of integer coordinates in a frame, per degree or metre."""
+    if frame in GLOBAL_FRAMES:
+        return DEGE7_PER_DEG
+    return 1.0 if frame == mavlink.MAV_FRAME_MISSION else LOCAL_SCALE
 
 
 def check_item(item: Item, kind: int) -> int:

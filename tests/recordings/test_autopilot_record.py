@@ -1,5 +1,6 @@
 """The record of an autopilot as MAVLink: its rows, state, parameters, mission and texts."""
 
+import json
 import math
 import struct
 from collections.abc import Sequence
@@ -203,6 +204,60 @@ def test_parameters_and_mission_are_answered_as_of_the_played_moment(tmp_path: P
                 (16, 473977000, 488.0),
                 (22, 0, 20.0),
             ]
+
+
+PLAN_FORMATS = FORMATS | {
+    "PARM": (129, "QNff", "TimeUS,Name,Value,Default"),
+    "FNCE": (147, "QBBBLLBf", "TimeUS,Tot,Seq,Type,Lat,Lng,Count,Radius"),
+    "RALY": (148, "QBBLLhB", "TimeUS,Tot,Seq,Lat,Lng,Alt,Flags"),
+}
+
+
+def write_with_plans(path: Path) -> Path:
+    corners = [(47.39, 8.54), (47.40, 8.54), (47.40, 8.55)]
+    plans = [
+        *(("FNCE", (BEGIN_US, 4, k, 98, *at, 3, 0.0)) for k, at in enumerate(corners)),
+        ("FNCE", (BEGIN_US, 4, 3, 92, 47.39, 8.54, 0, 150.0)),
+        ("RALY", (BEGIN_US, 1, 0, 47.391, 8.541, 30, 4)),
+    ]
+    parameters = [("PARM", (*row[1], 8.0)) for row in rows() if row[0] == "PARM"]
+    others = [row for row in rows() if row[0] != "PARM"]
+    return flown.write(path, flown.dataflash_of(PLAN_FORMATS, [*plans, *parameters[:3], *others]))
+
+
+def test_plans_texts_and_parameters_of_a_log_are_extracted(tmp_path: Path) -> None:
+    path, plan = write_with_plans(tmp_path / "flight.bin"), tmp_path / "flight.plan"
+    texts, params = tmp_path / "texts.csv", tmp_path / "flight.param"
+    run("extract", path, "--mission", plan, "--texts", texts, "--params", params)
+    found = json.loads(plan.read_text())
+    assert [one["command"] for one in found["mission"]["items"]] == [22]
+    ((polygon,), (circle,)) = found["geoFence"]["polygons"], found["geoFence"]["circles"]
+    assert polygon["polygon"] == [[47.39, 8.54], [47.4, 8.54], [47.4, 8.55]]
+    assert circle["circle"] == {"center": [47.39, 8.54], "radius": 150.0}
+    assert found["rallyPoints"]["points"] == [[47.391, 8.541, 30.0]]
+    assert "a text that is longer than the fifty bytes" in texts.read_text()
+    assert "BATT_CAPACITY,5000\n" in params.read_text()
+
+
+def test_diff_shows_the_defaults_that_a_log_states(tmp_path: Path) -> None:
+    path, other = write_with_plans(tmp_path / "flight.bin"), tmp_path / "other.param"
+    other.write_text("SYSID_THISMAV,7\nFRAME_CLASS,1\nBATT_CAPACITY,5000\n")
+    found = json.loads(run("diff", path, other, "--json"))
+    assert found["parameters"] == {"FRAME_CLASS": ["2", "1"]}
+    assert found["known"] == {"FRAME_CLASS": ["8", ""]}
+
+
+def test_map_shows_the_autopilots_own_positions_or_fused_ones(tmp_path: Path) -> None:
+    path = write(tmp_path / "flight.bin")
+    out = tmp_path / "flight.geojson"
+    run("convert", path, "-o", out)
+    lines = [
+        feature["geometry"]["coordinates"]
+        for feature in json.loads(out.read_text())["features"]
+        if feature["geometry"]["type"] == "LineString"
+    ]
+    assert [one[0][:2] for one in lines] == [[8.5455939, 47.3977418]]
+    assert "nothing to draw" in run("fuse", path, "-o", out, "--force", code=2)
 
 
 def test_units_of_the_log_go_before_those_of_the_table(tmp_path: Path) -> None:

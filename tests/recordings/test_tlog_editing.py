@@ -10,7 +10,13 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.files import FlightError, open_tlog
 from gateway.recordings.merging import MAX_SAMPLE, Alignment, FrameSample, batched
-from gateway.recordings.selection import MAX_MARGIN_S, FrameChoice, message_ids_of, while_armed
+from gateway.recordings.selection import (
+    MAX_MARGIN_S,
+    FrameChoice,
+    StateChoice,
+    message_ids_of,
+    while_in_state,
+)
 from gateway.recordings.senders import Senders
 from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.recordings.tlog_editing import Renumbering, TlogEdits
@@ -208,7 +214,7 @@ def test_cut_to_armed_time_keeps_the_margin_on_both_sides(
     data, scanner = make_tlog(records), TlogScanner()
     batches = [scanner.feed(data[at : at + piece]) for at in range(0, len(data), piece)]
     batches.append(scanner.feed(b"", final=True))
-    cut = while_armed(batches, senders_of(data), margin_s)
+    cut = while_in_state(batches, senders_of(data), StateChoice(armed=True, margin_s=margin_s))
     found = [(r.time_us - START_US) / SECOND_US for batch in cut for r in batch.records()]
     # The heartbeat that disarms ends the armed time, so that half a second of margin is left.
     expected = [
@@ -230,7 +236,8 @@ def test_armed_state_of_a_gimbal_or_a_station_does_not_count() -> None:
     records += [TlogRecord(START_US + k, other.pack(gimbal)) for k in range(1, 20)]
     data = make_tlog(records)
     batches = [TlogScanner().feed(data, final=True)]
-    assert sum(map(len, while_armed(batches, senders_of(data), 0.0))) == 0
+    cut = while_in_state(batches, senders_of(data), StateChoice(armed=True))
+    assert sum(map(len, cut)) == 0
 
 
 def test_armed_parts_are_cut_on_the_command_line(write: Write, tmp_path: Path) -> None:
@@ -238,6 +245,28 @@ def test_armed_parts_are_cut_on_the_command_line(write: Write, tmp_path: Path) -
     kept, _ = convert(path, "--while", "armed", "--margin", 2.5, folder=tmp_path)
     assert kept[0].time_us == START_US + 17_500_000
     assert kept[-1].time_us == START_US + 32 * SECOND_US
+
+
+@pytest.mark.parametrize(
+    ("options", "kept_s"),
+    [
+        (("--from-mode", "auto"), [10, 11, 30, 31]),
+        (("--from-mode", "AUTO", "--from-mode", "6"), [10, 11, 20, 21, 30, 31]),
+        (("--from-mode", "AUTO", "--while", "armed"), [30, 31]),
+    ],
+)
+def test_time_in_chosen_modes_is_kept(
+    write: Write, tmp_path: Path, options: tuple[str, ...], kept_s: list[int]
+) -> None:
+    """The modes of a copter are STABILIZE, AUTO (3) from 10 and 30 s, and RTL (6) from 20 s."""
+    modes, sender = {10: (0, 3), 20: (0, 6), 30: (128, 3)}, Sender()
+    records = []
+    for second in range(40):
+        armed, mode = modes.get(second // 2 * 2, (0, 0))
+        message = mavlink.MAVLink_heartbeat_message(2, 3, armed, mode, 4, 3)
+        records.append(TlogRecord(START_US + second * SECOND_US, sender.pack(message)))
+    kept, _ = convert(write(records), *options, folder=tmp_path)
+    assert [(one.time_us - START_US) // SECOND_US for one in kept] == kept_s
 
 
 def two_receivers(offset_us: int, *, loss: int = 7) -> tuple[list[TlogRecord], ...]:
@@ -381,7 +410,7 @@ def test_edits_that_change_nothing_are_recognised() -> None:
 
 def test_margin_out_of_range_is_refused() -> None:
     with pytest.raises(ValueError, match="margin"):
-        list(while_armed([], Senders(), MAX_MARGIN_S + 1))
+        list(while_in_state([], Senders(), StateChoice(margin_s=MAX_MARGIN_S + 1)))
 
 
 def test_empty_tlog_is_refused(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from gateway.output import write_new
 from gateway.recordings.anonymising import MAX_PLACE_DEG, Anonymiser, Anonymity
 from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.files import FlightError
-from gateway.recordings.selection import MAX_MARGIN_S, FrameChoice, message_ids_of
+from gateway.recordings.selection import MAX_MARGIN_S, FrameChoice, StateChoice, message_ids_of
 from gateway.recordings.tlog_editing import Renumbering, TlogEdits
 from gateway.wire.system_ids import LAST_ID
 
@@ -91,9 +91,18 @@ def convert(
     while_state: Annotated[
         Literal["armed"] | None, _option("--while", "Keep the time while a vehicle is armed.")
     ] = None,
+    modes: Annotated[
+        list[str] | None,
+        _option("--from-mode", "Keep the time while a vehicle is in this mode; may be repeated."),
+    ] = None,
     margin_s: Annotated[
         float,
-        _option("--margin", "Keep so much before and after --while, s.", min=0.0, max=MAX_MARGIN_S),
+        _option(
+            "--margin",
+            "Keep so much before and after --while and --from-mode, s.",
+            min=0.0,
+            max=MAX_MARGIN_S,
+        ),
     ] = 0.0,
     merge: Annotated[
         bool | None,
@@ -132,7 +141,7 @@ def convert(
     """
     edits = _read_edits(
         system, component, message, without, merge=merge, rename=rename,
-        margin_s=margin_s if while_state else None,
+        state=_read_state(while_state, modes or [], margin_s),
         anonymity=_read_anonymity(place, day, keep_unknown=keep_unknown, wanted=anonymise),
     )  # fmt: skip
     _check_edits(edits, output, message or [], system or [])
@@ -182,7 +191,7 @@ def _read_edits(
     *,
     merge: bool | None,
     rename: Sequence[str] | None,
-    margin_s: float | None,
+    state: StateChoice | None,
     anonymity: Anonymity | None,
 ) -> TlogEdits:
     """Read the options of a tlog that is made of tlogs; raises FlightError if one is invalid."""
@@ -193,7 +202,14 @@ def _read_edits(
         message_ids_of(without or ()),
     )
     frames = (Renumbering(_read_renames(rename)),) if rename else ()
-    return TlogEdits(choice, margin_s, merge, frames, anonymity)
+    return TlogEdits(choice, state, merge, frames, anonymity)
+
+
+def _read_state(state: str | None, modes: Sequence[str], margin_s: float) -> StateChoice | None:
+    if state is None and not modes:
+        return None
+    names = frozenset(mode.upper() for mode in modes)
+    return StateChoice(armed=state is not None, modes=names, margin_s=margin_s)
 
 
 def _read_anonymity(

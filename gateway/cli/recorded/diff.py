@@ -1,38 +1,56 @@
-"""`mavgate diff`: two recordings or parameter files, compared."""
+"""`mavgate diff`: two recordings, parameter files or running vehicles, compared."""
 
+import re
+from base64 import b64decode
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from gateway.cli.support.options import output_file
+from gateway.aircraft import Aircraft
+from gateway.cli.support.control import ask
+from gateway.cli.support.options import output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ForceOption,
     SystemOption,
+    print_remarks,
     progress_of,
     recorded_files,
 )
-from gateway.cli.support.terminal import JsonOption, console_of, print_json, refuse, table_of
+from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.output import check_output, write_new
+from gateway.recordings.answers import LogAnswers
 from gateway.recordings.comparison import (
     SECTIONS,
     Comparison,
     Contents,
     as_html,
     compare,
+    contents_of,
     read_param_file,
     read_recording,
+    rows_of,
 )
-from gateway.recordings.files import TLOG, FlightError, Progress, format_of
+from gateway.recordings.extracts import RecordedPlan
+from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.senders import AUTOPILOT, RecordedSender
+from gateway.recordings.vehicle_recording import VehicleRecording
 
 app = typer.Typer()
 
+LIVE = re.compile(r"live:(\d+)")
 PARAM_ENDINGS = (".param", ".params", ".parm")
 
 
 @app.command()
 def diff(
-    first: Annotated[Path, typer.Argument(help="Tlog, recording by name, or .param file.")],
+    first: Annotated[
+        Path,
+        typer.Argument(
+            help="Recording, log of an autopilot, .param file, or live:1 for an aircraft of the "
+            "running gateway."
+        ),
+    ],
     second: Annotated[Path, typer.Argument(help="The same, to compare with.")],
     *,
     page: Annotated[Path | None, output_file("Page to write.", (".html",), "--html")] = None,
@@ -40,14 +58,21 @@ def diff(
     system: SystemOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Compare recordings or parameter files: parameters, missions, figures, texts."""
-    files = [file for name in (first, second) for file in recorded_files([name], "tlogs")]
-    if len(files) > 2:
-        refuse("a recording of several parts is one file after `mavgate convert NAME -o ALL.tlog`")
+    """Compare recordings, parameter files or running vehicles: parameters, missions, texts."""
+    sides = [_files_of(name) for name in (first, second)]
+    files = [file for side in sides for file in side]
     if page is not None:
         check_output(page, files, overwrite=force)
     with progress_of(files) as advance:
-        found = compare(*(_read(file, system, advance) for file in files))
+        settings = read_settings()
+        options = read_options(settings, system_id=system, progress=advance)
+        names = zip((first, second), sides, strict=True)
+        both = [_read(str(name), side, options) for name, side in names]
+    metadata = Aircraft(1, settings.default_aircraft).vehicle.metadata
+    for one in both:
+        if metadata.describes(one.parameters):
+            one.add_known(metadata.of_parameters())
+    found = compare(*both)
     if page is not None:
         write_new(page, (each.encode() for each in as_html(found)), overwrite=force, inputs=files)
         console_of().print(str(page))
@@ -57,22 +82,40 @@ def diff(
         _show(found)
 
 
-def _read(file: Path, system: int | None, progress: Progress) -> Contents:
-    if file.suffix in PARAM_ENDINGS:
-        return read_param_file(file)
-    if format_of(file) != TLOG:
-        raise FlightError(f"{file}: is neither a tlog nor a file of parameters (.param)")
-    return read_recording(file, system, progress)
+def _files_of(name: Path) -> list[Path]:
+    return [] if LIVE.fullmatch(str(name)) else recorded_files([name], "tlogs")
+
+
+def _read(name: str, files: list[Path], options: ReadOptions) -> Contents:
+    if (live := LIVE.fullmatch(name)) is not None:
+        return _read_live(name, int(live[1]))
+    if files[0].suffix in PARAM_ENDINGS:
+        return read_param_file(files[0])
+    recording = VehicleRecording(files, options)
+    found = read_recording(str(files[0]), recording)
+    print_remarks(dict.fromkeys(recording.flight.remarks))
+    return found
+
+
+def _read_live(name: str, vehicle_id: int) -> Contents:
+    """Read the parameters, version and plans of an aircraft of the running gateway."""
+    answers = LogAnswers()
+    first, verb = 0, "vehicle.introduction"
+    while frames := ask(verb, {"vehicle_id": vehicle_id, "first": first}):
+        for frame in frames:
+            answers.add_frame(b64decode(frame), 0)
+        first += len(frames)
+    return contents_of(name, RecordedPlan(answers, RecordedSender(vehicle_id << 8 | AUTOPILOT)))
 
 
 def _show(found: Comparison) -> None:
-    for section, heading in SECTIONS.items():
-        rows: dict[str, tuple[str, str]] = getattr(found, section)
+    for section in SECTIONS:
+        (first, *heads), rows = rows_of(found, section)
         if not rows:
             continue
-        table = table_of(heading, *(Path(name).name for name in found.names), left=3)
-        for name, pair in rows.items():
-            table.add_row(name if section != "texts" else "", *pair)
+        table = table_of(first, *(Path(head).name for head in heads), left=5)
+        for name, *cells in rows:
+            table.add_row(name if section != "texts" else "", *cells)
         console_of().print(table)
     if not (found.parameters or found.plans or found.texts):
         console_of().print("no differences of parameters, missions and texts")

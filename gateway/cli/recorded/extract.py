@@ -1,15 +1,14 @@
 """`mavgate extract`: parameters, plans, texts, subtitles and geotags out of a recording."""
 
 import re
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 
-from gateway.cli.support.options import output_file
+from gateway.cli.support.options import output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ForceOption,
     SystemOption,
@@ -19,20 +18,9 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.output import check_output, write_new
-from gateway.recordings.answers import LogAnswers
-from gateway.recordings.extracts import (
-    FENCE,
-    MISSION,
-    RALLY,
-    RecordedPlan,
-    param_file,
-    qgc_params,
-    qgc_plan,
-    waypoints,
-)
-from gateway.recordings.files import TLOG, FlightError, Progress, TlogSource, format_of, open_tlog
-from gateway.recordings.moment import parse_moment, time_us_of
-from gateway.recordings.senders import Senders
+from gateway.recordings.extracts import RecordedPlan, param_file, qgc_params, qgc_plan, waypoints
+from gateway.recordings.files import FlightError
+from gateway.recordings.moment import Moment, parse_moment, time_us_of
 from gateway.recordings.timed_extracts import (
     MAX_RATE_HZ,
     SUBTITLE_FIELDS,
@@ -45,8 +33,9 @@ from gateway.recordings.timed_extracts import (
     subtitles,
     texts,
 )
-from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
+from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.units import US_PER_S
+from gateway.vehicle.plan import FENCE, MISSION, RALLY
 
 app = typer.Typer()
 
@@ -54,54 +43,6 @@ ITEMS: Final = (".waypoints", ".plan")
 VIDEO_TIME: Final = re.compile(r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)")
 """A time of begin in the name of a video, as cameras write it."""
 NAMES: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally points"}
-
-
-@dataclass(slots=True)
-class _Recording:
-    """The tlogs of a recording, and the vehicle that is read."""
-
-    sources: list[TlogSource]
-    senders: Senders
-    system_id: int
-    progress: Progress
-
-    def messages(self) -> Iterator[VehicleMessage]:
-        """Yield the messages of the vehicle."""
-        reader = VehicleReader(self.senders, WANTED, self.system_id, with_attitude=False)
-        for source in self.sources:
-            for batch in source.batches(self.progress):
-                yield from reader.feed_batch(batch)
-        yield from reader.flush()
-
-    def plan(self) -> RecordedPlan:
-        """Return its parameters and plans at the end."""
-        answers = LogAnswers()
-        for source in self.sources:
-            for batch in source.batches(self.progress):
-                answers.add(batch, self.senders)
-        return RecordedPlan(answers, self.senders.vehicle(self.system_id))
-
-    def first_us(self) -> int:
-        """Return the time of the first record."""
-        batches = (batch for source in self.sources for batch in source.batches())
-        return next((int(batch.time_us[0]) for batch in batches if len(batch)), 0)
-
-
-def _open(files: list[Path], system: int | None, progress: Progress) -> _Recording:
-    for file in files:
-        if format_of(file) != TLOG:
-            raise FlightError(f"{file}: is no tlog; `mavgate convert` makes one of it")
-    sources, senders = [open_tlog(file) for file in files], Senders()
-    for source in sources:
-        senders.merge(source.senders)
-    systems = senders.systems()
-    if system is None and len(systems) > 1:
-        raise FlightError(
-            f"several vehicles; choose one with --system: {', '.join(map(str, systems))}"
-        )
-    if not systems or (system is not None and system not in systems):
-        raise FlightError(f"{files[0]}: no vehicle{'' if system is None else f' {system}'} in it")
-    return _Recording(sources, senders, system or systems[0], progress)
 
 
 def _out(name: str, text: str, endings: tuple[str, ...]) -> Any:
@@ -158,33 +99,39 @@ def extract(
         check_output(path, files, overwrite=force)
     chosen = _read_fields(fields)
     with progress_of(files) as advance:
-        recording = _open(files, system, advance)
-        print_remarks(
-            f"{one.path}: {remark}" for one in recording.sources for remark in one.remarks
-        )
+        options = read_options(read_settings(), system_id=system, progress=advance)
+        recording = VehicleRecording(files, options)
         timed = ((text, texts), (event, events), (image, images))
         made: list[tuple[Path, Iterable[str]]] = [
-            (path, make(recording.messages())) for path, make in timed if path is not None
+            (path, make(recording.messages(WANTED))) for path, make in timed if path is not None
         ]
-        if any((params, mission, fence, rally)):
-            made += _plans(recording.plan(), params, (mission, fence, rally))
+        made += _plans(recording, (params, mission, fence, rally), is_read=bool(made))
         if subtitle is not None:
-            begin_us = _video_begin_us(recording.first_us(), offset, video)
-            shown = subtitles(recording.messages(), begin_us, chosen, rate_hz)
+            begin = _video_begin(offset, video)
+            shown = subtitles(
+                recording.messages(WANTED),
+                lambda: time_us_of(begin, recording.first_us), chosen, rate_hz,
+            )  # fmt: skip
             made.append((subtitle, srt(shown) if subtitle.suffix == ".srt" else ass(shown)))
         for path, pieces in made:
             encoded = (piece.encode() for piece in pieces)
             write_new(path, encoded, overwrite=force, inputs=files)
             console_of().print(str(path))
+    print_remarks(dict.fromkeys(recording.flight.remarks))
 
 
 def _plans(
-    plan: RecordedPlan, params: Path | None, items: Iterable[Path | None]
+    recording: VehicleRecording, paths: Sequence[Path | None], *, is_read: bool
 ) -> Iterator[tuple[Path, Iterable[str]]]:
     """Yield the files of parameters, mission, fence and rally points that are wanted."""
+    if not any(paths):
+        return
+    if not is_read:
+        recording.read()
+    plan, (params, *items) = recording.plan(), paths
     if params is not None:
         yield params, _params(params, plan)
-    for kind, path in enumerate(items):
+    for kind, path in zip((MISSION, FENCE, RALLY), items, strict=True):
         if path is not None:
             yield path, _items(path, plan, kind)
 
@@ -212,17 +159,17 @@ def _read_fields(text: str) -> list[str]:
     return names
 
 
-def _video_begin_us(first_us: int, offset: str | None, video: Path | None) -> int:
-    """Return when the video begins, on the clock of the recording; the offset is added."""
-    if video is not None:
-        first_us = _video_time_us(video)
-        print_remarks([f"{video}: begins at {moment_text(first_us)}"])
-    if offset is None:
-        return first_us
+def _video_begin(offset: str | None, video: Path | None) -> Moment:
+    """Return when the video begins, after the recording or in UTC; the offset is added."""
     try:
-        return time_us_of(parse_moment(offset), first_us)
+        begin = Moment(0.0) if offset is None else parse_moment(offset)
     except ValueError as error:
         raise FlightError(f"--offset: {error}") from error
+    if video is None or begin.time_us is not None:
+        return begin
+    video_us = _video_time_us(video)
+    print_remarks([f"{video}: begins at {moment_text(video_us)}"])
+    return Moment(time_us=time_us_of(begin, video_us))
 
 
 def _video_time_us(video: Path) -> int:

@@ -42,7 +42,9 @@ from gateway.recordings.formats.dataflash import (
 from gateway.recordings.message_table import MessageTable, read_table
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.records import NAN
-from gateway.units import US_PER_S
+from gateway.units import DEGE7_PER_DEG, US_PER_S
+from gateway.vehicle.encoding import int32
+from gateway.vehicle.plan import FENCE, MISSION, RALLY, Item
 
 ARMED, DISARMED = 10, 11
 """Ids of EV."""
@@ -50,11 +52,29 @@ ORIGIN, HOME = 0, 1
 """Types of ORGN."""
 INSTANCES: Final = ("I", "C", "Instance", "Inst", "IMU")
 """Columns with the number of a sensor, filter or battery."""
-EVENTS: Final = frozenset({"PARM", "MODE", "ARM", "EV", "STAT", "MSG", "CMD"})
+PLANS: Final = {"CMD": MISSION, "FNCE": FENCE, "RALY": RALLY}
+"""Messages with items of plans."""
+EVENTS: Final = frozenset({"PARM", "MODE", "ARM", "EV", "STAT", "MSG", *PLANS})
 """Messages with events at the begin of a log."""
 EARLY_US: Final = US_PER_S
 """A mode or armed state that is logged so soon holds from the begin of the log."""
 GLOBAL_RELATIVE: Final = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
+FENCE_COMMANDS: Final = {
+    92: mavlink.MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION,
+    93: mavlink.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION,
+    95: mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT,
+    97: mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
+    98: mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION,
+}
+"""By the type in FNCE."""
+CIRCLES: Final = {FENCE_COMMANDS[92], FENCE_COMMANDS[93]}
+RALLY_HAS_FRAME: Final = 4
+"""Bit of the flags in RALY; two bits above it are the frame."""
+RALLY_FRAMES: Final = {
+    0: mavlink.MAV_FRAME_GLOBAL,
+    1: GLOBAL_RELATIVE,
+    3: mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
+}
 _FIRMWARE: Final = re.compile(r"(Copter|Plane|Rover|Sub|Blimp|Tracker)\s*V\d", re.IGNORECASE)
 _FRAME_TYPES: Final = {
     1: mavlink.MAV_TYPE_QUADROTOR, 2: mavlink.MAV_TYPE_HEXAROTOR, 3: mavlink.MAV_TYPE_OCTOROTOR,
@@ -164,15 +184,17 @@ class RowReader:
             case "ERR":
                 why = f"Error of subsystem {m.Subsys}: code {m.ECode}"
                 return Text(mavlink.MAV_SEVERITY_WARNING, why)
-            case "CMD":
-                return self._item(m)
+            case "CMD" | "FNCE" | "RALY":
+                return self._item(name, m)
             case "MISE":
                 return Current(int(m.CNum))
         return None
 
-    def _item(self, m: Message) -> Event:
+    def _item(self, name: str, m: Message) -> Event:
         """Return an item; where it is in the mission already, the vehicle begins with it."""
-        item = _item_of(m)
+        item = _item_of(name, m)
+        if item.kind != MISSION:
+            return item
         if self._items.get(item.seq) == item and len(self._items) == item.count:
             return Current(item.seq)
         if len(self._items) >= item.count:
@@ -198,16 +220,30 @@ def _mode_of(m: Message) -> int | None:
     return None
 
 
-def _item_of(m: Message) -> LoggedItem:
+def _item_of(name: str, m: Message) -> LoggedItem:
+    """Return an item of a mission, a fence or rally points."""
+
     def get(name: str) -> float:
         # One NaN is equal to itself alone.
         value = float(getattr(m, name, 0.0))
         return NAN if math.isnan(value) else value
 
-    return LoggedItem(
-        int(m.CNum), int(m.CTot), int(getattr(m, "Frame", GLOBAL_RELATIVE)), int(m.CId),
-        (get("Prm1"), get("Prm2"), get("Prm3"), get("Prm4")), get("Lat"), get("Lng"), get("Alt"),
+    first, frame = get("Prm1"), int(getattr(m, "Frame", GLOBAL_RELATIVE))
+    if name == "FNCE":
+        command = FENCE_COMMANDS.get(m.Type, 0)
+        first = get("Radius") if command in CIRCLES else get("Count")
+        frame = mavlink.MAV_FRAME_GLOBAL
+    elif name == "RALY":
+        command, flags = mavlink.MAV_CMD_NAV_RALLY_POINT, int(getattr(m, "Flags", 0))
+        frame = RALLY_FRAMES.get(flags >> 3 & 3, frame) if flags & RALLY_HAS_FRAME else frame
+    else:
+        command = int(m.CId)
+    item = Item(
+        frame, command, 1, (first, get("Prm2"), get("Prm3"), get("Prm4")),
+        int32(get("Lat") * DEGE7_PER_DEG), int32(get("Lng") * DEGE7_PER_DEG), get("Alt"),
     )  # fmt: skip
+    seq, count = (m.CNum, m.CTot) if name == "CMD" else (m.Seq, m.Tot)
+    return LoggedItem(int(seq), int(count), item, PLANS[name])
 
 
 def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
@@ -228,6 +264,7 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
         counts=counts,
         units=_units_of(log),
         primary=sensors_of(log, damage) | dict(options.sensors),
+        defaults=dict(getattr(log, "param_defaults", {})),
     )
     _set_begin(path, found, _begin_of(log, damage))
     reader = RowReader(frozenset(unused))
@@ -298,16 +335,18 @@ def _set_begin(path: Path, found: AutopilotLog, entries: list[tuple[int, Event]]
     begin_us = entries[0][0] if entries else 0
     early_us = begin_us + EARLY_US
     parameters: dict[str, float | int] = {}
-    items: dict[int, dict[int, LoggedItem]] = {}
+    items: dict[tuple[int, int], dict[int, LoggedItem]] = {}
     for _, event in entries:
         if isinstance(event, LoggedParameter):
             parameters.setdefault(event.name, event.value)
         elif isinstance(event, LoggedItem):
-            items.setdefault(event.count, {}).setdefault(event.seq, event)
+            items.setdefault((event.kind, event.count), {}).setdefault(event.seq, event)
     found.parameters = parameters
-    whole = (known for count, known in items.items() if len(known) == count)
-    mission = next(whole, {})
-    found.mission = tuple(mission[seq] for seq in sorted(mission))
+    plans: dict[int, tuple[LoggedItem, ...]] = {}
+    for (kind, count), known in items.items():
+        if len(known) == count:
+            plans.setdefault(kind, tuple(known[seq] for seq in sorted(known)))
+    found.plans = plans
     modes = [event for time_us, event in entries if isinstance(event, Mode) and time_us <= early_us]
     found.custom_mode = modes[0].custom_mode if modes else 0
     armed = [(time_us, event) for time_us, event in entries if isinstance(event, Armed)]

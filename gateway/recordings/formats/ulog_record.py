@@ -36,6 +36,8 @@ from gateway.units import counted
 
 ARMED: Final = 2
 """arming_state of vehicle_status."""
+FIRMWARE: Final = 0
+"""Kind of default parameters: those of the firmware, for any vehicle."""
 STATUS: Final = "vehicle_status"
 GPS_TOPICS: Final = ("vehicle_gps_position", "sensor_gps")
 SHOWN: Final = (
@@ -98,7 +100,8 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
         counts=counts,
         unix_us_at_zero=None if boot_us is None else boot_us + zero_us,
         primary={name: number for kind, number in options.sensors for name in _named(kind)},
-        parameters=_parameters(log),
+        parameters=_parameters(log.initial_parameters),
+        defaults=_parameters(log.get_default_parameters(FIRMWARE)),
         modes={
             custom_mode_of(int(state)): name for state, (name, *_) in table().nav_states.items()
         },
@@ -146,10 +149,10 @@ def _type_of(log: Any, topics: Mapping[Instance, Topic]) -> int:
     return known if isinstance(known, int) and 0 <= known <= 255 else mavlink.MAV_TYPE_GENERIC
 
 
-def _parameters(log: Any) -> dict[str, float | int]:
+def _parameters(known: Mapping[str, Any]) -> dict[str, float | int]:
     return {
         name: value
-        for name, value in log.initial_parameters.items()
+        for name, value in known.items()
         if isinstance(value, int | float) and abs(value) < 1 << 31
     }
 

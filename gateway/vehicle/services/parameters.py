@@ -364,6 +364,13 @@ class Metadata:
         """Return whether parameters, at least one, are those of this version."""
         return bool(names) and set(names) <= self._table.parameters.keys()
 
+    def of_parameters(self) -> dict[str, tuple[float, str]]:
+        """Return the default and the meaning of each parameter, by name."""
+        return {
+            name: (one.to_number(one.field.default), _first_sentence(one.field.meaning))
+            for name, one in self._table.parameters.items()
+        }
+
     def announcement(self, now_us: int) -> Any:
         """Encode COMPONENT_METADATA."""
         uri = f"mftp://{self._general}".encode()

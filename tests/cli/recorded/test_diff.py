@@ -1,12 +1,17 @@
 """`mavgate diff`: recordings and parameter files."""
 
+import asyncio
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.aircraft import Aircraft, AircraftSettings
+from gateway.live.control_socket import ControlServer, socket_path
+from gateway.live.control_verbs import introduction_verb
 from gateway.recordings.tlog import TlogRecord
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender
@@ -111,3 +116,25 @@ def test_files_without_parameters_or_vehicle_are_refused(
     path.write_bytes(b"nothing\xff\n")
     assert "holds no parameters" in run("diff", flights[0], path, code=2)
     assert "no vehicle 9" in run("diff", *flights, "--system", 9, code=2)
+
+
+async def test_running_aircraft_is_compared_with_its_parameters_and_their_meaning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    vehicle = Aircraft(1, AircraftSettings()).vehicle
+    frames = [sent.frame for sent in vehicle.introduction()]
+    server = ControlServer(socket_path("run"), introduction_verb({1: frames}.__getitem__))
+    await server.start()
+    other = tmp_path / "other.param"
+    other.write_text("A,1\n")
+    try:
+        text = await asyncio.to_thread(run, "diff", "live:1", other, "--json")
+        refused = await asyncio.to_thread(partial(run, "diff", "live:2", other, code=2))
+    finally:
+        server.close()
+    found = json.loads(text)
+    assert found["names"] == ["live:1", str(other)]
+    assert found["parameters"].keys() - {"A"} == vehicle.metadata.of_parameters().keys()
+    assert all(meaning for _, meaning in found["known"].values())
+    assert "has no aircraft 2" in refused
