@@ -85,8 +85,7 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
     boot_us = _boot_us(topics)
     mav_type = _type_of(log, topics)
     events = _events_of(log, topics)
-    states = [event for _, event in events if isinstance(event, Mode)]
-    armed = [event for _, event in events if isinstance(event, Armed)]
+    first = {type(event): event for _, event in reversed(events)}
     odd = [f"left out {counted(dropped, 'row')} with an impossible time"] if dropped else []
     remarks = [*before.remarks, *damage_of(log, unread), *odd]
     return AutopilotLog(
@@ -105,8 +104,8 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
         modes={
             custom_mode_of(int(state)): name for state, (name, *_) in table().nav_states.items()
         },
-        is_armed=armed[0].is_armed if armed else False,
-        custom_mode=states[0].custom_mode if states else 0,
+        is_armed=getattr(first.get(Armed), "is_armed", False),
+        custom_mode=getattr(first.get(Mode), "custom_mode", 0),
         remarks=[f"{path}: {remark}" for remark in remarks],
     )
 
