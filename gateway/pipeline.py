@@ -310,11 +310,15 @@ class Pipeline:
             if each.received_us is not None:
                 each.received_us += stalled_us
 
-    def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> Outputs:
-        """Note whether a recording runs, or why not; this is announced."""
+    def on_recorder(
+        self, trouble: str, now_us: int, *, recording: bool, expected: bool = True
+    ) -> Outputs:
+        """Note whether a recording runs and should, or why not; this is announced."""
         out = Outputs()
         for each in self.aircraft.values():
-            found = each.vehicle.on_recorder(trouble, now_us, recording=recording)
+            found = each.vehicle.on_recorder(
+                trouble, now_us, recording=recording, expected=expected
+            )
             each.perform(found, now_us, out)
         return out
 

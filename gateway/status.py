@@ -25,6 +25,9 @@ class RecorderStatus:
     free_bytes: int
     reason: str
     folder: str
+    mode: str = "in_flight"
+    held_s: float = 0.0
+    """Time before arming that is held in memory, in the mode `armed`."""
 
 
 @dataclass(frozen=True, slots=True)

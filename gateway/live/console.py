@@ -196,6 +196,9 @@ def _recorder_line(recorder: RecorderStatus | None) -> list[Text]:
     free = f"{recorder.free_bytes / GB:.1f} GB free"
     if recorder.reason:
         return [Text(f"not recorded: {recorder.reason}", style="red")]
+    if recorder.held_s and recorder.state == "idle":
+        held = f"recorder waits for arming, {recorder.held_s:.0f} s in memory, {free}"
+        return [Text(held, style="dim")]
     if recorder.state != "recording":
         return [Text(f"recorder {recorder.state}, {free}", style="dim")]
     size = f"{recorder.part_bytes / MB:.1f} MB, {free}"

@@ -22,6 +22,7 @@ from gateway.config import (
     save_aircraft,
 )
 from gateway.hub.hub import Hub
+from gateway.live.armed_watch import VehicleLocations
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
 from gateway.live.control_verbs import (
     ImuTap,
@@ -180,6 +181,7 @@ class Daemon:
             self._announce,
             lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
             self._introduction,
+            self._locations,
         )
 
     def _make_control(self) -> ControlServer:
@@ -427,14 +429,34 @@ class Daemon:
         for vehicle_id in self._broken_plans.keys() & self._pipeline.aircraft.keys():
             # After its first heartbeat, before which ground stations ignore its messages.
             self._announce_plans(vehicle_id, self._broken_plans.pop(vehicle_id))
-        self._recorder.set_in_flight(self._pipeline.in_flight)
-        trouble, recording = self._recorder.trouble, self._recorder.recording
-        self._perform(self._pipeline.on_recorder(trouble, now_us, recording=recording))
+        self._note_recorder(now_us)
         wait_s = (self._pipeline.next_due_us() - now_us) / US_PER_S
         wait_s = min(max(wait_s, SHORTEST_WAIT_S), LONGEST_WAIT_S)
         self._timer.cancel()
         self._timer = loop.call_later(wait_s, self._poll)
         self._lag.expect(self.now_us() + round(wait_s * US_PER_S))
+
+    def _note_recorder(self, now_us: int) -> None:
+        """Exchange with the recorder whether to record, and whether it does."""
+        vehicles = [each.vehicle for each in self._pipeline.aircraft.values()]
+        recorder = self._recorder
+        recorder.set_in_flight(
+            in_flight=self._pipeline.in_flight, operates=any(each.operates for each in vehicles)
+        )
+        self._perform(
+            self._pipeline.on_recorder(
+                recorder.trouble, now_us, recording=recorder.recording, expected=recorder.expected
+            )
+        )
+
+    def _locations(self) -> VehicleLocations:
+        """Return the homes of the aircraft."""
+        return {
+            vehicle_id: None
+            if (home := each.vehicle.telemetry.home) is None
+            else (home.location.lat_deg, home.location.lon_deg)
+            for vehicle_id, each in self._pipeline.aircraft.items()
+        }
 
     def _watch_loop(self, now_us: int) -> None:
         """Report once that the event loop is starved, and excuse the nodes for a stall."""

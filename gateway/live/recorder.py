@@ -16,12 +16,15 @@ synced less often.
 import asyncio
 import contextlib
 import logging
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
+from typing import Final
 
 import msgspec
 
+from gateway.live.armed_watch import ArmedWatch, VehicleLocations, label_of
 from gateway.live.kept_files import begin_worker, done_by
 from gateway.live.part import PENDING_LIMIT, Part
 from gateway.live.part_files import DiskState, PartFiles, close_behind, free_bytes_near, reason_of
@@ -35,6 +38,7 @@ from gateway.live.session import (
     Session,
     SessionAction,
     SessionState,
+    session_name,
 )
 from gateway.output import sync_folder
 from gateway.recordings.index import RecordingError, find_recording, move_recording, part_of
@@ -45,6 +49,10 @@ from gateway.status import RecorderStatus
 from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
+HELD_US: Final = 30 * US_PER_S
+"""In the mode `armed` at least so much before arming is recorded, at most twice as much."""
+HELD_BYTES: Final = PENDING_LIMIT // 4
+"""Most of a stretch that is held, but for one turn: faster telemetry is held for less time."""
 
 
 class Recorder:
@@ -64,6 +72,8 @@ class Recorder:
     introduction_of : callable
         Returns the frames of a vehicle that every part begins with: version, modes, parameters,
         missions, home.
+    vehicles_of : callable
+        Returns latitude and longitude of the homes of own aircraft, or None, by id.
     """
 
     def __init__(
@@ -75,16 +85,21 @@ class Recorder:
         announce: Callable[[bool, str], None],
         state_of: Callable[[int], FusionState | None] = lambda _: None,
         introduction_of: Callable[[int], list[bytes]] = lambda _: [],
+        vehicles_of: Callable[[], VehicleLocations] = dict,
     ) -> None:
         self._settings = settings
         self._clock, self._machine_us = now_us, unix_us
         self._header_of = header_of
         self._announce = announce
         self._state_of, self._introduction_of = state_of, introduction_of
+        self._vehicles_of = vehicles_of
         self._session = Session(settings)
         self._civil = CivilClock()
         self._seen: set[int] = set()
         self._part: Part | None = None
+        self._memory: deque[tuple[int, Part]] = deque()
+        """What is held before arming, twice: since its begin, and since half of its length."""
+        self._watch = ArmedWatch() if settings.mode == "armed" else None
         self._files: PartFiles | None = None
         self._disk = DiskState(0, 0)
         self._sync_due_us = 0
@@ -105,6 +120,7 @@ class Recorder:
         """Start; needs a running event loop."""
         clear_copies(self.folder)
         self._civil.update_machine(self._machine_us(), self._clock())
+        self._hold()
         if self._session.wanted:
             # Nothing runs yet that could be delayed, and a table should begin with the estimator's
             # first sample.
@@ -146,14 +162,16 @@ class Recorder:
         self._session.stop()
         self._wake.set()
 
-    def set_in_flight(self, in_flight: bool) -> None:
-        """Note take-off or landing."""
+    def set_in_flight(self, *, in_flight: bool, operates: bool) -> None:
+        """Note whether an own aircraft is in flight, and whether one is armed."""
+        if self._watch is not None:
+            in_flight = operates or self._watch.is_armed(self._clock(), self._seen)
         self._session.set_in_flight(in_flight)
 
     def mark(self, text: str) -> bool:
         """Send a note, and add it to the recording at this moment; return whether one runs."""
-        if self._part is not None:
-            self._part.add_mark(TableMark(self._clock(), text))
+        for part in self._parts():
+            part.add_mark(TableMark(self._clock(), text))
         self._announce(False, REMARK + text)
         return self._part is not None
 
@@ -188,7 +206,14 @@ class Recorder:
             free_bytes=disk.free_bytes,
             reason=session.reason,
             folder=str(self.folder),
+            mode=self._settings.mode,
+            held_s=(self._clock() - self._memory[0][0]) / US_PER_S if self._memory else 0.0,
         )
+
+    @property
+    def expected(self) -> bool:
+        """Whether a user expects a recording now."""
+        return self._session.expected
 
     @property
     def trouble(self) -> str:
@@ -202,42 +227,84 @@ class Recorder:
 
     def frame(self, frame: bytes) -> None:
         """Record a MAVLink frame that was sent or received."""
-        if self._part is not None and self._settings.tlog:
-            self._part.add_frame(frame, self._clock())
+        now_us = self._clock()
+        if self._watch is not None:
+            self._watch.feed(frame, now_us)
+        for part in self._parts() if self._settings.tlog else ():
+            part.add_frame(frame, now_us)
 
     def flight(self, record: BaroRaw | GpsFix | FusedSample | NodeStatus) -> None:
         """Record a sample of the estimator, or the resulting state."""
-        part = self._part
         if isinstance(record, FusedSample):
             vehicle_id = record.vehicle_id
         else:
             vehicle_id = record.node.vehicle_id
             if isinstance(record, GpsFix) and record.utc_us is not None:
                 self._civil.update_gps(vehicle_id, record.utc_us, record.time_us)
-        if part is not None and part.introduces(vehicle_id):
-            for frame in self._introduction_of(vehicle_id):
-                self.frame(frame)
-        if part is not None and self._settings.table:
-            if not part.has_table(vehicle_id):
-                part.prepare_table(self._header(vehicle_id, part))
-            part.add_flight(vehicle_id, record)
+        for part in self._parts():
+            if self._settings.tlog and part.introduces(vehicle_id):
+                for frame in self._introduction_of(vehicle_id):
+                    part.add_frame(frame, self._clock())
+            if self._settings.table:
+                if not part.has_table(vehicle_id):
+                    part.prepare_table(self._header(vehicle_id, part))
+                part.add_flight(vehicle_id, record)
         self._seen.add(vehicle_id)
 
     def settings_changed(self, vehicle_id: int) -> None:
         """Note that the following samples are fused with other settings, in a new header line."""
-        if self._part is not None and self._part.has_table(vehicle_id):
-            self._part.change_settings(self._header(vehicle_id, self._part))
+        for part in self._parts():
+            if part.has_table(vehicle_id):
+                part.change_settings(self._header(vehicle_id, part))
+
+    def _parts(self) -> list[Part]:
+        """Return the part that is written; while none is, those in memory."""
+        return [part for _, part in self._memory] if self._part is None else [self._part]
+
+    def _hold(self) -> None:
+        """Discard what is too old in memory, or too much, and begin to hold the next stretch."""
+        if self._watch is None:
+            return
+        if self._part is not None or any(p.stamper.has_jumped(self._civil) for p in self._parts()):
+            self._memory.clear()
+        now_us = self._clock()
+        begin_us, newest = self._memory[-1] if self._memory else (now_us - HELD_US, None)
+        is_full = newest is not None and newest.size > HELD_BYTES
+        if self._part is None and (now_us - begin_us >= HELD_US or is_full):
+            begun = session_name(now_us + (self._civil.offset_us or 0))
+            self._memory.append((now_us, self._begin_part(begun, 1)))
+        while len(self._memory) > 2:
+            self._memory.popleft()
 
     def _new_part(self, session: str, number: int) -> Part:
-        """Start buffering for a part; later, the fusion would be ahead of its first row."""
-        part = Part(session, number, self._civil.offset_us or 0)
+        """Start buffering for a part, the first of a session with what is held in memory."""
         if number == 1:
             self._offsets.clear()
+        if number == 1 and self._memory:
+            part = self._memory[0][1]
+            part.session = session
+        else:
+            part = self._begin_part(session, number)
+        self._memory.clear()
         self._offsets[number] = part.stamper.offset_us
+        return part
+
+    def _begin_part(self, session: str, number: int) -> Part:
+        """Start buffering for a part; later, the fusion would be ahead of its first row."""
+        part = Part(session, number, self._civil.offset_us or 0)
         if self._settings.table:
             for vehicle_id in self._seen:
                 part.prepare_table(self._header(vehicle_id, part), self._state_of(vehicle_id))
         return part
+
+    def _label_of(self) -> str:
+        """Return what follows the time in the name of a recording that begins now."""
+        if self._settings.name == "time":
+            return ""
+        known = self._vehicles_of()
+        if self._watch is not None:
+            known = self._watch.vehicles(self._clock()) | known
+        return label_of(known, with_place=self._settings.name == "place")
 
     def _header(self, vehicle_id: int, part: Part) -> TableHeader:
         return msgspec.structs.replace(
@@ -264,15 +331,18 @@ class Recorder:
         """Write the buffered bytes, then let the session decide."""
         self._civil.update_machine(self._machine_us(), self._clock())
         actions = await self._flush()
+        self._hold()
         if not actions:
             now_us, disk = self._clock(), self._disk
             part = self._part
+            begin_us = self._memory[0][0] if self._memory else now_us
             actions = self._session.poll(
                 now_us,
-                now_us + (self._civil.offset_us or 0),
+                begin_us + (self._civil.offset_us or 0),
                 disk.part_bytes,
                 disk.free_bytes,
                 jumped=part is not None and part.stamper.has_jumped(self._civil),
+                label=self._label_of(),
             )
         while actions:
             actions = await self._perform(actions)

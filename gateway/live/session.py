@@ -38,7 +38,10 @@ RESUME_LEAST_MB: Final = 1.0
 PART_DIGITS: Final = 2
 
 
-Mode = Literal["manual", "in_flight", "always"]
+Mode = Literal["manual", "in_flight", "armed", "always"]
+NameStyle = Literal["time", "vehicle", "place"]
+AFTER_US: Final = 10 * US_PER_S
+"""In the mode `armed` a recording goes on for so long after disarming."""
 
 
 class RecordingSettings(Settings, frozen=True):
@@ -47,10 +50,18 @@ class RecordingSettings(Settings, frozen=True):
     mode: Annotated[
         Mode,
         setting(
-            "manual: on command only; in_flight: from arming or take-off to landing; always: as "
+            "manual: on command only; in_flight: from arming or take-off to landing; armed: from "
+            "at least 30 s before arming, out of memory, to 10 s after disarming; always: as "
             "long as the gateway runs."
         ),
     ] = "in_flight"
+    name: Annotated[
+        NameStyle,
+        setting(
+            "Name of a recording: time of its begin; vehicle: and the ids of its vehicles; place: "
+            "and where the first of them is then."
+        ),
+    ] = "time"
     folder: Annotated[
         str, setting("Folder of the recordings; created if it does not exist.", path=True)
     ] = "~/mavgate/recordings"
@@ -162,6 +173,9 @@ class Session:
         self.reason = ""
         """Why it is blocked."""
         self._begin_us = self._end_us = 0
+        self._until_us = 0
+        """End of the time after disarming."""
+        self._is_after = False
 
     @property
     def duration_s(self) -> float:
@@ -174,7 +188,12 @@ class Session:
         if self._asked is not None:
             return self._asked
         mode = self._settings.mode
-        return mode == "always" or (mode == "in_flight" and self._in_flight)
+        return mode == "always" or (mode != "manual" and (self._in_flight or self._is_after))
+
+    @property
+    def expected(self) -> bool:
+        """Whether a user expects a recording now: in the mode `armed` not while disarmed."""
+        return self.wanted or self._settings.mode != "armed"
 
     def start(self) -> None:
         """Start on a user's request; a blocked recording is retried at once."""
@@ -187,7 +206,10 @@ class Session:
         self._asked = False
 
     def set_in_flight(self, in_flight: bool) -> None:
-        """Note take-off or landing; a take-off cancels an earlier request to stop."""
+        """Note take-off or landing, in the mode `armed` arming or disarming.
+
+        A take-off cancels an earlier request to stop.
+        """
         if in_flight and not self._in_flight and self._asked is False:
             self._asked = None
         self._in_flight = in_flight
@@ -220,12 +242,22 @@ class Session:
         ]
 
     def poll(
-        self, now_us: int, unix_us: int, part_bytes: int, free_bytes: int, *, jumped: bool = False
+        self,
+        now_us: int,
+        unix_us: int,
+        part_bytes: int,
+        free_bytes: int,
+        *,
+        jumped: bool = False,
+        label: str = "",
     ) -> list[SessionAction]:
-        """Return the actions that are due."""
+        """Return the actions that are due; `label` follows the time in the name of a session."""
+        if self._in_flight and self._settings.mode == "armed":
+            self._until_us = now_us + AFTER_US
+        self._is_after = now_us < self._until_us
         match self.state:
             case SessionState.IDLE if self.wanted:
-                self.name, self.part = session_name(unix_us), 0
+                self.name, self.part = session_name(unix_us) + label, 0
                 self._corrected = False
                 if self._is_short(free_bytes):
                     return self._stop_short(now_us)

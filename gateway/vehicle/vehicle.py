@@ -186,6 +186,12 @@ class Vehicle:
         """Whether the aircraft is in flight."""
         return self.telemetry.motion.landed_state == IN_AIR
 
+    @property
+    def operates(self) -> bool:
+        """Whether its autopilot reports it armed; without one, whether it is in flight."""
+        reported = self.health.reported.armed
+        return self.in_flight if reported is None else reported
+
     def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Action]:
         """Take in the estimate for one IMU sample."""
         self.health.on_state(state, sample)
@@ -344,9 +350,11 @@ class Vehicle:
         for service in self._timed:
             service.remove_client(client_id)
 
-    def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
-        """Note whether a recording runs, or why not; the armed bit may follow it."""
-        self.health.recording = recording
+    def on_recorder(
+        self, trouble: str, now_us: int, *, recording: bool, expected: bool = True
+    ) -> list[Action]:
+        """Note whether a recording runs and should, or why not; the armed bit may follow it."""
+        self.health.recording, self.health.recording_expected = recording, expected
         return self._finish(self._recording.update(trouble, now_us, recording=recording))
 
     def on_saved(self, request: Request, text: str, now_us: int, *, stored: bool) -> list[Action]:

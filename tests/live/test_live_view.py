@@ -209,6 +209,10 @@ def test_wide_terminal_shows_clients_next_to_the_aircraft() -> None:
     ("recorder", "text"),
     [
         (replace(WELL_KNOWN.recorder, state="idle"), "recorder idle, 4.1 GB free"),
+        (
+            replace(WELL_KNOWN.recorder, state="idle", mode="armed", held_s=41.6),
+            "recorder waits for arming, 42 s in memory, 4.1 GB free",
+        ),
         (replace(WELL_KNOWN.recorder, reason="disk is full"), "not recorded: disk is full"),
     ],
 )

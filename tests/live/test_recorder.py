@@ -8,17 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.live.part import PENDING_LIMIT
 from gateway.live.part_files import PartFiles
-from gateway.live.recorder import Recorder
-from gateway.live.session import RETRY_US, RecordingSettings
+from gateway.live.recorder import HELD_BYTES, Recorder
+from gateway.live.session import RETRY_US, RecordingSettings, session_name
 from gateway.recordings.columns import TableRow
 from gateway.recordings.index import RecordingError, list_recordings
 from gateway.recordings.table import TableHeader, TableMark, TableReader
 from gateway.records import FusedSample, FusionState
 from gateway.wire.timesync import ENOUGH
 from tests.conftest import ManualClock
+from tests.kit.mavlink import Sender
 from tests.recordings.frames import make_frames, read_tlog
 from tests.recordings.samples import make_baro, make_flight, make_fused
 
@@ -84,6 +86,70 @@ async def test_every_frame_is_in_the_tlog_at_its_time(bench: Bench) -> None:
     for i, record in enumerate(records):
         assert 0 <= UNIX_US + begin_us + 1000 * (i + 1) - record.time_us < 4
     assert bench.announced == [(False, f"Recording {NAME}")]
+
+
+def heartbeat(sender: Sender, *, armed: bool) -> bytes:
+    mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
+    return sender.pack(mavlink.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3))
+
+
+async def test_armed_mode_records_from_memory_before_arming_to_ten_seconds_after_disarming(
+    tmp_path: Path, clock: ManualClock
+) -> None:
+    bench, sender = Bench(tmp_path / "recordings", clock, mode="armed", name="place"), Sender(7, 1)
+    recorder, files = bench.recorder, []
+    try:
+        for second in range(230):
+            # Armed from 100 to 120 and from 170 to 190 s; turned on every second.
+            armed = 100 <= second < 120 or 170 <= second < 190
+            position = mavlink.MAVLink_global_position_int_message(
+                0, -353_632_621, 1_491_652_374, 0, 0, 0, 0, 0, 0
+            )
+            bench.send([heartbeat(sender, armed=armed), sender.pack(position)])
+            recorder.set_in_flight(in_flight=False, operates=False)
+            assert recorder.expected == (recorder.status().state == "recording" or armed)
+            await bench.turn(0.998)
+            assert recorder.status().held_s <= 61.0
+            if second == 99:
+                assert not list(tmp_path.rglob("*.tlog"))
+                assert recorder.status().held_s >= 30.0
+        await bench.turn(20.0)
+        files = sorted(tmp_path.rglob("*.tlog"))
+    finally:
+        recorder.close()
+    assert [path.name[15:] for path in files] == ["-v7-35.3633S-149.1652E_01.tlog"] * 2
+    for path, (begin_s, end_s) in zip(files, ((100, 130), (170, 200)), strict=True):
+        times_s = [(record.time_us - UNIX_US) / 1e6 for record in read_tlog(path)]
+        assert begin_s - 61 <= times_s[0] <= begin_s - 29
+        assert end_s - 1.5 <= times_s[-1] <= end_s + 2
+        assert max(np.diff(times_s)) < 1.1
+        assert path.name.startswith(session_name(read_tlog(path)[0].time_us - 500_000)[:11])
+
+
+async def test_armed_bit_of_own_aircraft_and_its_memory_are_bounded(
+    tmp_path: Path, clock: ManualClock, rng: np.random.Generator
+) -> None:
+    bench = Bench(tmp_path / "recordings", clock, mode="armed")
+    try:
+        await bench.turn()
+        for record in make_flight(rng, 5):
+            bench.recorder.flight(record)
+        bench.send([heartbeat(Sender(3, 1), armed=True)])
+        bench.recorder.set_in_flight(in_flight=False, operates=False)
+        await bench.turn()
+        assert bench.recorder.status().state == "idle"
+        for _ in range(40):
+            bench.send([bytes(280)] * 5000)
+            await bench.turn()
+        held = [part.size for _, part in bench.recorder._memory]
+        assert len(held) == 2
+        assert sum(held) <= 2 * (HELD_BYTES + 5000 * 288)
+        bench.recorder.set_in_flight(in_flight=False, operates=True)
+        await bench.turn()
+        assert bench.recorder.status().state == "recording"
+        assert not bench.troubles
+    finally:
+        bench.recorder.close()
 
 
 async def test_table_contains_the_flight_and_its_header(

@@ -104,6 +104,8 @@ def _folder() -> Path:
 
 def _show(status: dict[str, Any]) -> None:
     console = console_of()
+    if status["held_s"] and status["state"] == SessionState.IDLE:
+        console.print(f"waits for arming, with {status['held_s']:.0f} s in memory")
     free = f"{status['free_bytes'] / 1e9:.1f} GB free"
     if status["state"] == SessionState.IDLE and status["name"]:
         length = duration_text(status["duration_s"]).removeprefix("0:").removeprefix("0")

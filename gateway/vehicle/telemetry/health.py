@@ -147,6 +147,8 @@ class Health:
         self.supply_low_v = supply_low_v
         """A lower supply is announced; 0 disables this."""
         self.recording = False
+        self.recording_expected = True
+        """Whether ground stations are to be shown that nothing is recorded."""
         self.reported = Reported()
         """What the vehicle's own autopilot reports, if it has one."""
         self.is_reported = False
@@ -318,7 +320,7 @@ class Health:
         elif AHRS in self._seen_us:
             present |= AHRS
             healthy |= AHRS if self.is_alive(AHRS, now_us) else 0
-        present |= LOGGING | PREARM
+        present |= PREARM | (LOGGING if self.recording or self.recording_expected else 0)
         # There is no fence, so none is breached; MAVProxy reports a breach without this bit.
         healthy |= GEOFENCE
         enabled = present if self.recording else present & ~LOGGING

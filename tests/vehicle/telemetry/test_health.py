@@ -53,6 +53,13 @@ def test_sys_status_reports_outages_and_faults_of_sensors(
     assert health.has_fix(now_us) == (not bad & GPS)
 
 
+def test_recording_that_waits_for_arming_is_not_shown_as_switched_off(health: Health) -> None:
+    health.recording_expected = False
+    assert not health.sensors(NOW_US)[0] & LOGGING
+    health.recording = True
+    assert all(bits & LOGGING for bits in health.sensors(NOW_US))
+
+
 def test_radio_status_has_the_weakest_signal_and_none_without_a_measurement(
     health: Health,
 ) -> None:
