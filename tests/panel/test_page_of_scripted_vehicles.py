@@ -105,7 +105,7 @@ def display_of(page: Page) -> Locator:
     return page.locator(".flight-display")
 
 
-def test_row_horizon(page: Page, vehicle: ScriptedVehicle) -> None:
+def test_horizon_follows_roll_and_pitch(page: Page, vehicle: ScriptedVehicle) -> None:
     points = [(0.25, 0.5), (0.72, 0.5), (0.25, 0.62)]
     for roll, pitch, expected in (
         (30, 0, ("sky", "ground", "sky")),
@@ -120,7 +120,7 @@ def test_row_horizon(page: Page, vehicle: ScriptedVehicle) -> None:
     vehicle.roll_deg = vehicle.pitch_deg = 0.0
 
 
-def test_row_compass(page: Page, vehicle: ScriptedVehicle) -> None:
+def test_compass_follows_the_heading(page: Page, vehicle: ScriptedVehicle) -> None:
     vehicle.heading_deg = 272.0
     until_drawn(page, "272°", "W", "300")
     expect(display_of(page)).to_have_attribute("aria-label", re.compile(r"heading 272.0°"))
@@ -130,7 +130,7 @@ def test_row_compass(page: Page, vehicle: ScriptedVehicle) -> None:
     assert "W" not in page.evaluate("window.seen")
 
 
-def test_row_altitude(page: Page, vehicle: ScriptedVehicle) -> None:
+def test_altitude_and_climb_are_drawn(page: Page, vehicle: ScriptedVehicle) -> None:
     vehicle.alt_home_m, vehicle.climb_mps = 123.0, -2.5
     until_drawn(page, "HOME  m", "123", "AMSL 554", "-2.5")
     expect(display_of(page)).to_have_attribute(
@@ -138,7 +138,9 @@ def test_row_altitude(page: Page, vehicle: ScriptedVehicle) -> None:
     )
 
 
-def test_row_speed(page: Page, vehicle: ScriptedVehicle) -> None:
+def test_airspeed_is_drawn_unless_it_repeats_the_ground_speed(
+    page: Page, vehicle: ScriptedVehicle
+) -> None:
     vehicle.airspeed_mps, vehicle.groundspeed_mps = 21.5, 19.3
     until_drawn(page, "AS  m/s", "21.5", "GS 19.3")
     vehicle.airspeed_mps = 0.0
@@ -150,7 +152,7 @@ def test_row_speed(page: Page, vehicle: ScriptedVehicle) -> None:
     until_drawn(page, "GS  m/s", "19.3")
 
 
-def test_row_roll_pitch_and_yaw(page: Page, vehicle: ScriptedVehicle) -> None:
+def test_angles_are_spoken_and_sent_exactly(page: Page, vehicle: ScriptedVehicle) -> None:
     vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = -17.5, 8.3, 123.4
     spoken = re.compile(r"^Roll -17.5°, pitch 8.3°, heading 123.4°,")
     expect(display_of(page)).to_have_attribute("aria-label", spoken)

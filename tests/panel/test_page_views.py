@@ -129,7 +129,7 @@ def desk(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     assert troubles == []
 
 
-def test_row_serial_mode_of_a_panel_that_the_settings_enable(desk: Desk) -> None:
+def test_receiver_on_a_serial_port_is_shown_as_serial(desk: Desk) -> None:
     expect(desk.page.locator(".chips").get_by_text("serial", exact=True)).to_be_visible()
     expect(desk.page.locator(".chips").get_by_text("GPS 11 sats")).to_be_visible()
 

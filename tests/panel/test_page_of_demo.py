@@ -1,4 +1,4 @@
-"""The rows of the window that the panel stands in for, and the layout, on one real page."""
+"""The functions of the page, and its layout, on one page of a demo."""
 
 import io
 import re
@@ -50,7 +50,7 @@ def test_several_aircraft_are_distinguished_and_selected(page: Page) -> None:
         page.wait_for_function(f"mavgate.state.system_id === {number}")
 
 
-def test_row_3d_from_two_viewpoints(page: Page) -> None:
+def test_scene_shows_the_aircraft_from_two_viewpoints(page: Page) -> None:
     show(page, "flight")
     scene = page.locator(".scene")
     expect(scene).to_have_attribute("data-model", "plane")
@@ -101,7 +101,7 @@ def test_3d_model_is_not_reloaded_while_the_theme_stays(page: Page) -> None:
     assert page.evaluate(TOUCH_THE_BODY) == ["plane"]
 
 
-def test_row_live_map_with_styles_and_zoom(page: Page, tmp_path: Path) -> None:
+def test_map_changes_style_and_zoom_and_accepts_an_upload(page: Page, tmp_path: Path) -> None:
     show(page, "map")
     view = page.locator("section[data-view='map']")
     expect(view.locator(".leaflet-tile-loaded").first).to_be_visible()
@@ -148,7 +148,7 @@ LISTEN_TO_WORDS = """
 """Records every text of an element from now on, also one that is shown for a moment."""
 
 
-def test_row_latitude_and_longitude_to_copy(page: Page) -> None:
+def test_position_is_copied_as_latitude_and_longitude(page: Page) -> None:
     show(page, "map")
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     view = page.locator("section[data-view='map']")
@@ -162,7 +162,7 @@ def test_row_latitude_and_longitude_to_copy(page: Page) -> None:
     assert re.fullmatch(r"-7\.7\d{5}, 110\.3\d{5}", copied)
 
 
-def test_row_marked_position_and_distance(page: Page, demo: Process) -> None:
+def test_marked_position_is_sent_and_shown_with_its_distance(page: Page, demo: Process) -> None:
     show(page, "map")
     view = page.locator("section[data-view='map']")
     expect(view.locator(".pin.home")).to_be_visible()
@@ -196,11 +196,11 @@ def test_row_marked_position_and_distance(page: Page, demo: Process) -> None:
     expect(view.locator("[data-role='way']")).to_have_count(0)
 
 
-def test_row_serial_recording_or_simulation_mode(page: Page) -> None:
+def test_simulated_receiver_is_shown_as_simulation(page: Page) -> None:
     expect(page.locator(".chips").get_by_text("simulation")).to_be_visible()
 
 
-def test_row_start_stop_save_delete_export_import_and_move_in_time(
+def test_recording_is_saved_downloaded_uploaded_played_and_deleted(
     page: Page, tmp_path: Path
 ) -> None:
     show(page, "recordings")
