@@ -103,7 +103,9 @@ class Dialogue:
 class Dialogues:
     """The dialogues with all aircraft."""
 
-    def __init__(self, fleet: FleetState, send: Callable[[Any], None], clock: GatewayClock) -> None:
+    def __init__(
+        self, fleet: FleetState, send: Callable[[Any], object], clock: GatewayClock
+    ) -> None:
         self._all: dict[int, Dialogue] = {}
         self._send = send
         self._clock = clock

@@ -164,7 +164,7 @@ class _Page:
         context = self._context
         names = {key: vehicle.title for key, vehicle in sorted(context.vehicles.items())}
         if names != self._names:
-            origins = context.fleet.origins
+            origins = context.parts.fleet.origins
             played = [key for key in names.keys() - self._names.keys() if key in origins]
             self._names = names
             wanted = min(played, default=context.system_id)

@@ -432,7 +432,7 @@ class RestApi:
         if self._book.has_heard(system_id, component_id):
             # Ids of a known system must not be used: the gateway would take that for a loop.
             system_id = component_id = 0
-        size = self._uplink.send_as(message, system_id, component_id)
+        size = self._uplink.send(message, system_id, component_id)
         self._book.add(message, is_sent=True)
         return size
 

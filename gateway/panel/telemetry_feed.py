@@ -8,16 +8,18 @@ nothing queues up here.
 import asyncio
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import suppress
+from http import HTTPStatus
 from typing import Any, Final
 
 import msgspec
-from fastapi import FastAPI
+from fastapi import FastAPI, HTTPException
 from starlette.responses import Response, StreamingResponse
 from starlette.status import WS_1008_POLICY_VIOLATION
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gateway.clock import GatewayClock
 from gateway.panel.state.fleet import FleetState
+from gateway.panel.state.vehicle import VehicleState
 
 PATH: Final = "/telemetry"
 TRACKS_PATH: Final = "/path/{system_id}"
@@ -102,20 +104,20 @@ def add_tracks(app: FastAPI, fleet: FleetState) -> None:
     on the loop, which changes what they read.
     """
 
+    def vehicle_of(system_id: int) -> VehicleState:
+        if (vehicle := fleet.vehicles.get(system_id)) is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND)
+        return vehicle
+
     @app.get(TRACKS_PATH)
     async def _track(system_id: int) -> Response:
-        vehicle = fleet.vehicles.get(system_id)
-        if vehicle is None:
-            return Response(status_code=404)
+        vehicle = vehicle_of(system_id)
         fixes = [(at.lat_deg, at.lon_deg, at.alt_amsl_m, at.time_us) for at in vehicle.fixes]
         return _streamed({"track": vehicle.history.track(), "fixes": fixes})
 
     @app.get(HISTORY_PATH)
     async def _history(system_id: int) -> Response:
-        vehicle = fleet.vehicles.get(system_id)
-        if vehicle is None:
-            return Response(status_code=404)
-        history = vehicle.history
+        history = vehicle_of(system_id).history
         step = max(1, len(history) // MAX_HISTORY + 1)
         columns: dict[str, Sequence[float]] = {"time_us": [*history.time_us[::step]]}
         columns |= {name: column[::step] for name, column in history.columns.items()}

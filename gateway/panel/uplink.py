@@ -21,7 +21,7 @@ from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError, find_socket, request
-from gateway.panel.state.commands import command_at, command_long
+from gateway.panel.state.commands import result_text
 from gateway.panel.state.fleet import FleetState
 from gateway.records import NAN, Incoming, Outgoing
 from gateway.units import US_PER_S
@@ -47,10 +47,9 @@ class ControlClient:
 
         Raises ControlError if no gateway listens, or the request is refused.
         """
-        return await asyncio.to_thread(self._ask, verb, params)
-
-    def _ask(self, verb: str, params: dict[str, Any]) -> Any:
-        return request(self.path or find_socket("run"), verb, params)
+        return await asyncio.to_thread(
+            lambda: request(self.path or find_socket("run"), verb, params)
+        )
 
 
 STATUS_S: Final = 1.0
@@ -84,15 +83,12 @@ class GatewayWatch:
     async def refresh(self) -> None:
         """Poll now; what is known then is not older than the call."""
         async with self._asking:
-            await self._refresh()
-
-    async def _refresh(self) -> None:
-        try:
-            status = await self._control.ask("status")
-        except ControlError:
-            self.status = self.before = self.recorder = None
-            return
-        self.before, self.status, self.recorder = self.status, status, status["recorder"]
+            try:
+                status = await self._control.ask("status")
+            except ControlError:
+                self.status = self.before = self.recorder = None
+                return
+            self.before, self.status, self.recorder = self.status, status, status["recorder"]
         for aircraft in status["aircraft"]:
             vehicle = self._fleet.vehicles.get(aircraft["vehicle_id"])
             if vehicle is not None:
@@ -189,28 +185,22 @@ class Uplink:
         """Call a listener with every decoded message."""
         self._listeners.append(listener)
 
-    def send(self, message: Any) -> None:
-        """Send one message; its target is in its fields."""
-        self._send(message, self._mav)
+    def send(self, message: Any, system_id: int = 0, component_id: int = 0) -> int:
+        """Send a message from the ids of a client, by default the panel's; return its bytes."""
+        mav = self._sender(system_id, component_id)
+        frame = message.pack(mav)
+        mav.seq = (mav.seq + 1) % 256
+        is_played = frame_of(frame).target[0] in self._fleet.origins
+        hub = self._player_hub if is_played else self._hub
+        hub.send(Outgoing(frame, message.get_msgId()))
+        return len(frame)
 
-    def send_as(self, message: Any, system_id: int, component_id: int) -> int:
-        """Send a message from a client's own ids (system 0: the panel's); return its bytes."""
-        return self._send(message, self._sender(system_id, component_id))
-
-    async def command(self, system_id: int, number: int, *params: float) -> None:
-        """Send a command, and wait until it is acknowledged.
+    async def command(self, message: Any) -> None:
+        """Send a COMMAND_LONG or COMMAND_INT, and wait until it is acknowledged.
 
         Raises CommandFailedError if it is refused or not answered.
         """
-        message = command_long(system_id, number, *params)
-        await self._until_acknowledged(system_id, number, message)
-
-    async def command_at(self, system_id: int, number: int, spot: Location) -> None:
-        """Send a command with a position; raises as `command`."""
-        message = command_at(system_id, number, spot)
-        await self._until_acknowledged(system_id, number, message)
-
-    async def _until_acknowledged(self, system_id: int, number: int, message: Any) -> None:
+        system_id, number = message.target_system, message.command
         name = mavlink.enums["MAV_CMD"][number].name if number in mavlink.enums["MAV_CMD"] else ""
         results: asyncio.Queue[int] = asyncio.Queue()
         self._acks[system_id, number] = results
@@ -222,19 +212,11 @@ class Uplink:
                 except TimeoutError:
                     continue
                 if result != mavlink.MAV_RESULT_ACCEPTED:
-                    raise CommandFailedError(f"{name or number}: {_word_of(result)}")
+                    raise CommandFailedError(f"{name or number}: {result_text(result)}")
                 return
         finally:
             self._acks.pop((system_id, number), None)
         raise CommandFailedError(f"{name or number}: aircraft {system_id} does not answer")
-
-    def _send(self, message: Any, mav: Any) -> int:
-        frame = message.pack(mav)
-        mav.seq = (mav.seq + 1) % 256
-        is_played = frame_of(frame).target[0] in self._fleet.origins
-        hub = self._player_hub if is_played else self._hub
-        hub.send(Outgoing(frame, message.get_msgId()))
-        return len(frame)
 
     def _sender(self, system_id: int, component_id: int) -> Any:
         """Return the encoder of a program that sends through the panel."""
@@ -328,13 +310,6 @@ async def _outcome(results: asyncio.Queue[int]) -> int:
         async with asyncio.timeout(PROGRESS_TIMEOUT_S):
             result = await results.get()
     return result
-
-
-def _word_of(result: int) -> str:
-    known = mavlink.enums["MAV_RESULT"].get(result)
-    if known is None:
-        return f"result {result}"
-    return str(known.name).removeprefix("MAV_RESULT_").lower().replace("_", " ")
 
 
 def _trusting(url: str) -> str:

@@ -42,6 +42,7 @@ from gateway.panel.open_pages import OpenPages
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
 from gateway.panel.recording_jobs import RecordingJobs
+from gateway.panel.state.commands import command_at, command_long
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.state.samples import SampleMemory
@@ -106,19 +107,14 @@ class ViewContext:
     _on_select: list[Callable[[], None]] = field(default_factory=list)
 
     @property
-    def fleet(self) -> FleetState:
-        """All aircraft."""
-        return self.parts.fleet
-
-    @property
     def vehicles(self) -> dict[int, VehicleState]:
         """The aircraft that this page shows."""
-        return self.fleet.visible(self.page)
+        return self.parts.fleet.visible(self.page)
 
     @property
     def vehicle(self) -> VehicleState | None:
         """The selected aircraft; None before the first."""
-        return None if self.system_id is None else self.fleet.vehicles.get(self.system_id)
+        return None if self.system_id is None else self.parts.fleet.vehicles.get(self.system_id)
 
     @property
     def dialogue(self) -> Dialogue | None:
@@ -131,6 +127,15 @@ class ViewContext:
         return self.vehicle is not None and not self.vehicle.is_live
 
     @property
+    def why_fixed(self) -> str:
+        """Why the user may not change the selected aircraft; empty if they may."""
+        if not self.may_change:
+            return "You are logged in as a viewer."
+        if self.vehicle is None:
+            return "No aircraft is heard."
+        return "This aircraft is played from a recording." if self.is_playback else ""
+
+    @property
     def now_us(self) -> int:
         """The panel's clock, which all times here refer to."""
         return self.parts.clock()
@@ -140,23 +145,15 @@ class ViewContext:
         """Whether the user may change things."""
         return self.role is Role.OPERATOR
 
-    def send(self, message: Any) -> None:
-        """Send one MAVLink message; raises NotAllowedError for a viewer."""
-        self.check_may_change()
-        self.parts.uplink.send(message)
-
-    async def command(self, number: int, *params: float) -> None:
-        """Send a MAV_CMD to the selected aircraft.
+    async def command(self, number: int, *params: float, at: Location | None = None) -> None:
+        """Send a MAV_CMD to the selected aircraft, with parameters or with a location.
 
         Raises CommandFailedError if it is refused, or nobody answers; NotAllowedError for a viewer.
         """
         self.check_may_change()
-        await self.parts.uplink.command(self.system_id or 0, number, *params)
-
-    async def command_at(self, number: int, spot: Location) -> None:
-        """Send a MAV_CMD with a position to the selected aircraft; raises as `command`."""
-        self.check_may_change()
-        await self.parts.uplink.command_at(self.system_id or 0, number, spot)
+        target = (self.system_id or 0, number)
+        message = command_long(*target, *params) if at is None else command_at(*target, at)
+        await self.parts.uplink.command(message)
 
     async def ask(self, verb: str, **params: Any) -> Any:
         """Send a request to the gateway's control socket; see docs/control.md.

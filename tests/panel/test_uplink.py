@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
 from gateway.panel import uplink as panel_uplink
+from gateway.panel.state.commands import command_long
 from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import (
     ACK_TIMEOUT_S,
@@ -136,7 +137,7 @@ async def test_every_result_other_than_accepted_is_a_failure(
     tmp_path: Path, result: int, word: str
 ) -> None:
     uplink = Uplink(None, FleetState(), ControlClient(tmp_path / "none.sock"), GatewayClock())
-    waits = asyncio.ensure_future(uplink.command(1, mavlink.MAV_CMD_LOGGING_START))
+    waits = asyncio.ensure_future(uplink.command(command_long(1, mavlink.MAV_CMD_LOGGING_START)))
     await asyncio.sleep(0)
     uplink._note_ack(
         decoded(mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_LOGGING_START, result))

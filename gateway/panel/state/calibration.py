@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.commands import command_long
+from gateway.panel.state.commands import command_long, result_text
 from gateway.records import NAN
 from gateway.sensing.calibrating import fit_sphere
 from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S, UT_PER_GAUSS
@@ -268,8 +268,7 @@ class CalibrationRun:
             else:
                 self.state = RunState.RUNNING
         else:
-            name = mavlink.enums["MAV_RESULT"][message.result].name.removeprefix("MAV_RESULT_")
-            self._fail(name.lower().replace("_", " "))
+            self._fail(result_text(message.result))
 
     def _handle_text(self, text: str, now_us: int) -> None:
         if match := _FAILED.match(text):

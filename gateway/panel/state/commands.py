@@ -1,4 +1,4 @@
-"""Commands to an aircraft as messages."""
+"""Commands to an aircraft as messages, and their results in words."""
 
 from typing import Any
 
@@ -6,6 +6,14 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import DEGE7_PER_DEG
 from gateway.vehicle.plan import Location
+
+
+def result_text(result: int) -> str:
+    """Return a MAV_RESULT in words."""
+    known = mavlink.enums["MAV_RESULT"].get(result)
+    if known is None:
+        return f"result {result}"
+    return str(known.name).removeprefix("MAV_RESULT_").lower().replace("_", " ")
 
 
 def command_long(system_id: int, number: int, *params: float) -> Any:

@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
+from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
@@ -18,44 +20,26 @@ MAX_RATE_HZ: Final = 50
 LEAST_GAP_US: Final = US_PER_S * 3 // (4 * MAX_RATE_HZ)
 """Shorter than the interval, so that jitter does not thin out messages at that rate."""
 MAX_ROWS: Final = SPAN_US // LEAST_GAP_US
-SHOWN_UNITS: Final = {
-    "rad": (math.degrees(1.0), "°"),
-    "rad/s": (math.degrees(1.0), "°/s"),
-    "deg": (1.0, "°"),
-    "degE7": (DEG_PER_DEGE7, "°"),
-    "cdeg": (1e-2, "°"),
-    "deg/s": (1.0, "°/s"),
-    "cm/s": (1e-2, "m/s"),
-    "m/s/s": (1.0, "m/s²"),
-    "uT": (1.0, "µT"),
-    "gauss": (100.0, "µT"),
-    "degC": (1.0, "°C"),
-    "cdegC": (1e-2, "°C"),
-    "us": (1e-6, "s"),
-    "ms": (1e-3, "s"),
-}
+ANGLES: Final = {"rad": (math.degrees(1.0), "°"), "rad/s": (math.degrees(1.0), "°/s")}
+SHOWN_UNITS: Final = ANGLES | {
+    "degE7": (DEG_PER_DEGE7, "°"), "cdeg": (1e-2, "°"), "cm/s": (1e-2, "m/s"),
+    "gauss": (100.0, "µT"), "cdegC": (1e-2, "°C"), "us": (1e-6, "s"), "ms": (1e-3, "s"),
+}  # fmt: skip
 """Factor and unit in which a field is shown, by the unit that MAVLink gives it."""
-
-
 UNIT_TEXTS: Final = {
     "deg": "°", "deg/s": "°/s", "m/s/s": "m/s²", "m/s2": "m/s²", "m/s^2": "m/s²", "uT": "µT",
     "degC": "°C", "us": "µs", "m2": "m²",
 }  # fmt: skip
 
 
-def unit_text(unit: str) -> str:
-    """Return a unit as it is written in print: `m/s2` is m/s²."""
-    return UNIT_TEXTS.get(unit, unit)
-
-
 def parameter_unit(unit: str) -> tuple[float, str]:
     """Return the factor and the unit in which a parameter is shown: angles in degrees."""
-    return SHOWN_UNITS[unit] if unit in ("rad", "rad/s") else (1.0, unit_text(unit))
+    return ANGLES.get(unit, (1.0, UNIT_TEXTS.get(unit, unit)))
 
 
 def shown_unit(unit: str) -> tuple[float, str]:
     """Return the factor and the unit in which a field of a MAVLink unit is shown."""
-    return SHOWN_UNITS.get(unit, (1.0, unit))
+    return SHOWN_UNITS.get(unit) or parameter_unit(unit)
 
 
 FIRST_ROWS: Final = 256
@@ -117,8 +101,8 @@ class _Columns:
 
     def __init__(self, message: Any) -> None:
         self._readers = _readers_of(message)
-        self.names = tuple(sorted(name for name, _, _ in self._readers))
-        self._index = {name: n for n, (name, _, _) in enumerate(self._readers)}
+        self.names = tuple(sorted(self._readers))
+        self._index = {name: n for n, name in enumerate(self._readers)}
         self._units: dict[str, str] = getattr(message, "fieldunits_by_name", {})
         self._time_us = np.zeros(FIRST_ROWS, np.int64)
         self._values = np.zeros((FIRST_ROWS, len(self._readers)))
@@ -143,7 +127,7 @@ class _Columns:
             self._grow(min(2 * self.capacity, MAX_ROWS))
         row = self._count % self.capacity
         self._time_us[row] = now_us
-        self._values[row] = [read(message) for _, _, read in self._readers]
+        self._values[row] = [read(message) for read in self._readers.values()]
         self._count += 1
 
     def column(
@@ -172,31 +156,22 @@ class _Columns:
         self._count = len(order)
 
 
-_Reader = tuple[str, str, Callable[[Any], float]]
-
-
-def _readers_of(message: Any) -> list[_Reader]:
-    """Return the numbers in a message: their names, their fields, how to read them."""
-    found: list[_Reader] = []
+def _readers_of(message: Any) -> dict[str, Callable[[Any], float]]:
+    """Return how to read each number in a message, by its name."""
+    found: dict[str, Callable[[Any], float]] = {}
     for field in message.fieldnames:
         value = getattr(message, field)
         if isinstance(value, int | float):
-            found.append((field, field, _scalar_reader(field)))
+            found[field] = attrgetter(field)
         elif isinstance(value, list | tuple) and 0 < len(value) <= MAX_ARRAY:
-            found += [
-                (f"{field}[{n}]", field, _item_reader(field, n))
-                for n, item in enumerate(value)
-                if isinstance(item, int | float)
-            ]
+            for n, item in enumerate(value):
+                if isinstance(item, int | float):
+                    found[f"{field}[{n}]"] = partial(_item, field, n)
     return found
 
 
-def _scalar_reader(field: str) -> Callable[[Any], float]:
-    return lambda message: float(getattr(message, field))
-
-
-def _item_reader(field: str, index: int) -> Callable[[Any], float]:
-    return lambda message: float(getattr(message, field)[index])
+def _item(field: str, index: int, message: Any) -> float:
+    return float(getattr(message, field)[index])
 
 
 def _kind_of(message: Any) -> str:

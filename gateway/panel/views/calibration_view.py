@@ -264,14 +264,7 @@ class CalibrationView:
 
     def _why_not(self, *, ready: bool) -> str:
         """Return why nothing can be calibrated now; empty if it can."""
-        vehicle = self._context.vehicle
-        if not self._context.may_change:
-            return "You are logged in as a viewer."
-        if vehicle is None:
-            return "No aircraft is heard."
-        if not vehicle.is_live:
-            return "This aircraft is played from a recording."
-        return "" if ready else "The parameters are being read."
+        return self._context.why_fixed or ("" if ready else "The parameters are being read.")
 
     def _what_now(self, run: CalibrationRun | None, *, ready: bool) -> str:
         vehicle = self._context.vehicle

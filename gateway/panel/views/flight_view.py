@@ -75,7 +75,7 @@ def _ground_m(context: ViewContext) -> float:
 
 
 async def _mark(context: ViewContext, spot: Location) -> None:
-    await context.command_at(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, spot)
+    await context.command(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, at=spot)
     if context.vehicle is not None:
         context.vehicle.exact_mark = spot
     ui.notify("Marked", type="positive")
@@ -88,14 +88,10 @@ async def _ask_home(context: ViewContext, spot: Location) -> None:
 
     async def act() -> None:
         with notify_failure(context):
-            await _set_home(context, spot)
+            await context.command(mavlink.MAV_CMD_DO_SET_HOME, at=spot)
+            ui.notify("Home set", type="positive")
 
     confirm(title, "Set home", act, grave=False)
-
-
-async def _set_home(context: ViewContext, spot: Location) -> None:
-    await context.command_at(mavlink.MAV_CMD_DO_SET_HOME, spot)
-    ui.notify("Home set", type="positive")
 
 
 async def _clear(context: ViewContext, _: Location) -> None:

@@ -324,10 +324,7 @@ class TuningView:
         self._refresh()
 
     def _refresh(self) -> None:
-        reason = "This aircraft is played from a recording." if self._context.is_playback else ""
-        allow(
-            self._button, reason if self._context.may_change else "You are logged in as a viewer."
-        )
+        allow(self._button, self._context.why_fixed)
         dialogue = self._context.dialogue
         if dialogue is None:
             self._state.set_text("")

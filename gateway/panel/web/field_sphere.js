@@ -63,14 +63,9 @@ export default {
     },
     draw() {
       const canvas = this.$el;
-      const ratio = Math.min(window.devicePixelRatio || 1, 2);
-      const size = canvas.clientWidth;
-      if (canvas.width !== Math.round(size * ratio)) canvas.width = canvas.height = Math.round(size * ratio);
-      const g = canvas.getContext("2d");
-      g.setTransform(ratio, 0, 0, ratio, 0, 0);
-      g.clearRect(0, 0, size, size);
-      const style = getComputedStyle(document.body);
-      const colour = (name) => style.getPropertyValue(`--${name}`).trim();
+      const { pen: g, width: size } = mavgate.pen_of(canvas, 2) ?? {};
+      if (!g) return;
+      const colour = mavgate.colour;
       const [cy, sy, ct, st] = [Math.cos(this.yaw), Math.sin(this.yaw), Math.cos(this.tilt), Math.sin(this.tilt)];
       const radius = size * 0.4;
       // NED seen from the side: z down the screen; depth grows towards the eye.

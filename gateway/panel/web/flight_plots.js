@@ -51,13 +51,8 @@ export default {
       this.groups.forEach((group, n) => this.canvases[n] && this.draw(this.canvases[n], group));
     },
     draw(canvas, group) {
-      const { clientWidth: width, clientHeight: height } = canvas;
-      if (!width) return;
-      const ratio = window.devicePixelRatio || 1;
-      if (canvas.width !== Math.round(width * ratio)) [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
-      const pen = canvas.getContext("2d");
-      pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-      pen.clearRect(0, 0, width, height);
+      const { pen, width, height } = mavgate.pen_of(canvas) ?? {};
+      if (!pen) return;
       const [from, to] = this.span();
       const narrow = width < NARROW;
       const top = narrow ? 42 : 26;

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // The current flight over time: its height, and a handle that goes back in it, and to the present.
 const RELOAD_MS = 5000;
-const STEP_S = { ArrowLeft: -5, ArrowRight: 5, PageDown: -60, PageUp: 60 };
 
 export default {
   template: `
@@ -62,14 +61,8 @@ export default {
       this.draw();
     },
     draw() {
-      const canvas = this.$refs.canvas;
-      const { clientWidth: width, clientHeight: height } = canvas ?? {};
-      if (!width) return;
-      const ratio = window.devicePixelRatio || 1;
-      if (canvas.width !== Math.round(width * ratio)) [canvas.width, canvas.height] = [Math.round(width * ratio), Math.round(height * ratio)];
-      const pen = canvas.getContext("2d");
-      pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-      pen.clearRect(0, 0, width, height);
+      const { pen, width, height } = mavgate.pen_of(this.$refs.canvas) ?? {};
+      if (!pen) return;
       const { time_us: times, alt_amsl_m: heights } = this.history() ?? {};
       if (!times?.length || !this.span_s) return;
       const known = heights.filter(Number.isFinite);
@@ -99,8 +92,7 @@ export default {
       this.say();
     },
     at(event) {
-      const box = this.$refs.canvas.getBoundingClientRect();
-      return Math.min(1, Math.max(0, (event.clientX - box.left) / box.width)) * this.span_s;
+      return mavgate.share_of(event, this.$refs.canvas) * this.span_s;
     },
     grab(event) {
       event.currentTarget.setPointerCapture(event.pointerId);
@@ -111,11 +103,8 @@ export default {
       if (this.held) this.go(this.at(event));
     },
     key(event) {
-      const step = { ...STEP_S, Home: -this.span_s, End: this.span_s }[event.key];
-      if (step === undefined) return;
-      event.preventDefault();
-      event.stopPropagation();
-      this.go(this.at_s + step);
+      const step = mavgate.step_of(event, { Home: -this.span_s, End: this.span_s });
+      if (step !== undefined) this.go(this.at_s + step);
     },
   },
 };

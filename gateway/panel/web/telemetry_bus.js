@@ -59,6 +59,31 @@
     },
     // A colour of the style sheet, as canvas and WebGL want it.
     colour: (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`).trim(),
+    // Clears a canvas whose pixels are those of the screen; returns its pen and its size in CSS pixels.
+    pen_of(canvas, most = Infinity) {
+      const { clientWidth: width, clientHeight: height } = canvas ?? {};
+      if (!width) return null;
+      const ratio = Math.min(window.devicePixelRatio || 1, most);
+      const size = [Math.round(width * ratio), Math.round(height * ratio)];
+      if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+      const pen = canvas.getContext("2d");
+      pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+      pen.clearRect(0, 0, width, height);
+      return { pen, width, height };
+    },
+    // The share of an element's width at which a pointer is.
+    share_of(event, element) {
+      const box = element.getBoundingClientRect();
+      return Math.min(1, Math.max(0, (event.clientX - box.left) / box.width));
+    },
+    // The seconds by which a key moves a slider over time, and stops the key; undefined for others.
+    step_of(event, ends = {}) {
+      const step = { ArrowLeft: -5, ArrowRight: 5, PageDown: -60, PageUp: 60, ...ends }[event.key];
+      if (step === undefined) return undefined;
+      event.preventDefault();
+      event.stopPropagation();
+      return step;
+    },
     // Calls back when the page turns dark or light, not when another class of its body is set again.
     watch_theme(callback) {
       const is_dark = () => document.body.classList.contains("body--dark");

@@ -43,16 +43,8 @@ export default {
   methods: {
     draw() {
       const { slider, canvas } = this.$refs;
-      const { clientWidth: width, clientHeight: height } = slider;
-      if (!width) return;
-      const ratio = window.devicePixelRatio || 1;
-      if (canvas.width !== width * ratio) {
-        canvas.width = width * ratio;
-        canvas.height = height * ratio;
-      }
-      const pen = canvas.getContext("2d");
-      pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-      pen.clearRect(0, 0, width, height);
+      const { pen, width, height } = mavgate.pen_of(canvas) ?? {};
+      if (!pen) return;
       const x = (s) => (this.duration ? (s / this.duration) * width : 0);
       const [chosen, ...others] = this.curves;
       const heights = this.curves.flatMap((curve) => curve.alt_amsl_m);
@@ -92,8 +84,7 @@ export default {
       slider.dataset.curves = this.curves.length;
     },
     at(event) {
-      const box = this.$refs.slider.getBoundingClientRect();
-      return Math.min(1, Math.max(0, (event.clientX - box.left) / box.width)) * this.duration;
+      return mavgate.share_of(event, this.$refs.slider) * this.duration;
     },
     grab(event) {
       event.currentTarget.setPointerCapture(event.pointerId);
@@ -109,10 +100,8 @@ export default {
     },
     key(event) {
       if (event.key === " ") event.preventDefault(); // the page scrolls no further; the shell plays
-      const step = { ArrowLeft: -5, ArrowRight: 5, PageDown: -60, PageUp: 60 }[event.key];
+      const step = mavgate.step_of(event);
       if (step === undefined) return;
-      event.preventDefault();
-      event.stopPropagation();
       this.$emit("seek", Math.min(this.duration, Math.max(0, this.shown + step)));
     },
   },
