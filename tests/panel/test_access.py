@@ -17,7 +17,7 @@ import pytest
 from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
-from starlette.types import Message, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from gateway.panel import access, logins
 from gateway.panel.access import COOKIE, MAX_BODY, MAX_LOGIN_BODY, ROLE, AccessControl
@@ -45,7 +45,7 @@ def guarded(settings: PanelSettings | None = None) -> AccessControl:
     return AccessControl(grants_all, settings, lock)
 
 
-def client_of(guard: AccessControl, base: str = HERE) -> httpx.AsyncClient:
+def client_of(guard: ASGIApp, base: str = HERE) -> httpx.AsyncClient:
     return httpx.AsyncClient(transport=httpx.ASGITransport(app=guard), base_url=base)
 
 
@@ -353,8 +353,7 @@ async def test_inline_scripts_of_a_page_get_the_nonce_of_their_response() -> Non
     page = b"<script>one()</script><p>&lt;script&gt;</p><script src=/x defer></script><scripts>"
     seen = set()
     for _ in range(2):
-        app = ScriptNonces(HTMLResponse(page))
-        async with httpx.AsyncClient(transport=httpx.ASGITransport(app=app), base_url=HERE) as http:
+        async with client_of(ScriptNonces(HTMLResponse(page))) as http:
             answer = await http.get("/")
         policy = answer.headers["content-security-policy"]
         nonce = re.search(r"'nonce-([\w-]{22})'", policy)

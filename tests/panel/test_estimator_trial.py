@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
@@ -6,15 +8,13 @@ from gateway.estimation.select import ESTIMATORS
 from gateway.panel.estimator_trial import LEAST_HZ, LEAST_S, ComparisonError, compare, settings_of
 from gateway.panel.state.samples import SPAN_US, SampleMemory
 from gateway.units import US_PER_S
+from tests.panel.messages import decoded
 
 
-def imu(time_us: int) -> mavlink.MAVLink_message:
+def imu(time_us: int) -> Any:
     """A message as it comes off the line: with its frame."""
-    mav = mavlink.MAVLink(None, 1, 1)
-    message = mavlink.MAVLink_highres_imu_message(
-        time_us, 0, 0, -9.8, 0, 0, 0, 0.2, 0, 0.4, 0, 0, 0, 20, 0xFFFF
-    )
-    return mav.decode(bytearray(message.pack(mav)))
+    values = (0, 0, -9.8, 0, 0, 0, 0.2, 0, 0.4, 0, 0, 0, 20, 0xFFFF)
+    return decoded(mavlink.MAVLink_highres_imu_message(time_us, *values))
 
 
 def test_parameters_are_converted_to_settings() -> None:

@@ -15,14 +15,13 @@ from typing import ClassVar
 
 import httpx
 import pytest
-from fastapi import FastAPI
 from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
 
 from gateway.panel.admission import Role
 from gateway.panel.map_tiles import MAX_FILES, MAX_TILE, MapTiles, tidy
 from gateway.panel.panel_settings import MapStyle, PanelSettings
-from tests.panel.web_client import client_as
+from tests.panel.web_client import client_of
 
 pytestmark = pytest.mark.io
 
@@ -216,18 +215,12 @@ def hostile_maps(folder: Path) -> dict[str, tuple[bytes, str]]:
     }  # fmt: skip
 
 
-def client_of(tiles: MapTiles, role: Role = Role.OPERATOR) -> httpx.AsyncClient:
-    app = FastAPI()
-    tiles.serve(app)
-    return client_as(role, app)
-
-
 async def test_uploaded_map_is_a_style_and_hostile_ones_are_refused(tmp_path: Path) -> None:
     (tmp_path / "made").mkdir()
     maps, folder = hostile_maps(tmp_path / "made"), tmp_path / "tiles"
     good = (tmp_path / "made" / "good").read_bytes()
     tiles = MapTiles(PanelSettings(tiles_folder=str(folder), map_styles=()))
-    async with client_of(tiles) as client:
+    async with client_of(tiles.serve) as client:
         for name, (data, text) in maps.items():
             answer = await client.put(f"/maps/{name}", content=data)
             assert (answer.status_code, text in answer.text) == (400, True), (name, answer.text)
@@ -239,11 +232,11 @@ async def test_uploaded_map_is_a_style_and_hostile_ones_are_refused(tmp_path: Pa
         assert "already" in (await client.put("/maps/home field", content=good)).text
     assert [style.name for style in tiles.styles] == ["home field"]
     assert [file.name for file in folder.iterdir()] == ["home field.pmtiles"]
-    async with client_of(tiles, Role.VIEWER) as viewer:
+    async with client_of(tiles.serve, Role.VIEWER) as viewer:
         assert (await viewer.put("/maps/other", content=good)).status_code == 403
     for number in range(MAX_FILES):
         (folder / f"{number}.pmtiles").touch()
-    async with client_of(tiles) as client:
+    async with client_of(tiles.serve) as client:
         assert "delete one" in (await client.put("/maps/other", content=good)).text
 
 

@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel import rest_api
 from gateway.panel.rest_api import MessageBook
+from tests.panel.messages import decoded
 
 
 class Wall:
@@ -19,9 +20,8 @@ class Wall:
 
 
 def attitude(roll: float, system_id: int = 1, component_id: int = 1) -> Any:
-    link = mavlink.MAVLink(None, system_id, component_id)
     message = mavlink.MAVLink_attitude_message(5, roll, 0, 0, 0, 0, 0)
-    return link.decode(bytearray(message.pack(link)))
+    return decoded(message, system_id, component_id)
 
 
 @pytest.fixture
@@ -66,9 +66,7 @@ def test_status_has_count_frequency_and_times(book: MessageBook) -> None:
 
 
 def test_array_element_is_found_by_its_index(book: MessageBook) -> None:
-    link = mavlink.MAVLink(None, 1, 1)
-    message = mavlink.MAVLink_param_value_message(b"SPEED", 1.5, 9, 1, 0)
-    book.add(link.decode(bytearray(message.pack(link))))
+    book.add(decoded(mavlink.MAVLink_param_value_message(b"SPEED", 1.5, 9, 1, 0)))
     path = "vehicles/1/components/1/messages/PARAM_VALUE/message/param_id"
     assert book.look_up(f"{path}/1") == "P"
     for element in ("16", "-1", "01", "+1"):

@@ -2,19 +2,17 @@
 
 import httpx
 import pytest
-from fastapi import FastAPI
 
 from gateway.panel.pointing_api import pointing_router
 from gateway.panel.state.fleet import FleetState, Origin
 from gateway.units import US_PER_S
 from tests.panel.messages import heartbeat, position
+from tests.panel.web_client import client_of
 
 
 async def get(fleet: FleetState, path: str, now_us: int = US_PER_S) -> httpx.Response:
-    app = FastAPI()
-    app.include_router(pointing_router(fleet, lambda: now_us))
-    transport = httpx.ASGITransport(app)
-    async with httpx.AsyncClient(transport=transport, base_url="http://panel") as client:
+    router = pointing_router(fleet, lambda: now_us)
+    async with client_of(lambda app: app.include_router(router)) as client:
         return await client.get(path)
 
 

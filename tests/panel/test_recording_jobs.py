@@ -4,9 +4,7 @@ import asyncio
 import tempfile
 from pathlib import Path
 
-import httpx
 import pytest
-from fastapi import FastAPI
 
 from gateway.batch.catalogue import FlightFigures
 from gateway.panel import recording_jobs
@@ -16,6 +14,7 @@ from gateway.panel.recording_search import RecordingFacts
 from gateway.recordings.index import RecordingError, list_recordings
 from gateway.recordings.tlog import encode_record
 from tests.panel.messages import flight_frames
+from tests.panel.web_client import client_of
 
 pytestmark = pytest.mark.io
 
@@ -35,10 +34,8 @@ def exported(tmp_path: Path) -> Path:
 async def test_export_is_fetched_under_an_unguessable_address(
     exported: Path, kind: str, begin: bytes
 ) -> None:
-    jobs, app = RecordingJobs(), FastAPI()
-    jobs.serve(app)
-    transport = httpx.ASGITransport(app=app)
-    async with httpx.AsyncClient(transport=transport, base_url="http://panel") as client:
+    jobs = RecordingJobs()
+    async with client_of(jobs.serve) as client:
         url = await jobs.export(exported, NAME, kind)
         answer = await client.get(url)
         assert answer.content.startswith(begin)
@@ -128,14 +125,12 @@ async def test_equal_export_is_made_once_and_deleted_after_the_last_fetch(
     exported: Path, made: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    jobs, app = RecordingJobs(), FastAPI()
-    jobs.serve(app)
+    jobs = RecordingJobs()
     first, second = await asyncio.gather(
         *(jobs.export(exported, NAME, "kml", VIEWER) for _ in range(2))
     )
     assert (first, made) == (second, ["kml"])
-    transport = httpx.ASGITransport(app=app)
-    async with httpx.AsyncClient(transport=transport, base_url="http://panel") as client:
+    async with client_of(jobs.serve) as client:
         assert [(await client.get(first)).status_code for _ in range(3)] == [200, 200, 404]
     assert list(tmp_path.glob("mavgate-export-*/*")) == []
     jobs.close()

@@ -3,6 +3,7 @@
 import os
 import tempfile
 from collections.abc import AsyncIterator
+from functools import partial
 from http import HTTPStatus
 from io import BytesIO
 from pathlib import Path
@@ -15,15 +16,13 @@ from fastapi import FastAPI
 from gateway.panel.admission import Role
 from gateway.panel.recording_transfer import CHUNK, add_recording_files, zip_stream
 from tests.panel.messages import short_tlog
-from tests.panel.web_client import client_as
+from tests.panel.web_client import client_of
 
 pytestmark = pytest.mark.io
 
 
-def client_of(folder: Path, role: Role = Role.OPERATOR) -> httpx.AsyncClient:
-    app = FastAPI()
+def serve(folder: Path, app: FastAPI) -> None:
     add_recording_files(app, lambda: folder)
-    return client_as(role, app)
 
 
 @pytest.fixture
@@ -35,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 async def client(folder: Path) -> AsyncIterator[httpx.AsyncClient]:
-    async with client_of(folder) as opened:
+    async with client_of(partial(serve, folder)) as opened:
         yield opened
 
 
@@ -86,7 +85,7 @@ async def test_upload_under_an_existing_name_is_refused(
 
 async def test_viewer_may_download_but_not_upload(folder: Path) -> None:
     (folder / "day_01.tlog").write_bytes(short_tlog())
-    async with client_of(folder, Role.VIEWER) as viewer:
+    async with client_of(partial(serve, folder), Role.VIEWER) as viewer:
         assert (await viewer.get("/recordings/day")).status_code == HTTPStatus.OK
         answer = await viewer.put("/recordings/other", content=short_tlog())
     assert answer.status_code == HTTPStatus.FORBIDDEN

@@ -8,7 +8,6 @@ from contextlib import asynccontextmanager
 from types import SimpleNamespace
 from typing import Any, cast
 
-import httpx
 from fastapi import FastAPI
 from fastapi.routing import APIRoute
 from starlette.websockets import WebSocket
@@ -21,6 +20,7 @@ from gateway.panel.rest_api import RestApi
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.telemetry_feed import GRANTS, MAX_HISTORY, TelemetryFeed, add_tracks
 from tests.panel.messages import position
+from tests.panel.web_client import client_of
 
 LIMIT_S = 60.0
 
@@ -94,10 +94,8 @@ async def test_unused_grants_do_not_accumulate() -> None:
 
 
 async def test_history_and_path_are_served_in_flight() -> None:
-    fleet, app = FleetState(), FastAPI()
-    add_tracks(app, fleet)
-    transport = httpx.ASGITransport(app=app)
-    async with httpx.AsyncClient(transport=transport, base_url="http://panel") as client:
+    fleet = FleetState()
+    async with client_of(lambda app: add_tracks(app, fleet)) as client:
         assert (await client.get("/history/1")).status_code == 404
         for n in range(2 * MAX_HISTORY):
             fleet.update(position(47.0 + n * 1e-6, 8.0), n * 250_000)

@@ -15,100 +15,57 @@ from gateway.panel.state.calibration import (
     RunState,
     seen_cells,
 )
-from gateway.records import Incoming, Vec3
 from gateway.units import US_PER_S
 from gateway.vehicle.services.calibrator import SIDES as VEHICLE_SIDES
-from gateway.vehicle.vehicle import Vehicle
-from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
-from tests.kit.records import sample_at, state_at
-
-G = 9.80665
+from tests.kit.vehicle_bench import G_MPS2, VehicleBench
 
 
-class Bench:
-    """The gateway's vehicle in a hand, and the page that follows."""
-
-    def __init__(self, step: CalibrationStep) -> None:
-        rates = RateSettings(highres_imu_hz=50.0)
-        self.vehicle = Vehicle(VehicleSettings(rates=rates), 1)
-        self.now_us = US_PER_S
-        self.run = CalibrationRun(1, step, self.now_us)
-        self._mav = mavlink.MAVLink(None, 253, 25)
-        self._rng = np.random.default_rng(1)
-
-    def send(self, message: Any) -> None:
-        frame = message.pack(self._mav)
-        self._receive(self.vehicle.handle(Incoming(1, frame, True), self.now_us))
-
-    def hold(
-        self,
-        seconds: float,
-        accel: Vec3 = (0.0, 0.0, -G),
-        gyro: Vec3 = (0.0, 0.0, 0.0),
-        mag: Vec3 | None = None,
-    ) -> None:
-        for _ in range(round(seconds * 100)):
-            self.now_us += 10_000
-            noise = self._rng.normal(scale=0.005, size=(2, 3))
-            values: dict[str, Any] = {
-                "accel_b_mps2": tuple((np.array(accel) + noise[0]).tolist()),
-                "gyro_b_radps": tuple((np.array(gyro) + noise[1]).tolist()),
-            }
-            if mag is not None:
-                values["mag_b_ut"] = mag
-            sample = sample_at(self.now_us, **values)
-            self._receive(self.vehicle.on_state(state_at(self.now_us), sample, self.now_us))
-            self._receive(self.vehicle.poll(self.now_us))
-            self.run.poll(self.now_us)
-
-    def _receive(self, actions: Any) -> None:
-        for action in actions:
-            if hasattr(action, "frame"):
-                self.run.handle(self._mav.decode(bytearray(action.frame)), self.now_us)
+def bench_of(step: CalibrationStep) -> VehicleBench:
+    return VehicleBench(CalibrationRun(1, step, 10 * US_PER_S))
 
 
 def test_gyro_calibration_reports_bias_before_and_after() -> None:
-    bench = Bench(CalibrationStep.GYRO)
-    bench.send(bench.run.start_message())
-    assert bench.run.state is RunState.RUNNING
+    bench = bench_of(CalibrationStep.GYRO)
+    bench.send(bench.client.start_message())
+    assert bench.client.state is RunState.RUNNING
     bench.hold(1.5, gyro=(0.01, 0.0, 0.0))
-    assert bench.run.progress in range(40, 60)
+    assert bench.client.progress in range(40, 60)
     bench.hold(1.6, gyro=(0.01, 0.0, 0.0))
-    assert bench.run.state is RunState.CHECKING
+    assert bench.client.state is RunState.CHECKING
     bench.hold(2.1)
-    assert bench.run.state is RunState.DONE
-    [residual] = bench.run.residuals()
+    assert bench.client.state is RunState.DONE
+    [residual] = bench.client.residuals()
     assert residual.before == pytest.approx(math.degrees(0.01), rel=0.1)
     assert residual.after < 0.1
 
 
 def test_motion_fails_gyro_calibration_with_the_reason() -> None:
-    bench = Bench(CalibrationStep.GYRO)
-    bench.send(bench.run.start_message())
+    bench = bench_of(CalibrationStep.GYRO)
+    bench.send(bench.client.start_message())
     for n in range(40):
         bench.hold(0.1, gyro=(math.sin(n), 0.0, 0.0))
-    assert (bench.run.state, bench.run.trouble) == (RunState.FAILED, "it was moved")
+    assert (bench.client.state, bench.client.trouble) == (RunState.FAILED, "it was moved")
 
 
 def test_each_of_six_sides_is_reported_once_done() -> None:
-    bench = Bench(CalibrationStep.ACCEL)
-    bench.send(bench.run.start_message())
+    bench = bench_of(CalibrationStep.ACCEL)
+    bench.send(bench.client.start_message())
     bias = np.array((0.3, -0.2, 0.1))
     for done, (axis, sign) in enumerate((a, s) for a in range(3) for s in (1.0, -1.0)):
-        pose = bias + sign * G * np.eye(3)[axis]
+        pose = bias + sign * G_MPS2 * np.eye(3)[axis]
         bench.hold(2.5, accel=tuple(pose.tolist()))
-        assert bench.run.side_now == VEHICLE_SIDES[2 * axis + (sign < 0)]
-        assert len(bench.run.sides_done) >= done + 1
-    assert sorted(bench.run.sides_done) == sorted(SIDES)
+        assert bench.client.side_now == VEHICLE_SIDES[2 * axis + (sign < 0)]
+        assert len(bench.client.sides_done) >= done + 1
+    assert sorted(bench.client.sides_done) == sorted(SIDES)
     bench.hold(2.1)
-    [residual] = bench.run.residuals()
+    [residual] = bench.client.residuals()
     assert residual.before == pytest.approx(0.2, abs=0.1)
     assert residual.after < 0.02
 
 
 def test_magnetometer_shows_uncovered_directions() -> None:
-    bench = Bench(CalibrationStep.MAG)
-    bench.send(bench.run.start_message())
+    bench = bench_of(CalibrationStep.MAG)
+    bench.send(bench.client.start_message())
     rng = np.random.default_rng(2)
     directions = rng.normal(size=(1500, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -116,28 +73,28 @@ def test_magnetometer_shows_uncovered_directions() -> None:
     upper = directions[directions[:, 2] < 0.0]
     for direction in upper[:400]:
         bench.hold(0.02, mag=tuple((centre + 48.0 * direction).tolist()))
-    half = sum(bench.run.cover())
+    half = sum(bench.client.cover())
     assert 30 < half < 60
     for direction in directions[:1000]:
-        if bench.run.state is not RunState.RUNNING:
+        if bench.client.state is not RunState.RUNNING:
             break
         bench.hold(0.02, mag=tuple((centre + 48.0 * direction).tolist()))
-    assert bench.run.state is RunState.CHECKING
+    assert bench.client.state is RunState.CHECKING
     bench.hold(2.1)
-    assert sum(bench.run.cover()) > half
-    found, radius = bench.run.sphere()
+    assert sum(bench.client.cover()) > half
+    found, radius = bench.client.sphere()
     assert found == pytest.approx(centre.tolist(), abs=0.2)
     assert radius == pytest.approx(48.0, abs=0.2)
-    [residual] = bench.run.residuals()
+    [residual] = bench.client.residuals()
     assert residual.before > 4.0
     assert residual.after < 0.1
 
 
 def test_cancelling_and_timeout_end_a_calibration() -> None:
-    bench = Bench(CalibrationStep.MAG)
-    bench.send(bench.run.start_message())
-    bench.send(bench.run.cancel_message())
-    assert (bench.run.state, bench.run.trouble) == (RunState.FAILED, "cancelled")
+    bench = bench_of(CalibrationStep.MAG)
+    bench.send(bench.client.start_message())
+    bench.send(bench.client.cancel_message())
+    assert (bench.client.state, bench.client.trouble) == (RunState.FAILED, "cancelled")
     lonely = CalibrationRun(2, CalibrationStep.GYRO, 0)
     lonely.poll(5 * US_PER_S)
     assert (lonely.state, lonely.trouble) == (RunState.FAILED, "the aircraft does not answer")

@@ -4,7 +4,6 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.estimation.select import EstimationSettings
 from gateway.panel.dialogues import Dialogue
 from gateway.panel.state.parameters import (
     MAX_ATTEMPTS,
@@ -16,49 +15,14 @@ from gateway.panel.state.parameters import (
     parameter_path,
     parse_parameters,
 )
-from gateway.records import Incoming
-from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S
-from gateway.vehicle.vehicle import Vehicle
-from gateway.vehicle.vehicle_settings import VehicleSettings
+from tests.kit.vehicle_bench import VehicleBench
 
 
-class Bench:
-    """A client and the gateway's own vehicle, with a line between them that may lose messages."""
-
-    def __init__(self, client: Any, *, lose_every: int = 0, may_change: bool = True) -> None:
-        self.client = client
-        self.now_us = 10 * US_PER_S
-        sections = {"estimation": EstimationSettings(), "calibration": NodeCalibration()}
-        self._vehicle = Vehicle(VehicleSettings(), 1, sections=sections)
-        self._mav = mavlink.MAVLink(None, 253, 25)
-        self._lose_every, self._count, self._may_change = lose_every, 0, may_change
-
-    def run(self, messages: list[Any], seconds: float) -> None:
-        waiting = list(messages)
-        for _ in range(round(seconds / 0.01)):
-            self.now_us += 10_000
-            actions = list(self._vehicle.poll(self.now_us))
-            for message in waiting:
-                frame = message.pack(self._mav)
-                incoming = Incoming(1, frame, self._may_change)
-                actions += self._vehicle.handle(incoming, self.now_us)
-            waiting = []
-            for action in actions:
-                if hasattr(action, "frame") and not self._is_lost():
-                    message = self._mav.decode(bytearray(action.frame))
-                    waiting += self.client.handle(message, self.now_us) or []
-            waiting += self.client.poll(self.now_us)
-
-    def _is_lost(self) -> bool:
-        self._count += 1
-        return bool(self._lose_every) and self._count % self._lose_every == 0
-
-
-def loaded(*, may_change: bool = True) -> tuple[ParameterClient, Bench]:
+def loaded(*, may_change: bool = True) -> tuple[ParameterClient, VehicleBench]:
     """Return a client that has all parameters."""
     client = ParameterClient(1)
-    bench = Bench(client, may_change=may_change)
+    bench = VehicleBench(client, may_change=may_change)
     bench.run(client.load(bench.now_us), 2.0)
     return client, bench
 
@@ -66,7 +30,7 @@ def loaded(*, may_change: bool = True) -> tuple[ParameterClient, Bench]:
 @pytest.mark.parametrize("lose_every", [0, 3])
 def test_parameter_list_is_completed_despite_losses(lose_every: int) -> None:
     client = ParameterClient(1)
-    bench = Bench(client, lose_every=lose_every)
+    bench = VehicleBench(client, lose_every=lose_every)
     bench.run(client.load(bench.now_us), 40.0 if lose_every else 2.0)
     assert client.state is ListState.COMPLETE
     assert len(client.entries) == client.count > 90
@@ -195,7 +159,7 @@ def test_integers_are_encoded_by_the_convention_of_the_autopilot() -> None:
 @pytest.mark.parametrize("lose_every", [0, 5])
 def test_metadata_describes_every_parameter(lose_every: int) -> None:
     (parameters, _), files = loaded(), FileClient(1)
-    bench = Bench(files, lose_every=lose_every)
+    bench = VehicleBench(files, lose_every=lose_every)
     bench.run(files.read("/general.json", bench.now_us), 5.0)
     path = parameter_path(files.files["/general.json"])
     assert path == "/parameter-1.json.xz"
@@ -220,7 +184,7 @@ def test_metadata_that_describes_no_parameter_is_parsed_once(
 
     monkeypatch.setattr("gateway.panel.dialogues.parse_parameters", parse)
     dialogue = Dialogue(1)
-    bench = Bench(dialogue)
+    bench = VehicleBench(dialogue)
     bench.run(dialogue.load(bench.now_us), 10.0)
     assert len(parsed) == 1
     bench.run(dialogue.load(bench.now_us), 10.0)
@@ -229,7 +193,7 @@ def test_metadata_that_describes_no_parameter_is_parsed_once(
 
 def test_missing_file_is_refused() -> None:
     files = FileClient(1)
-    bench = Bench(files)
+    bench = VehicleBench(files)
     bench.run(files.read("/nothing.json", bench.now_us), 0.2)
     assert files.refused == {"/nothing.json"}
     assert not files.busy
