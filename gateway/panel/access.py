@@ -31,7 +31,7 @@ COOKIE: Final = "mavgate_panel"
 ROLE: Final = "mavgate.role"
 """Key of the scope with the user's role."""
 HOLDER: Final = "mavgate.holder"
-"""Key of the scope with the `Holder` of what the request opens."""
+"""Key of the scope with the `Holder` to which the request belongs."""
 MAX_BODY: Final = 1 << 20
 MAX_LOGIN_BODY: Final = 1 << 13
 LOGIN_S: Final = 10.0
@@ -308,7 +308,7 @@ class _SessionSocket:
 
 
 async def _answer(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Let a request be answered, unless the browser leaves meanwhile."""
+    """Let a request be answered, unless the browser disconnects meanwhile."""
     left = False
 
     async def heard() -> Message:

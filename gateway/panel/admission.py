@@ -43,18 +43,18 @@ LOCAL: Final = Holder(Role.OPERATOR, "", "")
 
 @dataclass(slots=True)
 class Places(Generic[Item]):
-    """Things of one kind by their holders; see the theory of operation above."""
+    """Items of one kind by their holders; see the theory of operation above."""
 
     of_session: int
     of_address: int
     of_role: int
     evict: Callable[[Item], object] | None = None
-    """Ends a thing that must make room; None if newcomers wait for room instead."""
+    """Ends an item that must make room; None if newcomers wait for room instead."""
     _held: dict[Item, Holder] = field(default_factory=dict)
     """Oldest first."""
 
     def admit(self, item: Item, holder: Holder) -> bool:
-        """Add a thing; return False, and do not add it, if there is no room for it."""
+        """Add an item; return False, and do not add it, if there is no room for it."""
         self._held.pop(item, None)
         rules: list[tuple[int, Callable[[Holder], bool]]] = [
             (self.of_address, lambda held: held.address == holder.address),
@@ -88,7 +88,7 @@ class Places(Generic[Item]):
         return self._held.get(item)
 
     def items(self) -> list[Item]:
-        """Return all that is held, oldest first."""
+        """Return all items, oldest first."""
         return [*self._held]
 
 

@@ -1,7 +1,7 @@
 """Connections to the panel: places by role, header timeouts, and clients that do not read.
 
-Any client can open connections and send nothing. A connection belongs to nobody until a request on
-it has passed access control; see `Places` for the limits. Each must send a complete request header
+Any client can open connections and send nothing. A connection has no holder until a request on it
+has passed access control; see `Places` for the limits. Each must send a complete request header
 in time, of a limited size.
 """
 
@@ -47,7 +47,7 @@ class ConnectionLimits:
         """Connections that were closed to keep to the limits."""
 
     def admit(self, client: Client, sock: socket.socket) -> None:
-        """Add a connection; an older one of nobody may be closed for it."""
+        """Add a connection; an older one without a holder may be closed for it."""
         for other in [other for other, each in self._sockets.items() if each.fileno() < 0]:
             del self._sockets[other]
             self._places.release(other)
@@ -55,7 +55,7 @@ class ConnectionLimits:
         self._places.admit(client, Holder(None, "", address_group(client[0])))
 
     def authenticate(self, client: Client, holder: Holder) -> None:
-        """Note whose connection it is: a request on it has passed access control."""
+        """Set the holder of a connection on which a request has passed access control."""
         if client in self._sockets and self._places.holder(client) != holder:
             self._places.admit(client, holder)
 

@@ -41,7 +41,7 @@ SHOWN_HZ: Final = 5.0
 
 
 class ComparisonError(ValueError):
-    """There is too little data to fuse; the text says what is missing."""
+    """There is too little data to fuse; the text names the missing data."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -190,7 +190,7 @@ class Logins:
 
 
 def _network(host: str) -> str:
-    """Return the network of an address, /24 or /64, or what else it is."""
+    """Return the network of an address, /24 or /64, or the text itself if it is none."""
     group = address_group(host)
     return group.rpartition(".")[0] or group
 

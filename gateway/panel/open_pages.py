@@ -37,7 +37,7 @@ class OpenPages:
         """Add a page that is being loaded; an older one of the same role may be deleted for it."""
         self._pages[page.id] = page, holder
         page.on_connect(lambda: self._pending.release(page.id))
-        page.on_delete(lambda: self._forget(page.id))
+        page.on_delete(lambda: self._discard(page.id))
         self._pending.admit(page.id, holder)
 
     def holder(self, page_id: str) -> Holder:
@@ -82,6 +82,6 @@ class OpenPages:
         if (known := self._pages.pop(page_id, None)) is not None:
             known[0].delete()
 
-    def _forget(self, page_id: str) -> None:
+    def _discard(self, page_id: str) -> None:
         self._pending.release(page_id)
         self._pages.pop(page_id, None)

@@ -115,7 +115,7 @@ class _Page:
             self._theme.props('flat round dense aria-label="Light or dark"')
 
     def _build_playback_bar(self) -> None:
-        """Build what marks a playback above every view."""
+        """Build the bar that marks a playback above every view."""
         with ui.element("div").classes("playback-bar").props("role=status") as self._bar:
             ui.icon("smart_display")
             self._bar_text = ui.label().classes("figure banner-title")

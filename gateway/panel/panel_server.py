@@ -128,7 +128,7 @@ def tls_files(settings: PanelSettings) -> tuple[Path | None, Path | None]:
 
 
 def without_traceback(record: logging.LogRecord) -> bool:
-    """Let a log line pass, without a traceback where a browser sent what is no text."""
+    """Let a log line pass, without a traceback where a browser sent invalid text."""
     if record.exc_info and isinstance(record.exc_info[1], UnicodeDecodeError):
         record.exc_info = None
     return True

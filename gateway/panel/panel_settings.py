@@ -142,7 +142,7 @@ class PanelSettings(Settings, frozen=True):
     )
 
     def __post_init__(self) -> None:
-        """Refuse to be open to other machines without a password, and a key of nothing."""
+        """Refuse an address for other machines without password, and a key without certificate."""
         for name in ("password", "viewer_password"):
             if (hashed := getattr(self, name)) and (why := why_weak(hashed)):
                 raise ValueError(f"{name}: {why}; `mavgate panel --hash-password` makes one")

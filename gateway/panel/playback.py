@@ -307,7 +307,7 @@ class Playback:
             # Closed meanwhile.
             return
         if self.status is None:
-            text = await self._complaint()
+            text = await self._failure()
             self.close()
             raise PlaybackError(text)
         self._watching = asyncio.create_task(self._watch())
@@ -318,7 +318,7 @@ class Playback:
             await self.refresh()
             await asyncio.sleep(WATCH_S)
 
-    async def _complaint(self) -> str:
+    async def _failure(self) -> str:
         """Return why the player ended."""
         if self._child is None or self._child.stderr is None or self._child.returncode is None:
             return "the player does not start"

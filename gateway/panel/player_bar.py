@@ -10,7 +10,7 @@ from nicegui.events import GenericEventArguments
 
 from gateway.panel.playback import SPEEDS, Playback, Profile
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.widgets import notify_failure, ongoing
+from gateway.panel.widgets import notify_failure, progress_shown
 
 POSITION_S: Final = 0.25
 
@@ -18,7 +18,7 @@ POSITION_S: Final = 0.25
 async def open_playback(context: ViewContext, name: str, *, fused_again: bool = False) -> None:
     """Play a recording on this page, instead of the present one."""
     folder = context.parts.recordings_folder
-    with ongoing(f"Opening {name} …"), notify_failure(context):
+    with progress_shown(f"Opening {name} …"), notify_failure(context):
         context.check_may_change()
         await context.playback.open(folder, name, fused_again=fused_again)
 

@@ -1,4 +1,4 @@
-"""REST: where to point an antenna at a live vehicle, from home, a place or another system."""
+"""REST: where to point an antenna at a live vehicle, from home, a location or another system."""
 
 import dataclasses
 from collections.abc import Callable
@@ -21,10 +21,10 @@ def pointing_router(fleet: FleetState, now_us: Callable[[], int]) -> APIRouter:
         if system_id not in states:
             raise HTTPException(HTTPStatus.NOT_FOUND, f"no vehicle {system_id}")
         try:
-            place = station_from(station)
+            antenna = station_from(station)
         except ValueError as error:
             raise HTTPException(HTTPStatus.BAD_REQUEST, str(error)) from None
-        found = pointing_of(place, states[system_id], states, now_us())
+        found = pointing_of(antenna, states[system_id], states, now_us())
         if found is None:
             reason = "the vehicle or the station has no valid position, or they are too near"
             raise HTTPException(HTTPStatus.CONFLICT, reason)

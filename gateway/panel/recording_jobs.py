@@ -73,7 +73,7 @@ class _Export:
     role: Role | None
     task: "asyncio.Task[Path] | None" = None
     users: int = 0
-    """Those who have asked for it and not fetched it."""
+    """Requests for it whose file was not fetched yet."""
     token: str = ""
     size: int = 0
 
@@ -134,7 +134,7 @@ class RecordingJobs:
         return f"{EXPORTS}{export.token}"
 
     def close(self) -> None:
-        """Delete what was made."""
+        """Stop all jobs, and delete their files."""
         if self._indexing is not None:
             self._indexing.cancel()
         for export in self._exports.values():

@@ -33,14 +33,14 @@ SCRIPT: Final = re.compile(rb"<script(?=[\s>])")
 def with_headers(send: Send, added: Mapping[str, str] = HEADERS) -> Send:
     """Return a `send` that adds headers to a response, by default those for security."""
 
-    async def dressed(message: Message) -> None:
+    async def with_added(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
             headers.update(added)
             headers.setdefault("content-security-policy", NO_SCRIPT_POLICY)
         await send(message)
 
-    return dressed
+    return with_added
 
 
 class ScriptNonces:
@@ -58,7 +58,7 @@ class ScriptNonces:
         begin: Message | None = None
         body = b""
 
-        async def dressed(message: Message) -> None:
+        async def with_added(message: Message) -> None:
             nonlocal begin, body
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
@@ -78,4 +78,4 @@ class ScriptNonces:
             await send(begin)
             await send({"type": "http.response.body", "body": body})
 
-        await self.app(scope, receive, dressed)
+        await self.app(scope, receive, with_added)

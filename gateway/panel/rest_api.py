@@ -61,8 +61,8 @@ class _Entry:
             "message": to_json(self.message),
             "status": {
                 "time": {
-                    "first_update": _written(self.first_s),
-                    "last_update": _written(self.last_s),
+                    "first_update": _iso_time(self.first_s),
+                    "last_update": _iso_time(self.last_s),
                     "counter": self.counter,
                     "frequency": (self.counter - 1) / span_s if span_s > 0 else 0.0,
                 }
@@ -159,7 +159,7 @@ def plain_entry(value: object) -> dict[str, Any]:
     return value.as_json()
 
 
-def _written(time_s: float) -> str:
+def _iso_time(time_s: float) -> str:
     return datetime.fromtimestamp(time_s, UTC).astimezone().isoformat()
 
 
@@ -399,7 +399,7 @@ class RestApi:
         return router
 
     async def _read_all(self, socket: WebSocket, subscriber: Subscriber) -> None:
-        """Carry out what an operator sends; end the connection of a viewer that sends."""
+        """Handle the messages of an operator; end the connection of a viewer that sends."""
         is_operator = socket.scope[ROLE] is Role.OPERATOR
         with suppress(WebSocketDisconnect):
             while (given := await socket.receive())["type"] == "websocket.receive":

@@ -81,7 +81,7 @@ class GatewayWatch:
             self._task.cancel()
 
     async def refresh(self) -> None:
-        """Poll now; what is known then is not older than the call."""
+        """Poll now; the status is not older than the call then."""
         async with self._asking:
             try:
                 status = await self._control.ask("status")
@@ -113,7 +113,7 @@ FIRST_COMPONENT: Final = 25
 USER_COMPONENTS: Final = 75
 """MAV_COMP_ID_USER1 and on: two panels of one gateway must not be taken for one."""
 HEARTBEAT_S: Final = 1.0
-KNOCK_S: Final = 0.2
+PROBE_S: Final = 0.2
 """Between heartbeats while nothing is received: the first one may come before the socket is
 open."""
 SILENT_US: Final = 3 * US_PER_S
@@ -154,7 +154,7 @@ class Uplink:
         self._listeners: list[Callable[[Any], None]] = []
         self._heard: bytes | None = None
         self._heard_us = -SILENT_US
-        self._local = self._told = ""
+        self._local = self._reported = ""
         self._acks: dict[tuple[int, int], asyncio.Queue[int]] = {}
         self._task: asyncio.Task[None] | None = None
 
@@ -273,15 +273,15 @@ class Uplink:
             if self.is_local and not self.is_alive:
                 await self._find_gateway()
             self.send(beat)
-            await asyncio.sleep(HEARTBEAT_S if self.is_alive else KNOCK_S)
+            await asyncio.sleep(HEARTBEAT_S if self.is_alive else PROBE_S)
 
     async def _find_gateway(self) -> None:
         """Ask the gateway on this machine for a separate port, and connect to it."""
         try:
             port = await self._local_port()
         except ControlError as error:
-            if str(error) != self._told:
-                self._told = str(error)
+            if str(error) != self._reported:
+                self._reported = str(error)
                 log.warning("no MAVLink yet: %s", error)
             return
         url = f"udp:127.0.0.1:{port}?name=gateway"

@@ -79,7 +79,7 @@ def asking(title: str, look: str = "") -> Iterator[ui.dialog]:
 
 
 @contextmanager
-def ongoing(text: str) -> Iterator[None]:
+def progress_shown(text: str) -> Iterator[None]:
     """Show on the page that something takes its time."""
     note = ui.notification(printable(text), spinner=True, timeout=None, type="ongoing")
     try:
@@ -88,10 +88,12 @@ def ongoing(text: str) -> Iterator[None]:
         note.dismiss()
 
 
-def closing(dialog: ui.dialog, act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
-    """Return what closes a dialog and then acts, for a button in it.
+def close_and(
+    dialog: ui.dialog, act: Callable[[], Awaitable[Any]]
+) -> Callable[[], Awaitable[None]]:
+    """Return a function that closes a dialog and then acts, for a button in it.
 
-    What it shows is shown on the page: the dialog is deleted before a slow link has answered.
+    Its notifications appear on the page: the dialog is deleted before a slow link has answered.
     """
     page = ui.context.client
 
@@ -106,9 +108,9 @@ def closing(dialog: ui.dialog, act: Callable[[], Awaitable[Any]]) -> Callable[[]
 def confirm(
     question: str, word: str, act: Callable[[], Awaitable[Any]], *, grave: bool = True
 ) -> None:
-    """Ask for confirmation, and act on a yes; a grave act has a red button."""
+    """Ask for confirmation, and then act; the button of a grave act is red."""
     with asking(question) as dialog:
-        button = ui.button(word, on_click=closing(dialog, act)).props("no-caps")
+        button = ui.button(word, on_click=close_and(dialog, act)).props("no-caps")
         button.props("color=negative" if grave else "")
 
 
@@ -245,7 +247,7 @@ class RecorderControls:
     def _ask_save(self) -> None:
         with asking("Name for this recording, or the last one") as dialog:
             name = ui.input().props('dense outlined autofocus aria-label="Name of the recording"')
-            save = closing(dialog, lambda: self._save(name.value.strip()))
+            save = close_and(dialog, lambda: self._save(name.value.strip()))
             name.on("keydown.enter", save)
             ui.button("Save", on_click=save).props("no-caps")
 

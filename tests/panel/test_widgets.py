@@ -125,10 +125,10 @@ def test_failed_comparison_reports_the_reason_and_can_be_repeated(
     card, failures = comparison_of(monkeypatch, [error, ComparisonError("no samples")])
     with pytest.raises(type(error)):
         asyncio.run(card._compare())
-    assert (card._story.text, card._button.enabled) == (text, True)
+    assert (card._summary.text, card._button.enabled) == (text, True)
     asyncio.run(card._compare())
     again = "Cannot be compared: no samples."
-    assert (card._story.text, card._button.enabled) == (again, True)
+    assert (card._summary.text, card._button.enabled) == (again, True)
     assert failures == []
 
 

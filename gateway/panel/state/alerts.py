@@ -14,7 +14,7 @@ from gateway.units import US_PER_S
 
 SILENT_S: Final = 5.0
 FIX_OLD_US: Final = 5 * US_PER_S
-SHOUT_US: Final = 20 * US_PER_S
+TEXT_ALERT_US: Final = 20 * US_PER_S
 """How long a severe text of any vehicle is shown as an alert."""
 
 SENSORS: Final = {
@@ -92,8 +92,8 @@ def _sensors(vehicle: VehicleState) -> list[Alert]:
     present, enabled, healthy = (
         status[f"onboard_control_sensors_{word}"] for word in ("present", "enabled", "health")
     )
-    ill = present & enabled & ~healthy
-    names = [name for bit, name in SENSORS.items() if ill & bit]
+    unhealthy = present & enabled & ~healthy
+    names = [name for bit, name in SENSORS.items() if unhealthy & bit]
     if not names:
         return []
     return [Alert("sensors", AlertLevel.WARNING, "Sensors not healthy", ", ".join(names))]
@@ -114,7 +114,7 @@ def _texts(vehicle: VehicleState, now_us: int) -> list[Alert]:
                 ended = keys.format(re.escape(match[1]))
                 standing = {k: v for k, v in standing.items() if not re.fullmatch(ended, k)}
         grave = text.severity <= mavlink.MAV_SEVERITY_CRITICAL
-        if grave and not is_known and now_us - text.time_us < SHOUT_US:
+        if grave and not is_known and now_us - text.time_us < TEXT_ALERT_US:
             key = f"text {text.number}"
             standing[key] = Alert(key, AlertLevel.CRITICAL, text.text)
     return list(standing.values())

@@ -204,7 +204,7 @@ class CalibrationRun:
                 self._add_sample(_milli(message))
 
     def poll(self, now_us: int) -> None:
-        """Notice missing answers."""
+        """Fail if an answer is missing; end the evaluation after its time."""
         if self.state is RunState.ASKED and now_us - self._heard_us > NO_ANSWER_US:
             self._fail("the aircraft does not answer")
         elif self.state is RunState.RUNNING and now_us - self._began_us > GIVEN_UP_US:

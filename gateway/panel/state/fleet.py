@@ -36,7 +36,7 @@ class FleetState:
         self.origins: dict[int, Origin] = {}
         """Of played aircraft, by their played system ids."""
         self.version = 0
-        """Counts the messages, so that a reader knows whether there is new data."""
+        """Counts the messages, so that a reader can detect new data."""
         self._components = VehicleComponents()
         self._listeners: list[Listener] = []
         self._on_discard: list[Callable[[int], None]] = []

@@ -149,7 +149,7 @@ MAX_PLAIN: Final = 16_000_000
 
 
 class ParameterChoice(msgspec.Struct, frozen=True):
-    """One value of a parameter, and what it means."""
+    """One value of a parameter, and its meaning."""
 
     value: float
     description: str = ""
@@ -217,7 +217,7 @@ MAX_ATTEMPTS: Final = 5
 MAX_PARAMETERS: Final = 5000
 """Large autopilots have some 1500; more are forged."""
 NOT_REQUESTED: Final = 65_535
-"""The index that a value may have which nobody asked for by its index."""
+"""The index of a value that was not requested by its index."""
 AUTOPILOT: Final = mavlink.MAV_COMP_ID_AUTOPILOT1
 
 ERRORS: Final = {

@@ -17,7 +17,7 @@ class TimedText:
     """One text."""
 
     number: int
-    """Counts up from 1, so that a page knows which are new."""
+    """Counts up from 1, so that a page can find the new ones."""
     time_us: int
     """On the panel's clock."""
     severity: int

@@ -50,7 +50,7 @@ TITLES: Final = {
     CalibrationStep.LEVEL: ("Level", "horizontal_rule", "as it flies, at rest, 3 s"),
     CalibrationStep.MAG: ("Magnetometer", "explore", "turn it about all axes"),
 }
-WHAT_TO_DO: Final = {
+INSTRUCTIONS: Final = {
     CalibrationStep.GYRO: "Lay the aircraft down and do not touch it until this is done.",
     CalibrationStep.ACCEL: "Rest it on each of its six sides in turn, for two seconds each, in any "
     "order. A wall or a box helps; small tilts do no harm.",
@@ -175,7 +175,7 @@ class CalibrationView:
         runs = run is not None and not run.state.is_over
         done = run is not None and run.state is RunState.DONE
         look = "good" if done else "" if run is None or runs else "bad"
-        self._now.classes(look, replace="now").set_text(self._what_now(run, ready=ready))
+        self._now.classes(look, replace="now").set_text(self._instruction(run, ready=ready))
         self._progress.set_visibility(runs)
         for name, shown in (("cancel", runs), ("store", done), ("undo", done), ("start", not runs)):
             self._buttons[name].set_visibility(shown)
@@ -266,7 +266,7 @@ class CalibrationView:
         """Return why nothing can be calibrated now; empty if it can."""
         return self._context.why_fixed or ("" if ready else "The parameters are being read.")
 
-    def _what_now(self, run: CalibrationRun | None, *, ready: bool) -> str:
+    def _instruction(self, run: CalibrationRun | None, *, ready: bool) -> str:
         vehicle = self._context.vehicle
         if vehicle is None:
             return "No aircraft is heard."
@@ -274,14 +274,14 @@ class CalibrationView:
             return "This aircraft is played from a recording. Choose a live one to calibrate it."
         if run is None or run.state is RunState.ASKED:
             waits = "" if ready else " Reading the parameters first, so that it can be undone …"
-            return WHAT_TO_DO[self._step] + waits
+            return INSTRUCTIONS[self._step] + waits
         if run.state is RunState.FAILED:
             return f"Not calibrated: {printable(run.trouble)}. Nothing has changed; try again."
         if run.state is RunState.CHECKING:
             return "Done. Measuring the remaining error; leave it as it is for a moment."
         if run.state is RunState.DONE:
             return "Calibrated, and in use until the gateway ends. Keep it for good?"
-        return WHAT_TO_DO[self._step]
+        return INSTRUCTIONS[self._step]
 
     def _build_poses(self) -> None:
         self._poses = {}

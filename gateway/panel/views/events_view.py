@@ -32,7 +32,7 @@ def build_banner(context: ViewContext) -> None:
         nonlocal shown
         vehicle = context.vehicle
         if vehicle is None or not vehicle.is_live:
-            # What was wrong in a recording must not look like a problem of now.
+            # Alerts of a recording would look like present ones.
             alerts = []
         else:
             alerts = alerts_of(vehicle, context.now_us)

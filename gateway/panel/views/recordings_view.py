@@ -21,11 +21,11 @@ from gateway.panel.widgets import (
     RowButton,
     UploadButton,
     asking,
-    closing,
+    close_and,
     confirm,
     heading,
     notify_failure,
-    ongoing,
+    progress_shown,
 )
 from gateway.printable import figure, printable
 from gateway.recordings.index import Recording, delete_recording, list_recordings
@@ -119,13 +119,13 @@ class RecordingsView:
     def _ask_export(self, name: str) -> None:
         with asking(f"Export {name}") as dialog:
             for kind, (label, _, _) in FORMATS.items():
-                export = closing(dialog, partial(self._export, name, kind))
+                export = close_and(dialog, partial(self._export, name, kind))
                 ui.button(label, on_click=export).props("no-caps outline")
 
     async def _export(self, name: str, kind: str) -> None:
         parts = self._context.parts
         text = f"{name}: making {FORMATS[kind][0]} …"
-        with notify_failure(self._context), ongoing(text):
+        with notify_failure(self._context), progress_shown(text):
             holder = parts.pages.holder(self._context.page)
             url = await parts.jobs.export(parts.recordings_folder, name, kind, holder)
             ui.download.from_url(url)

@@ -158,7 +158,7 @@ class ComparisonCard:
                 self._quantity.props('dense borderless options-dense aria-label="Compared"')
                 self._button = ui.button("Compare", icon="compare", on_click=self._compare)
                 self._button.props("no-caps unelevated dense")
-            self._story = ui.label(
+            self._summary = ui.label(
                 "Fuses the sensor data of the last three minutes with every estimator, each "
                 "with the present parameters."
             ).classes("soft")
@@ -196,20 +196,20 @@ class ComparisonCard:
         values = {name: entry.value for name, entry in parameters.items()}
         self._is_fusing = True
         self._refresh()
-        self._story.set_text("Fusing …")
+        self._summary.set_text("Fusing …")
         try:
             self._estimates = await compare_apart(context.parts.samples.frames(system_id), values)
         except ComparisonError as error:
-            self._story.set_text(f"Cannot be compared: {error}.")
+            self._summary.set_text(f"Cannot be compared: {error}.")
             return
         except Exception as error:
-            self._story.set_text(f"Cannot be compared: {reason_of(error)}.")
+            self._summary.set_text(f"Cannot be compared: {reason_of(error)}.")
             raise
         finally:
             self._is_fusing = False
             self._refresh()
         seconds = np.ptp(self._estimates[0].time_us) / 1e6
-        self._story.set_text(f"The last {seconds:.0f} s, and the aircraft's own estimate.")
+        self._summary.set_text(f"The last {seconds:.0f} s, and the aircraft's own estimate.")
         self._chart.set_visibility(True)
         self._draw()
 
@@ -351,7 +351,7 @@ class TuningView:
             row.refresh(dialogue)
 
     def _draw(self, _: Any = None) -> None:
-        """Build the visible rows; leave them as they are, with what is typed, if none changes."""
+        """Build the visible rows; leave them as they are, with typed text, if none changes."""
         dialogue = self._context.dialogue
         names = [] if dialogue is None else self._wanted(dialogue)
         metas = {} if dialogue is None else {name: dialogue.metas.get(name) for name in names}
