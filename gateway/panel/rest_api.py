@@ -341,7 +341,10 @@ class RestApi:
     async def read(self, request: Request, path: str) -> Response:
         """Return a part of that: `vehicles/1/components/1/messages/ATTITUDE/message/roll`."""
         try:
-            found = self._book.look_up(path, _systems_of(request.query_params))
+            systems = _systems_of(request.query_params)
+            async with self._encoding:
+                found = self._book.look_up(path, systems)
+                await asyncio.sleep(0)
             return StreamingResponse(encode_in_pieces(found, self._encoding), media_type=JSON)
         except KeyError:
             return Response(NOTHING, media_type=JSON)

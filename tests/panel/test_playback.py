@@ -4,7 +4,6 @@ import asyncio
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
 from gateway.live.control_socket import ControlError
@@ -16,12 +15,8 @@ from gateway.panel.playback import (
     PlaybackError,
     Profile,
     RecordedAircraft,
-    look_into,
 )
 from gateway.panel.state.fleet import FleetState, Origin
-from gateway.recordings.columns import row_to_line
-from gateway.recordings.table import TableHeader, encode_head
-from tests.analysis.test_flight import rows
 from tests.panel.messages import heartbeat
 
 
@@ -128,13 +123,6 @@ async def test_opening_waits_for_a_player_that_refuses_at_first(
     assert playback.status == {"state": "playing", "position_s": 0.0}
     playback.close()
     assert playback.status is None
-
-
-def test_aircraft_of_a_table_is_that_of_its_header(tmp_path: Path) -> None:
-    path = tmp_path / "day_01_v7.csv"
-    header = msgspec.structs.replace(TableHeader(), vehicle_id=7)
-    path.write_text(encode_head(header) + "".join(map(row_to_line, rows(raw=False))))
-    assert [[one.recorded_id for one in flight] for flight in look_into([path])] == [[7]]
 
 
 async def test_recording_is_visible_only_on_the_page_that_opened_it() -> None:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.config import GatewaySettings
@@ -44,10 +45,11 @@ def test_heights_of_a_table_are_those_of_its_states(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 10))[0])
+    header = replace(header, vehicle_id=7)
     table = tmp_path / "a_01_v1.csv"
     table.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
     ((found,),) = look_into([table])
-    assert (found.recorded_id, found.origin) == (header.vehicle_id, FUSED_AGAIN)
+    assert (found.recorded_id, found.origin) == (7, FUSED_AGAIN)
     assert found.profile.time_s[-1] == pytest.approx(10.0, abs=0.5)
     heights = [row.state.alt_amsl_m for row in rows if row.state is not None]
     assert set(found.profile.alt_amsl_m) <= set(heights)
