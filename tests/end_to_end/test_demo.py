@@ -1,7 +1,7 @@
 """`mavgate demo` as a ground station meets it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
@@ -40,11 +40,19 @@ def test_every_message_arrives_and_stopping_is_clean(
     assert "Traceback" not in gateway.log.read_text()
 
 
+@pytest.fixture(scope="module")
+def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    """Start one gateway for the clients, which change nothing."""
+    with Gateway(tmp_path_factory.mktemp("gateway"), "demo") as running:
+        client = Client(running.port)
+        client.until(lambda seen: "HEARTBEAT" in seen)
+        client.sock.close()
+        yield running
+
+
 def test_client_that_sends_to_listening_port_is_served(
-    start_gateway: Callable[..., Gateway], connect: Callable[..., Client]
+    gateway: Gateway, connect: Callable[..., Client]
 ) -> None:
-    gateway = start_gateway("demo")
-    connect(gateway.port).until(lambda seen: "HEARTBEAT" in seen)
     guest = connect()
     beat = mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3
@@ -53,10 +61,7 @@ def test_client_that_sends_to_listening_port_is_served(
     guest.until(lambda seen: {"HEARTBEAT", "ATTITUDE_QUATERNION"} <= set(seen))
 
 
-async def test_mavsdk_sees_vehicle_attitude_and_position(
-    start_gateway: Callable[..., Gateway],
-) -> None:
-    gateway = start_gateway("demo")
+async def test_mavsdk_sees_vehicle_attitude_and_position(gateway: Gateway) -> None:
     async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
         async for position in telemetry.subscribe_position():
@@ -72,9 +77,8 @@ async def test_mavsdk_sees_vehicle_attitude_and_position(
 
 
 def test_mavproxy_sees_vehicle_attitude_and_position(
-    start_gateway: Callable[..., Gateway], start_mavproxy: Callable[[int], MavProxy]
+    gateway: Gateway, start_mavproxy: Callable[[int], MavProxy]
 ) -> None:
-    gateway = start_gateway("demo")
     proxy = start_mavproxy(gateway.port)
     proxy.until(r"Detected vehicle 1:1")
     proxy.until(r"Home set by GPS")

@@ -1,7 +1,6 @@
 """Recordings read and played to mavlogdump, MAVProxy, MAVSDK and a bare client."""
 
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,11 +9,10 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.live.control_socket import request
-from gateway.recordings.tlog import TlogRecord, TlogScanner
+from gateway.recordings.tlog import TlogRecord
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import Client, Gateway, MavProxy, mavsdk_system
 from tests.end_to_end.test_demo import NEAR_DEG
-from tests.kit.cli import invoke
 from tests.kit.mavlink import Sender
 from tests.kit.process import START_LIMIT_S, Process
 from tests.ports import free_port
@@ -149,39 +147,6 @@ def test_recorded_vehicle_answers_a_ground_station(
     client.send(home, address[1])
     seen = client.until(lambda seen: {"COMMAND_ACK", "HOME_POSITION"} <= seen.keys())
     assert seen["COMMAND_ACK"].result == mavlink.MAV_RESULT_ACCEPTED
-
-
-def test_live_recording_is_read_by_mavlogdump_and_fused_bit_for_bit(
-    start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
-) -> None:
-    config = """
-[hub]
-endpoints = ["udp:127.0.0.1:{port}", "udp-listen:127.0.0.1:{listen}"]
-
-[recording]
-folder = "FOLDER"
-"""
-    gateway = start_gateway("demo", "--record", config=config.replace("FOLDER", str(tmp_path)))
-    connect(gateway.port).until(lambda seen: "HIGHRES_IMU" in seen)
-    assert gateway.end() == 0
-    path, *_ = sorted(tmp_path.glob("*.tlog"))
-    batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
-    assert batch.damage == ()
-    dumped = subprocess.run(
-        [sys.executable, str(Path(sys.executable).parent / "mavlogdump.py"), str(path)],
-        capture_output=True,
-        text=True,
-        timeout=START_LIMIT_S,
-        check=True,
-    )
-    lines = [line for line in dumped.stdout.splitlines() if " {" in line]
-    assert len(lines) == len(batch)
-    assert "BAD_DATA" not in dumped.stdout
-    table, *_ = sorted(tmp_path.glob("*_v1.csv"))
-    again = tmp_path / "again.csv"
-    done = invoke("fuse", table, "-o", again)
-    assert done.exit_code == 0, done.output
-    assert again.read_bytes() == table.read_bytes()
 
 
 def test_mavproxy_sees_the_recorded_vehicle(
