@@ -1,24 +1,20 @@
 """The commands that read recordings, run as people run them."""
 
 import gzip
-import json
 import math
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
-from pymavlink import mavutil
-from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.table import TableFault, TableHeader, TableReader
-from gateway.recordings.tlog import TlogRecord
 from gateway.wire.mavlink_splitter import origin_of
 from tests.kit.cli import run
 from tests.recordings.flights import flown_table
-from tests.recordings.frames import START_US, make_records, make_tlog, read_tlog
+from tests.recordings.frames import make_records, make_tlog, read_tlog
 
 pytestmark = pytest.mark.io
 
@@ -65,14 +61,6 @@ def test_range_without_samples_is_refused(
         assert not out.exists()
 
 
-def test_tlogs_are_joined_in_order_of_time(tmp_path: Path) -> None:
-    for name, records in (("a", RECORDS[::2]), ("b", RECORDS[1::2])):
-        (tmp_path / f"{name}.tlog").write_bytes(make_tlog(records))
-    out = tmp_path / "all.tlog"
-    run("convert", tmp_path / "b.tlog", tmp_path / "a.tlog", "-o", out)
-    assert read_tlog(out) == RECORDS
-
-
 def test_existing_output_is_overwritten_only_with_force(tlog: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.tlog"
     out.write_text("dear")
@@ -80,22 +68,6 @@ def test_existing_output_is_overwritten_only_with_force(tlog: Path, tmp_path: Pa
     assert out.read_text() == "dear"
     run("convert", tlog, "-o", out, "--force")
     assert read_tlog(out) == RECORDS
-
-
-def test_table_fused_again_is_identical(table: Path, tmp_path: Path) -> None:
-    out = tmp_path / "again.csv"
-    run("fuse", table, "-o", out)
-    assert out.read_bytes() == table.read_bytes()
-
-
-def test_table_fused_with_other_settings_has_other_states(table: Path, tmp_path: Path) -> None:
-    config = tmp_path / "other.toml"
-    config.write_text('[estimation]\nestimator = "paper"\n')
-    out = tmp_path / "again.csv"
-    run("fuse", table, "-o", out, "--fuse-with", "current", "--config", config)
-    (_, before), (_, after) = read_table(table), read_table(out)
-    assert [row.raw for row in after] == [row.raw for row in before]
-    assert after[-1].state != before[-1].state
 
 
 def test_interpolated_positions_lie_on_lines_between_fixes(table: Path, tmp_path: Path) -> None:
@@ -108,21 +80,6 @@ def test_interpolated_positions_lie_on_lines_between_fixes(table: Path, tmp_path
     middle = rows[len(rows) // 2].state
     assert middle is not None
     assert middle.alt_amsl_m == pytest.approx(np.interp(middle.time_us, times - latency_us, alts))
-
-
-@pytest.mark.parametrize("ending", ["kml", "gpx", "geojson"])
-def test_tables_of_two_aircraft_are_drawn_as_two(table: Path, tmp_path: Path, ending: str) -> None:
-    other, out = tmp_path / "other.csv", tmp_path / f"track.{ending}"
-    other.write_bytes(table.read_bytes().replace(b'"vehicle_id":1', b'"vehicle_id":2', 1))
-    text = run("convert", other, table, "-o", out)
-    assert "Dropped: samples" in text
-    drawn = out.read_text()
-    assert drawn.index("aircraft 1") < drawn.index("aircraft 2")
-    if ending == "geojson":
-        features = json.loads(drawn)["features"]
-        lines = [f for f in features if f["geometry"]["type"] == "LineString"]
-        assert [line["properties"]["name"] for line in lines] == ["aircraft 1", "aircraft 2"]
-        assert min(len(line["geometry"]["coordinates"]) for line in lines) > 50
 
 
 def test_tables_of_two_aircraft_become_one_tlog(table: Path, tmp_path: Path) -> None:
@@ -140,30 +97,6 @@ def test_map_of_a_flight_without_position_is_refused(tlog: Path, tmp_path: Path)
     text = run("convert", tlog, "-o", tmp_path / "out.kml", code=2)
     assert f"{tlog}: nothing to draw, since the flight has no position" in text
     assert not (tmp_path / "out.kml").exists()
-
-
-def test_tlog_of_an_autopilot_is_converted_to_a_fused_table(tmp_path: Path) -> None:
-    mav = mavlink.MAVLink(None, 4, 1)
-    records = []
-    for i in range(1000):
-        messages = [mavlink.MAVLink_raw_imu_message(20_000 * i, 0, 0, -1000, 0, 0, 0, 200, 0, 400)]
-        if i % 10 == 0:
-            fix = (20_000 * i, 3, 471_000_000, 85_000_000, 430_000, 100, 100, 0, 0, 11)
-            messages.append(mavlink.MAVLink_gps_raw_int_message(*fix))
-        for message in messages:
-            frame = bytes(message.pack(mav))
-            records.append(TlogRecord(START_US + 20_000 * i, frame))
-    source, out = tmp_path / "autopilot.tlog", tmp_path / "flight.csv"
-    source.write_bytes(make_tlog(records))
-    run("convert", source, "-o", out)
-    header, rows = read_table(out)
-    assert (header.vehicle_id, header.unix_us_at_zero) == (4, START_US)
-    states = [row.state for row in rows if row.state is not None]
-    assert len(states) == 1000
-    assert states[-1].lat_deg == pytest.approx(47.1, abs=1e-6)
-    again = tmp_path / "again.csv"
-    run("fuse", out, "-o", again)
-    assert again.read_bytes() == out.read_bytes()
 
 
 def test_foreign_csv_is_converted_by_its_column_map(tmp_path: Path) -> None:
@@ -225,15 +158,6 @@ def test_part_given_twice_is_taken_once_and_reported(table: Path, tmp_path: Path
     )
     assert f"left out {len(recorded) - 1} rows that overlap" in text
     assert times == [*recorded, recorded[-1]]
-
-
-def test_info_as_json(tlog: Path, table: Path) -> None:
-    info = json.loads(run("info", tlog, "--json"))
-    assert (info["kind"], info["records"]) == ("tlog", 500)
-    assert info["duration_s"] == pytest.approx(9.98)
-    info = json.loads(run("info", table, "--json"))
-    assert info["kind"] == "table"
-    assert info["header"]["vehicle_id"] == 1
 
 
 def test_info_as_text_reports_incomplete_and_damaged_records(tlog: Path) -> None:
@@ -331,11 +255,6 @@ def test_tables_of_two_aircraft_are_not_joined(table: Path, tmp_path: Path) -> N
     assert "aircraft 1 and 2" in text
 
 
-def test_recover_copies_an_undamaged_file(tlog: Path, tmp_path: Path) -> None:
-    assert "nothing was damaged" in run("recover", tlog)
-    assert (tmp_path / "flight.recovered.tlog").read_bytes() == tlog.read_bytes()
-
-
 def test_record_commands_manage_files_without_a_gateway(tmp_path: Path) -> None:
     config = tmp_path / "x.toml"
     config.write_text(f'[recording]\nfolder = "{tmp_path}/rec"\n')
@@ -350,24 +269,6 @@ def test_record_commands_manage_files_without_a_gateway(tmp_path: Path) -> None:
     assert [path.name for path in folder.glob("*.tlog")] == ["first flight_01.tlog"]
     run("record", "delete", "last", "--yes", "-c", config)
     assert list(folder.glob("*.tlog")) == []
-
-
-@pytest.mark.parametrize("command", ["convert", "fuse"])
-def test_marks_stay_between_their_rows(table: Path, tmp_path: Path, command: str) -> None:
-    mark = '# mark: {"time_us":123456,"text":"over the wood"}'
-    lines = table.read_text().splitlines()
-    lines.insert(len(lines) // 2, mark)
-    table.write_text("\n".join(lines) + "\n")
-    out = tmp_path / "again.csv"
-    run(command, table, "-o", out)
-    assert out.read_text().splitlines().index(mark) == lines.index(mark)
-    run("convert", table, "-o", tmp_path / "again.tlog")
-    log = mavutil.mavlogfile(str(tmp_path / "again.tlog"))
-    texts = []
-    while (message := log.recv_match(type="STATUSTEXT")) is not None:
-        texts.append(message.text)
-    log.close()
-    assert "Mark: over the wood" in texts
 
 
 @pytest.mark.parametrize("ending", ["csv", "tlog", "kml", "gpx", "geojson", "mcap", "parquet"])

@@ -237,12 +237,6 @@ def test_dataflash_with_a_restart_keeps_every_sample(tmp_path: Path, after_us: i
     assert rates(short)["imu"] == 618
 
 
-@pytest.mark.parametrize("count", [2, 700, 5000])
-def test_erased_flash_before_a_dataflash_log_is_skipped(tmp_path: Path, count: int) -> None:
-    path = dataflash(tmp_path / "flash.log", *RECENT, *recent_log(), before=b"\xff" * count)
-    assert rates(path) == {"imu": 600, "gps": 60}
-
-
 @pytest.mark.parametrize(
     ("formats", "reason"),
     [

@@ -6,15 +6,10 @@ import math
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from gateway.recordings.columns import TableRow, row_to_line
-from gateway.recordings.recorded_table import header_for
-from gateway.recordings.table import TableReader, encode_head, encode_line
 from tests.kit.cli import invoke
 from tests.kit.cli import run as run_words
-from tests.recordings.flights import fly_from_the_middle
 from tools.make_golden import GOLDEN
 
 pytestmark = pytest.mark.io
@@ -55,47 +50,12 @@ def test_one_row_per_sample_with_position_and_true_heading(log: Path, estimator:
     assert known == (estimator != "paper")
 
 
-def test_recording_cut_in_its_middle_is_fused_to_its_recorded_states(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
-    settings, state, rows = fly_from_the_middle("eskf", rng)
-    path = tmp_path / "flight.csv"
-    head = encode_head(header_for(settings, 1)) + encode_line(state)
-    path.write_text(head + "".join(map(row_to_line, rows)))
-    recorded = [row.state for row in rows if row.state]
-    again = run(path)
-    assert [row["nav_q_w"] for row in again] == [repr(known.q_nb[0]) for known in recorded]
-    assert [row["nav_lat_deg"] for row in again] == [repr(known.lat_deg) for known in recorded]
-
-
-def test_output_is_a_readable_table(log: Path) -> None:
-    run(log)
-    reader = TableReader()
-    events = reader.feed(log.with_name("out.csv").read_bytes(), final=True)
-    assert reader.header is not None
-    assert [type(event) for event in events] == [TableRow] * 500
-    assert all(event.state is not None for event in events if isinstance(event, TableRow))
-
-
-def test_unknown_states_are_blank(log: Path) -> None:
-    first = run(log, "--estimator", "eskf")[0]
-    assert first["nav_lat_deg"] == ""
-    assert first["nav_q_w"] != ""
-
-
 def test_settings_file_overrides_facts_of_the_log(log: Path) -> None:
     config = log.with_name("c.toml")
     config.write_text('[estimation.reference]\ndeclination = "fixed"\ndeclination_deg = -20.0\n')
     last = run(log, "--estimator", "eskf", "--config", str(config))[-1]
     yaw = 2.0 * math.atan2(float(last["nav_q_z"]), float(last["nav_q_w"]))
     assert math.degrees(yaw) == pytest.approx(-20.0, abs=0.5)
-
-
-def test_file_without_needed_columns_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "other.csv"
-    path.write_text("a,b\n1,2\n")
-    invoke("fuse", path, "-o", tmp_path / "out.csv", code=2)
-    assert not (tmp_path / "out.csv").exists()
 
 
 @pytest.mark.parametrize("force", [[], ["--force"]])

@@ -1,17 +1,14 @@
 """Every command on recordings accepts the names that `info` lists."""
 
-import gzip
 import json
 import socket
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from types import SimpleNamespace
 
 import msgspec
 import pytest
 
-from gateway.analysis.flight import Flight
 from gateway.cli.live.demo import recorded_line
 from gateway.cli.recorded import play
 from gateway.cli.support.options import read_options
@@ -99,28 +96,6 @@ def test_play_accepts_a_name(config: Path, tmp_path: Path, monkeypatch: pytest.M
     assert len(played) == 2
 
 
-def test_report_accepts_a_name(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Fusing it in every way and drawing it is tested elsewhere, and takes long."""
-    reported: list[Flight] = []
-
-    def note(flight: Flight, **_: object) -> SimpleNamespace:
-        reported.append(flight)
-        return SimpleNamespace(sections=[], smoothed_latency_s=None)
-
-    monkeypatch.setattr("gateway.analysis.case.make_case", note)
-    monkeypatch.setattr("gateway.analysis.reporting.compose.make_report", lambda case, _: case)
-    monkeypatch.setattr(
-        "gateway.analysis.reporting.page.write_report", lambda _, folder, __: folder / "index.html"
-    )
-    assert "index.html" in run("report", "alps", "-o", tmp_path / "out", "--config", config)
-    (flight,) = reported
-    # Both parts of its table.
-    assert flight.name == "alps"
-    assert flight.duration_s == pytest.approx(12, abs=0.1)
-
-
 def test_sweep_accepts_a_name(config: Path, tmp_path: Path) -> None:
     best = tmp_path / "best.toml"
     words = ("--beta", "0.5", "--jobs", "1", "--metric", "interpolated", "-o", best)
@@ -177,12 +152,3 @@ def test_only_names_need_a_choice_where_several_gateways_run(
     chosen = invoke("convert", "lake", "-o", tmp_path / "again.tlog")
     assert "nobody listens at the socket" in chosen.output
     assert "run-2.sock" in chosen.output.replace("\n", "")
-
-
-def test_info_accepts_a_foreign_csv(tmp_path: Path) -> None:
-    lines = ["time_s,ax,ay,az,gx,gy,gz"]
-    lines += [f"{k / 100:.2f},0.0,0.0,-9.8,0.0,0.0,0.0" for k in range(501)]
-    path = tmp_path / "log.csv.gz"
-    path.write_bytes(gzip.compress("\n".join(lines).encode() + b"\n"))
-    found = json.loads(run("info", path, "--json"))
-    assert (found["kind"], found["records"], found["duration_s"]) == ("csv", 501, 5.0)
