@@ -50,17 +50,6 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
         yield running
 
 
-def test_client_that_sends_to_listening_port_is_served(
-    gateway: Gateway, connect: Callable[..., Client]
-) -> None:
-    guest = connect()
-    beat = mavlink.MAVLink_heartbeat_message(
-        mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, 0, 3
-    )
-    guest.send(beat, gateway.listen_port)
-    guest.until(lambda seen: {"HEARTBEAT", "ATTITUDE_QUATERNION"} <= set(seen))
-
-
 async def test_mavsdk_sees_vehicle_attitude_and_position(gateway: Gateway) -> None:
     async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
