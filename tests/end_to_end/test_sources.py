@@ -12,6 +12,7 @@ from mavsdk.plugins.telemetry.telemetry import FlightMode
 
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import CONFIG, Client, Gateway, MavProxy, mavsdk_system
+from tests.ports import free_port
 
 HOME = SimulatorSettings()
 NEAR_DEG = 0.004
@@ -77,9 +78,7 @@ def test_lines_are_fused_and_seen(
 def test_datagrams_of_any_program_are_a_vehicle(
     start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
 ) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as chosen:
-        chosen.bind(("127.0.0.1", 0))
-        port = chosen.getsockname()[1]
+    port = free_port()
     gateway = start_gateway("run", "--source", f"lines-udp:127.0.0.1:{port}?id=9")
     client = connect(gateway.port)
     line = {"lat": 48.0, "lon": 11.0, "alt_m": 500, "speed_mps": 3, "course_deg": 90}

@@ -18,6 +18,7 @@ from gateway.wire.mavlink_signing import (
 )
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 from tests.kit import mavlink as kit
+from tests.kit.mavlink import read_back
 
 KEY = bytes(range(32))
 
@@ -25,15 +26,6 @@ KEY = bytes(range(32))
 def packed(message: Any, system_id: int, *, v1: bool = False, key: bytes | None = None) -> bytes:
     signing = None if key is None else (key, 3, 123_456)
     return kit.packed(message, system_id, version=1 if v1 else 2, signing=signing)
-
-
-def read(frame: bytes, key: bytes | None = None) -> Any:
-    """Read a frame back; pymavlink raises if the checksum or the signature is wrong."""
-    link = mavlink.MAVLink(None, 255, 0)
-    if key is not None:
-        link.signing.secret_key = key
-        link.signing.timestamp = 1
-    return link.decode(bytearray(frame))
 
 
 def translation(key: bytes | None = None) -> FrameTranslation:
@@ -67,14 +59,14 @@ def command(target: int) -> Any:
 @pytest.mark.parametrize("v1", [False, True])
 def test_sender_of_a_frame_from_the_site_is_translated(v1: bool) -> None:
     there = translation()
-    got = read(from_site(there, packed(attitude(), 1, v1=v1)) or b"")
+    got = read_back(from_site(there, packed(attitude(), 1, v1=v1)) or b"")
     assert (got.get_srcSystem(), got.roll, got.yawspeed) == (2, 0.5, 0.25)
 
 
 @pytest.mark.parametrize("v1", [False, True])
 def test_target_of_a_frame_to_the_site_is_translated(v1: bool) -> None:
     system_id, frame = to_site(translation(), packed(command(2), 255, v1=v1)) or (0, b"")
-    got = read(frame)
+    got = read_back(frame)
     assert (system_id, got.target_system, got.get_srcSystem()) == (1, 1, 255)
     assert (got.command, got.param7) == (400, 7)
 
@@ -101,9 +93,9 @@ def follow(leader: int, kind: Any) -> Any:
 def test_system_named_in_a_command_is_translated(kind: Any, v1: bool) -> None:
     both = translation()
     _, frame = to_site(both, packed(follow(2, kind), 255, v1=v1)) or (0, b"")
-    there = read(frame)
+    there = read_back(frame)
     assert (there.target_system, there.param1, there.param2, there.param4) == (1, 1, 2, 4)
-    back = read(from_site(both, packed(follow(1, kind), 1, v1=v1)) or b"")
+    back = read_back(from_site(both, packed(follow(1, kind), 1, v1=v1)) or b"")
     assert (back.get_srcSystem(), back.param1, back.param2) == (2, 2, 2)
 
 
@@ -113,27 +105,27 @@ def test_parameter_that_names_no_vehicle_is_unchanged(value: float) -> None:
         2, 1, mavlink.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE, 0, 2, 2, value, 2, 0, 0, 0
     )
     _, frame = to_site(translation(), packed(message, 255)) or (0, b"")
-    got = read(frame)
+    got = read_back(frame)
     assert (got.param1, got.param2, got.param4) == (1, 2, 2)
     assert got.param3 == pytest.approx(value, nan_ok=True)
 
 
 def test_controlling_systems_of_a_gimbal_are_translated() -> None:
     message = mavlink.MAVLink_gimbal_manager_status_message(5, 0, 1, 1, 1, 255, 190)
-    got = read(from_site(translation(), packed(message, 1)) or b"")
+    got = read_back(from_site(translation(), packed(message, 1)) or b"")
     assert (got.primary_control_sysid, got.secondary_control_sysid) == (2, 255)
     assert (got.primary_control_compid, got.get_srcSystem()) == (1, 2)
 
 
 def test_target_of_an_answer_is_unchanged() -> None:
     ack = mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 255, 190)
-    got = read(from_site(translation(), packed(ack, 1)) or b"")
+    got = read_back(from_site(translation(), packed(ack, 1)) or b"")
     assert (got.get_srcSystem(), got.target_system, got.target_component) == (2, 255, 190)
 
 
 def test_target_within_the_site_is_translated() -> None:
     """As an autopilot its gimbal, or one aircraft the next."""
-    got = read(from_site(translation(), packed(command(1), 30)) or b"")
+    got = read_back(from_site(translation(), packed(command(1), 30)) or b"")
     assert (got.get_srcSystem(), got.target_system) == (30, 2)
 
 
@@ -144,7 +136,7 @@ def test_broadcast_of_a_station_is_unchanged() -> None:
 
 def test_target_cut_off_by_mavlink_2_remains_zero() -> None:
     ack = mavlink.MAVLink_command_ack_message(400, 0)
-    assert read(from_site(translation(), packed(ack, 1)) or b"").target_system == 0
+    assert read_back(from_site(translation(), packed(ack, 1)) or b"").target_system == 0
 
 
 def test_frame_without_a_change_passes_byte_for_byte() -> None:
@@ -158,13 +150,13 @@ class TestSigned:
         frame = packed(attitude(), 1, key=KEY)
         got = from_site(translation(KEY), frame)
         assert got is not None
-        assert read(got, KEY).get_srcSystem() == 2
+        assert read_back(got, KEY).get_srcSystem() == 2
         assert got[-13:-6] == frame[-13:-6]
 
     def test_target_of_a_frame_to_the_site_is_translated(self) -> None:
         found = to_site(translation(KEY), packed(command(2), 255, key=KEY))
         assert found is not None
-        assert read(found[1], KEY).target_system == 1
+        assert read_back(found[1], KEY).target_system == 1
 
     @pytest.mark.parametrize("offset", [-1, -10, 15])
     def test_forged_frame_is_dropped_and_counted(self, offset: int) -> None:

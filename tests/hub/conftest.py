@@ -24,11 +24,12 @@ from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 from tests.conftest import ManualClock
 from tests.kit.mavlink import STATION, Sender, outgoing
+from tests.kit.process import START_LIMIT_S as LIMIT_S
+from tests.kit.process import until
 from tests.kit.records import sample_at, state_at
 from tests.ports import free_port
 
-LIMIT_S = 60.0
-"""Time limit of a test: its events take a moment, on a busy machine some seconds."""
+__all__ = ["LIMIT_S"]
 
 
 class Station:
@@ -212,9 +213,7 @@ class Rig:
         hub._tick()
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(LIMIT_S):
-            while not condition():
-                await asyncio.sleep(0)
+        await until(condition)
 
     async def quiet(self) -> None:
         """Let all frames arrive: on loopback each step takes one turn of the loop."""

@@ -15,6 +15,7 @@ from gateway.hub.transports import stream as accepting
 from gateway.hub.transports.stream import accept_each
 from gateway.live.control_socket import ControlServer
 from gateway.live.metrics_server import MetricsServer
+from tests.kit.process import until
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io
@@ -36,12 +37,6 @@ def no_descriptors() -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(LIMIT_S):
-        while not condition():
-            await asyncio.sleep(0.001)
 
 
 @pytest.fixture

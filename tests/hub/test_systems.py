@@ -9,7 +9,7 @@ from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.systems import WAITS, SystemTranslation
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import frame_of
-from tests.kit.mavlink import KEY, STATION, packed
+from tests.kit.mavlink import KEY, STATION, packed, read_back
 
 V1, V2 = 1, 2
 OTHER_KEY = bytes(range(32))
@@ -25,14 +25,6 @@ def attitude(time_ms: int = 5) -> Any:
 
 def heartbeat(kind: int = mavlink.MAV_TYPE_FIXED_WING, autopilot: int = 3) -> Any:
     return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3)
-
-
-def read(data: bytes, key: bytes | None = None) -> Any:
-    """Read a frame back; pymavlink raises if the checksum or the signature is wrong."""
-    link = mavlink.MAVLink(None, 255, 0)
-    if key is not None:
-        link.signing.secret_key, link.signing.timestamp = key, 1
-    return link.decode(bytearray(data))
 
 
 @pytest.mark.parametrize(
@@ -104,10 +96,10 @@ def test_ids_change_in_both_directions(text: str, version: int) -> None:
     ids.from_link(frame_of(packed(heartbeat(), 1)), 0)
     received = ids.from_link(frame_of(packed(attitude(), 1, version=version)), 0)
     assert received
-    assert (read(received.data).get_srcSystem(), read(received.data).roll) == (11, 0.5)
+    assert (read_back(received.data).get_srcSystem(), read_back(received.data).roll) == (11, 0.5)
     sent = ids.to_link(frame_of(packed(command(11), 255, version=version)))
     assert sent
-    got = read(sent.data)
+    got = read_back(sent.data)
     assert (got.get_srcSystem(), got.target_system, got.param7) == (255, 1, 7)
 
 
@@ -117,7 +109,7 @@ def test_fields_with_a_system_id_change_too() -> None:
     )
     sent = translation("1:11,2:12").to_link(frame_of(packed(message, 255)))
     assert sent
-    got = read(sent.data)
+    got = read_back(sent.data)
     assert (got.target_system, got.param1) == (1, 2)
 
 
@@ -126,7 +118,7 @@ def test_signed_frame_is_signed_again_with_its_own_time(key: bytes) -> None:
     signed = packed(attitude(), 1, signing=(key, 3, 123_456))
     changed = translation("1:11", OTHER_KEY, KEY).from_link(frame_of(signed), 0)
     assert changed
-    assert read(changed.data, key).get_srcSystem() == 11
+    assert read_back(changed.data, key).get_srcSystem() == 11
     assert changed.data[-13:-6] == signed[-13:-6]
 
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from pymavlink.dialects.v20 import all as every_dialect
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.records import Outgoing
@@ -92,6 +93,14 @@ def strict(key: bytes = KEY) -> Any:
     receiver = dialect.MAVLink(None)
     receiver.signing.secret_key, receiver.signing.timestamp = key, TIMESTAMP
     return receiver
+
+
+def read_back(data: bytes, key: bytes | None = None) -> Any:
+    """Decode a frame; pymavlink raises if the checksum or, with a key, the signature is wrong."""
+    link = every_dialect.MAVLink(None, 255, 0)
+    if key is not None:
+        link.signing.secret_key, link.signing.timestamp = key, 1
+    return link.decode(bytearray(data))
 
 
 def outgoing(frame: bytes, client_id: int | None = None) -> Outgoing:

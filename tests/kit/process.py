@@ -1,5 +1,6 @@
 """A `mavgate` command as its users start it: a process of its own, its output in a file."""
 
+import asyncio
 import os
 import re
 import signal
@@ -23,6 +24,13 @@ def wait_for(look: Callable[[], Found | None], describe: Callable[[], str] = str
         assert time.monotonic() < deadline_s, f"not in {START_LIMIT_S:.0f} s:\n{describe()}"
         time.sleep(0.02)
     return found
+
+
+async def until(condition: Callable[[], object], pause_s: float = 0.0) -> None:
+    """Let the event loop run until something holds."""
+    async with asyncio.timeout(START_LIMIT_S):
+        while not condition():
+            await asyncio.sleep(pause_s)
 
 
 class Process:

@@ -55,11 +55,8 @@ def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemon:
 def test_signed_frame_is_not_accepted_again_after_a_restart(tmp_path: Path, orderly: bool) -> None:
     # First, since it may compile for more than the minute in which a timestamp is new.
     first = make_daemon(tmp_path, "correct horse")
-    mav = mavlink.MAVLink(None, 255, 190)
-    mav.signing.secret_key = key_from_passphrase("correct horse")
-    mav.signing.sign_outgoing = True
-    mav.signing.timestamp = (unix_time_us() - EPOCH_2015_US) // 10
-    signed = Incoming(5, bytes(PING.pack(mav)), True)
+    signing = (key_from_passphrase("correct horse"), 0, (unix_time_us() - EPOCH_2015_US) // 10)
+    signed = Incoming(5, packed(PING, 255, 190, signing=signing), True)
     first._on_frame(signed)
     first._timestamps.close(first._pipeline.newest_timestamps() if orderly else {})
     assert first._pipeline.forged == 0

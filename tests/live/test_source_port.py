@@ -3,7 +3,6 @@
 import asyncio
 import os
 import socket
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,8 @@ from gateway.records import NodeId
 from gateway.sources.kinds import make_decoder
 from gateway.sources.settings import parse_source
 from gateway.sources.source import SourceInput
+from tests.kit.process import until
+from tests.ports import free_port
 
 pytestmark = pytest.mark.io
 
@@ -43,18 +44,6 @@ class Opened:
     async def __aexit__(self, *_: object) -> None:
         self._port.close()
         await asyncio.sleep(0)
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(30.0):
-        while not condition():
-            await asyncio.sleep(0.005)
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
 
 
 async def test_datagrams_are_read() -> None:

@@ -28,6 +28,7 @@ from gateway.recordings.tlog_index import TlogIndex
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_splitter import message_id_of
 from gateway.wire.timesync import ENOUGH
+from tests.kit.mavlink import KEY, packed
 from tests.recordings.frames import START_US, STEP_US, make_frames, make_records, make_tlog
 
 
@@ -66,7 +67,8 @@ def test_columns_contain_sender_and_message() -> None:
 
 
 def test_mavlink_1_and_signed_frames_are_read() -> None:
-    old, signed = heartbeat(v1=True), heartbeat(signed=True)
+    message = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
+    old, signed = packed(message, version=1), packed(message, signing=(KEY, 0, 1))
     records = [TlogRecord(START_US + i, frame) for i, frame in enumerate([old, signed, old])]
     assert len(signed) == 12 + 9 + 13
     assert records_of(scan(make_tlog(records), strict=True)) == records
@@ -320,14 +322,6 @@ def test_timestamps_of_a_clock_before_1970_start_at_zero() -> None:
 def decode(frame: bytes) -> mavlink.MAVLink_message:
     (message,) = mavlink.MAVLink(None).parse_buffer(frame)
     return message
-
-
-def heartbeat(*, v1: bool = False, signed: bool = False) -> bytes:
-    mav = mavlink.MAVLink(None, 1, 1)
-    mav.signing.secret_key = bytes(32)
-    mav.signing.sign_outgoing = signed
-    message = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
-    return bytes(message.pack(mav, force_mavlink1=v1))
 
 
 @pytest.mark.parametrize(

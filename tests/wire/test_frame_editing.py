@@ -11,7 +11,7 @@ from gateway.wire.frame_editing import edit_frame, renumbered
 from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_NAMES, layout_of
 from gateway.wire.mavlink_signing import signature
 from gateway.wire.mavlink_splitter import MavFrame, frame_of, to_mavlink1
-from tests.kit.mavlink import KEY, frames_in, packed
+from tests.kit.mavlink import KEY, frames_in, packed, read_back
 
 ATTITUDE = mavlink.MAVLink_attitude_message(5, 0.5, 0, 0, 0, 0, 0.25)
 POSITION = mavlink.MAVLink_global_position_int_message(7, 470000000, 85000000, 9, 8, 1, 2, 3, 0)
@@ -30,10 +30,7 @@ def read(edited: MavFrame | None, key: bytes | None = None) -> Any:
     """Read a frame back; raises if the checksum, the signature or the header's copy is wrong."""
     assert edited is not None
     assert frame_of(edited.data) == edited
-    link = mavlink.MAVLink(None, 255, 0)
-    if key is not None:
-        link.signing.secret_key, link.signing.timestamp = key, 1
-    return link.decode(bytearray(edited.data))
+    return read_back(edited.data, key)
 
 
 HEADERS: list[dict[str, int]] = [

@@ -23,24 +23,13 @@ from gateway.wire.mavlink_splitter import (
     split_datagram,
 )
 from tests.kit.ground_station import OWN_MESSAGES
-from tests.kit.mavlink import frames_in, frames_of
-
-
-def link(system: int = 7, component: int = 1, *, signed: bool = False) -> dialect.MAVLink:
-    sender = dialect.MAVLink(None, system, component)
-    if signed:
-        sender.signing.secret_key = bytes(32)
-        sender.signing.link_id = 1
-        sender.signing.timestamp = 1
-        sender.signing.sign_outgoing = True
-    return sender
-
+from tests.kit.mavlink import KEY, frames_in, frames_of, packed
 
 HEARTBEAT = dialect.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
 COMMAND = dialect.MAVLink_command_long_message(9, 3, 512, 0, 1, 2, 3, 4, 5, 6, 7)
-V2 = bytes(HEARTBEAT.pack(link()))
-V2_SIGNED = bytes(HEARTBEAT.pack(link(signed=True)))
-V2_COMMAND = bytes(COMMAND.pack(link()))
+V2 = packed(HEARTBEAT, 7)
+V2_SIGNED = packed(HEARTBEAT, 7, signing=(KEY, 1, 1))
+V2_COMMAND = packed(COMMAND, 7)
 V1 = bytes(
     dialect_v1.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3).pack(dialect_v1.MAVLink(None, 7, 1))
 )
@@ -109,7 +98,7 @@ LARGE_IDS = {
 
 @pytest.mark.parametrize("number", LARGE_IDS)
 def test_message_ids_of_two_bytes_are_read(number: int) -> None:
-    frame = bytes(LARGE_IDS[number].pack(link()))
+    frame = packed(LARGE_IDS[number], 7)
     assert number > 0xFF
     assert read_datagram(frame)
     assert message_id_of(frame) == number
@@ -223,8 +212,8 @@ def test_header_has_the_fields_of_the_frame(frame: bytes) -> None:
 
 def test_keys_differ_by_system_component_message_and_version() -> None:
     others = [
-        bytes(HEARTBEAT.pack(link(8))),
-        bytes(HEARTBEAT.pack(link(7, 2))),
+        packed(HEARTBEAT, 8),
+        packed(HEARTBEAT, 7, 2),
         V2_COMMAND,
         V1,
         V2,
@@ -268,7 +257,7 @@ TARGETS = {
 @pytest.mark.parametrize("name", TARGETS)
 def test_target_is_that_of_the_message(name: str) -> None:
     message, target = TARGETS[name]
-    assert frame_of(bytes(message.pack(link()))).target == target
+    assert frame_of(packed(message, 7)).target == target
 
 
 @pytest.mark.parametrize("number", [300, 397, 512])
