@@ -126,9 +126,11 @@ class TestNumbers:
     def queue(self) -> SendQueue:
         return queue_of(10_000, (1, 1))
 
-    def test_frames_are_unchanged_without_drops(self, queue: SendQueue) -> None:
-        for sequence in (254, 255, 0, 9, 9, 3):
-            frame = numbered(1, sequence)
+    @pytest.mark.parametrize(("system", "sequences"), [(1, (254, 255, 0, 9, 9, 3)), (2, (5, 9))])
+    def test_frames_are_unchanged_without_drops_and_those_of_others_always(
+        self, queue: SendQueue, system: int, sequences: tuple[int, ...]
+    ) -> None:
+        for frame in (numbered(system, sequence) for sequence in sequences):
             assert queue.encode(frame, 0) is frame.data
 
     def test_dropped_frames_leave_no_gap(self) -> None:
@@ -147,11 +149,6 @@ class TestNumbers:
             queue.push(numbered(1, sequence, message), 0)
         found = [(frame_of(data).message_id, frame_of(data).sequence) for data in drain(queue)]
         assert found == [(COMMAND_ACK, 8), (RAW_IMU, 9), (RAW_IMU, 10)]
-
-    def test_frames_of_others_are_unchanged(self, queue: SendQueue) -> None:
-        for sequence in (5, 9):
-            frame = numbered(2, sequence)
-            assert queue.encode(frame, 0) is frame.data
 
 
 def raw_imu() -> dialect.MAVLink_message:
