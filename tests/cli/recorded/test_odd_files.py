@@ -270,7 +270,7 @@ def test_mark_at_invalid_coordinates_is_refused(words: tuple[str, ...]) -> None:
         ('[hub]\nendpoints = ["udp-multicast:127.0.0.1:14550"]', "is not a multicast group"),
         ('[recording]\nfolder = "~no-such-user/x"', "no user has the home ~no-such-user"),
         ('aircraft_folder = "~no-such-user"', "write the whole path"),
-        ('[recording]\nmode = "sometimes"', "allowed: manual, in_flight, always"),
+        ('[recording]\nmode = "sometimes"', "allowed: manual, in_flight, armed, always"),
     ],
 )
 def test_unusable_settings_are_refused(tmp_path: Path, text: str, words: str) -> None:
