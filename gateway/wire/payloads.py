@@ -56,8 +56,6 @@ _GPS_NAMES: Final = {
 PROTOCOL_VERSION: Final = 1
 MAX_PAYLOAD: Final = 32
 """One nRF24L01+ packet."""
-MAX_FOREIGN: Final = 60
-"""Of a packet of another program, its header included."""
 PIPES: Final = 6
 NO_PIPE: Final = 0xFF
 """Of a frame that carries no radio payload."""
@@ -300,13 +298,6 @@ def encode_radio(
     return head + (b"" if signal is None else _encode_signal(signal)) + payload
 
 
-def encode_foreign(frame: ForeignFrame) -> bytes:
-    """Build the content of the serial frame that carries a packet of another program."""
-    first = PROTOCOL_VERSION << 4 | FrameKind.FOREIGN
-    head = _FRAME_HEADER.pack(first, frame.frame_seq, NO_PIPE, frame.receiver_time_us)
-    return head + _encode_signal(frame.signal) + frame.packet
-
-
 def _encode_signal(signal: RadioSignal) -> bytes:
     return _SIGNAL.pack(-signal.rssi_dbm, round(signal.snr_db * _SNR_PER_DB))
 
@@ -412,16 +403,8 @@ def _decode_receiver_status(
     if noise > 100 or radio not in _RADIO_STATES:
         return Fault(FaultKind.VALUE, size)
     pipes = tuple(PipeCounters(*p) for p in _PIPE.iter_unpack(body[_RECEIVER_HEAD.size :]))
-    return ReceiverStatusFrame(
-        frame_seq=frame_seq,
-        receiver_time_us=receiver_time_us,
-        channel=channel,
-        noise_percent=noise,
-        uart_dropped=dropped,
-        reset_cause=cause & _RESET_MASK,
-        pipes=pipes,
-        radio=RadioState(radio),
-    )
+    head = (frame_seq, receiver_time_us, channel, noise, dropped, cause & _RESET_MASK)
+    return ReceiverStatusFrame(*head, pipes, RadioState(radio))
 
 
 def _encode_body(payload: Payload) -> tuple[PayloadKind, bytes]:
@@ -451,33 +434,14 @@ def _encode_quality(payload: GpsQualityPayload) -> bytes:
     if utc is not None:
         clock = (utc.hour, utc.minute, utc.second, utc.microsecond // 10_000)
         moment = (utc.year - 2000, utc.month, utc.day, *clock)
-    return _GPS_QUALITY.pack(
-        payload.itow_ms,
-        payload.h_acc_cm,
-        payload.v_acc_cm,
-        payload.speed_acc_cmps,
-        payload.course_acc_cdeg,
-        payload.pdop_centi,
-        payload.geoid_separation_cm,
-        utc is not None,
-        *moment,
-    )
+    # The fields are in the order of the wire.
+    *words, _ = msgspec.structs.astuple(payload)
+    return _GPS_QUALITY.pack(*words, utc is not None, *moment)
 
 
 def _encode_node_status(payload: NodeStatusPayload) -> bytes:
-    values = (
-        *payload.firmware_version,
-        payload.reset_cause | payload.radio << _RADIO_SHIFT,
-        payload.sensors_present,
-        payload.sensors_failed,
-        payload.bus_errors,
-        payload.radio_failed,
-        payload.radio_retries,
-        payload.loop_max_us,
-        payload.sample_rate_hz,
-        payload.supply_mv,
-    )
-    chips = payload.chips
+    version, cause, *counts, radio, chips = msgspec.structs.astuple(payload)
+    values = (*version, cause | radio << _RADIO_SHIFT, *counts)
     if chips is None:
         return _NODE_STATUS_1_0.pack(*values)
     return _NODE_STATUS.pack(*values, *msgspec.structs.astuple(chips))
@@ -486,36 +450,17 @@ def _encode_node_status(payload: NodeStatusPayload) -> bytes:
 def _read_imu(words: tuple[int, ...]) -> ImuPayload:
     ax, ay, az, gx, gy, gz, mx, my, mz, temperature, flags, ranges = words
     accel_range, gyro_range, mag_gain = _RANGES[ranges]
-    return ImuPayload(
-        (ax, ay, az),
-        (gx, gy, gz),
-        (mx, my, mz),
-        temperature,
-        _imu_flags(flags),
-        accel_range,
-        gyro_range,
-        mag_gain,
-    )
-
-
-def _read_baro(words: tuple[int, ...]) -> BaroPayload:
-    return BaroPayload(*words)
+    accel, gyro, mag = (ax, ay, az), (gx, gy, gz), (mx, my, mz)
+    ranges_of_all = (accel_range, gyro_range, mag_gain)
+    return ImuPayload(accel, gyro, mag, temperature, _imu_flags(flags), *ranges_of_all)
 
 
 def _read_gps_fix(words: tuple[int, ...]) -> GpsFixPayload:
     itow, lat, lon, alt, north, east, down, kind, satellites = words
     if not (-900_000_000 <= lat <= 900_000_000 and -1_800_000_000 <= lon <= 1_800_000_000):
         raise ValueError("no coordinates of the Earth")
-    return GpsFixPayload(
-        itow_ms=itow,
-        lat_dege7=lat,
-        lon_dege7=lon,
-        alt_amsl_mm=alt,
-        vel_n_cmps=(north, east, down),
-        fix_type=GpsFixType(kind & 0x7F),
-        fix_ok=bool(kind & 0x80),
-        satellites=satellites,
-    )
+    fix_type, fix_ok = GpsFixType(kind & 0x7F), bool(kind & 0x80)
+    return GpsFixPayload(itow, lat, lon, alt, (north, east, down), fix_type, fix_ok, satellites)
 
 
 def _read_gps_quality(words: tuple[int, ...]) -> GpsQualityPayload:
@@ -533,20 +478,10 @@ def _read_gps_quality(words: tuple[int, ...]) -> GpsQualityPayload:
 
 def _read_node_status(words: tuple[int, ...]) -> NodeStatusPayload:
     major, minor, cause, present, failed, bus, unsent, resent, loop, rate, supply = words[:11]
-    return NodeStatusPayload(
-        firmware_version=(major, minor),
-        reset_cause=cause & _RESET_MASK,
-        sensors_present=present,
-        sensors_failed=failed,
-        bus_errors=bus,
-        radio_failed=unsent,
-        radio_retries=resent,
-        loop_max_us=loop,
-        sample_rate_hz=rate,
-        supply_mv=supply,
-        radio=RadioState(cause >> _RADIO_SHIFT),
-        chips=Chips(*words[11:]) if len(words) > 11 else None,
-    )
+    counts = (present, failed, bus, unsent, resent, loop, rate, supply)
+    radio = RadioState(cause >> _RADIO_SHIFT)
+    chips = Chips(*words[11:]) if len(words) > 11 else None
+    return NodeStatusPayload((major, minor), cause & _RESET_MASK, *counts, radio, chips)
 
 
 _KINDS: Final = frozenset(PayloadKind)
@@ -556,7 +491,7 @@ _BODIES: Final[dict[tuple[int, int], tuple[_Unpack, _Read]]] = {
     (PROTOCOL_VERSION << 4 | kind, layout.size): (layout.unpack_from, read)
     for kind, layout, read in (
         (PayloadKind.IMU, _IMU, _read_imu),
-        (PayloadKind.BARO, _BARO, _read_baro),
+        (PayloadKind.BARO, _BARO, lambda words: BaroPayload(*words)),
         (PayloadKind.GPS_FIX, _GPS_FIX, _read_gps_fix),
         (PayloadKind.GPS_QUALITY, _GPS_QUALITY, _read_gps_quality),
         (PayloadKind.NODE_STATUS, _NODE_STATUS_1_0, _read_node_status),

@@ -2,6 +2,7 @@
 
 import json
 import math
+import struct
 from typing import Any
 
 import pytest
@@ -9,13 +10,12 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.aircraft import AircraftSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import BatteryReport, GpsFix, NodeId, RadioSignal, VehicleReport
+from gateway.records import BatteryReport, GpsFix, NodeId, VehicleReport
 from gateway.sources.kinds import make_sources
 from gateway.sources.sampling import fix_at, imu_raw
 from gateway.sources.settings import SourceSettings, nodes_of, parse_source
 from gateway.units import US_PER_S
 from gateway.wire.framing import encode_frame
-from gateway.wire.payloads import ForeignFrame, encode_foreign
 
 NODE = NodeId(1, 8)
 
@@ -212,9 +212,9 @@ def test_packets_of_radiohead_through_the_receiver_are_lines() -> None:
     flight.pipeline.connect("/dev/ttyUSB0")
     for number in range(4):
         packet = b"\xff\x01\x00\x00" + b'{"pressure_hpa": 990}'
-        frame = ForeignFrame(number, number * 500_000, RadioSignal(-104, 5.0), packet)
+        head = struct.pack("<BBBIBb", 0x14, number, 0xFF, number * 500_000, 104, 20)
         flight.now_us += 500_000
-        flight._keep(flight.pipeline.feed(encode_frame(encode_foreign(frame)), flight.now_us))
+        flight._keep(flight.pipeline.feed(encode_frame(head + packet), flight.now_us))
     flight.wait(2.0)
     assert flight.newest("SCALED_PRESSURE").press_abs == 990.0
     assert flight.newest("SCALED_PRESSURE").get_srcSystem() == 5
