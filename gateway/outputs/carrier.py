@@ -5,7 +5,6 @@ loses whole messages, and the next ones are newer.
 """
 
 import asyncio
-import os
 import ssl
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -40,20 +39,10 @@ def target_of(location: str, kinds: Collection[str]) -> tuple[str, Endpoint]:
 
 
 class Carrier:
-    """Carry bytes to all present peers of one target.
+    """Carry bytes to all present peers of one target, such as `tcp-listen:127.0.0.1:10110`.
 
-    Parameters
-    ----------
-    location : str
-        The target, such as `tcp-listen:127.0.0.1:10110`.
-    kinds : collection of str
-        The carriers that are allowed.
-    on_state : callable
-        Called with a state and its reason when they change.
-    max_clients : int
-        Most connections of a listening port.
-    tls : callable
-        Makes the context of TLS, or raises OSError.
+    It may be one of `kinds`, and a listening port has at most `max_clients`. `on_state` is called
+    with a state and its reason when they change, and `tls` makes the context of TLS.
     """
 
     def __init__(
@@ -119,7 +108,8 @@ class Carrier:
     async def _connect(self, loop: asyncio.AbstractEventLoop) -> None:
         host, port = self._inner.host, self._inner.port
         if self._kind == EndpointKind.SERIAL:
-            self.add(SerialLine(host, port, self.lose))
+            line = serial.Serial(host, port, timeout=0, write_timeout=0, exclusive=True)
+            await loop.connect_write_pipe(lambda: _Link(self), line)
         elif self._kind == LISTEN:
             self._server = await loop.create_server(lambda: _Link(self), host, port)
         elif self._kind in DATAGRAMS:
@@ -166,39 +156,6 @@ class _Link(asyncio.Protocol, asyncio.DatagramProtocol):
 
     def error_received(self, error: Exception) -> None:
         self._carrier.refuse(error)
-
-
-class SerialLine:
-    """A serial port that is only written; what it has no room for waits here.
-
-    Raises OSError or ValueError if it cannot be opened.
-    """
-
-    def __init__(
-        self, device: str, baud: int, lose: Callable[[Any, Exception | None], None]
-    ) -> None:
-        self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
-        self._lose = lose
-        self._waiting = b""
-
-    def get_write_buffer_size(self) -> int:
-        """Return the number of bytes that wait."""
-        return len(self._waiting)
-
-    def write(self, data: bytes) -> None:
-        """Write as much as there is room for."""
-        self._waiting += data
-        try:
-            self._waiting = self._waiting[os.write(self._port.fileno(), self._waiting) :]
-        except BlockingIOError:
-            return
-        except OSError as error:
-            self._lose(self, error)
-            self.abort()
-
-    def abort(self) -> None:
-        """Close the port."""
-        self._port.close()
 
 
 def client_context(authority: str, certificate: str, key: str) -> ssl.SSLContext:

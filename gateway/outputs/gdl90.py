@@ -27,7 +27,7 @@ from gateway.recordings.positions import Position
 from gateway.units import PA_PER_HPA, US_PER_S
 from gateway.wire.mavlink_messages import ids_of
 
-FLAG, ESCAPE, ESCAPED = 0x7E, 0x7D, 0x20
+FLAG: Final = b"\x7e"
 HEARTBEAT, OWNSHIP, GEOMETRIC_ALTITUDE, TRAFFIC, EXTENDED = 0, 10, 11, 20, 0x65
 FEET_PER_M: Final = 1 / 0.3048
 KNOTS_PER_MPS: Final = 3600 / 1852
@@ -98,10 +98,8 @@ def framed(message: bytes) -> bytes:
     """Return a message with its checksum, escaped, between flags."""
     # The specification's checksum is XMODEM, but does not shift the last two bytes out.
     crc = xmodem(message[:-2]) ^ int.from_bytes(message[-2:], "big")
-    escaped = bytearray()
-    for byte in message + crc.to_bytes(2, "little"):
-        escaped += bytes((ESCAPE, byte ^ ESCAPED)) if byte in (FLAG, ESCAPE) else bytes((byte,))
-    return bytes((FLAG, *escaped, FLAG))
+    body = message + crc.to_bytes(2, "little")
+    return FLAG + body.replace(b"\x7d", b"\x7d\x5d").replace(FLAG, b"\x7d\x5e") + FLAG
 
 
 def heartbeat(unix_us: int, *, is_valid: bool) -> bytes:
