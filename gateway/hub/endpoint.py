@@ -91,6 +91,8 @@ ALIASES: Final = {
     "wsserver": "ws-listen",
 }
 ANY_ADDRESS: Final = "0.0.0.0"
+PARTS: Final = frozenset({"site", "vehicle"})
+"""Options that distinguish endpoints of one address: sites of a router, vehicles of an output."""
 
 
 def admits_page(origin: str, local_host: str, named: Collection[str]) -> bool:
@@ -184,8 +186,6 @@ OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.ZENOH: frozenset({"site", "keys", "config"}),
 }
 """Options that only some kinds have."""
-PARTS: Final = frozenset({"site", "vehicle"})
-"""Options that distinguish endpoints of one address: sites of a router, vehicles of an output."""
 HOSTED: Final = LISTENING | {EndpointKind.UDP, EndpointKind.TCP, EndpointKind.WS, EndpointKind.WSS}
 """Kinds whose frames go to hosts by their addresses, one by one."""
 

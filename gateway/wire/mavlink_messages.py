@@ -20,6 +20,8 @@ MAX_ID_V1: Final = 255
 """Messages with greater ids do not exist in MAVLink 1."""
 WIDEST: Final = 8
 """Bytes of the widest type of a field."""
+US_PER_MS: Final = 1000
+BOOT_TIME_BYTES: Final = 4
 
 
 class MissingMessage:
@@ -109,8 +111,6 @@ def ids_of(*names: str) -> frozenset[int]:
     return frozenset(MESSAGE_IDS[name] for name in names)
 
 
-US_PER_MS: Final = 1000
-BOOT_TIME_BYTES: Final = 4
 BOOT_TIME_OFFSETS: Final = {
     message_id: offset
     for message_id in MESSAGE_NAMES
