@@ -45,7 +45,7 @@ def check_output(
 
 
 def check_ending(path: Path, endings: Iterable[str]) -> None:
-    """Raise OSError if a file's name has none of the endings of what is written to it."""
+    """Raise OSError if the ending of a file's name is not one of its format."""
     if path.suffix not in endings:
         raise OSError(errno.EINVAL, f"the output must end in {', '.join(endings)}", str(path))
 

@@ -107,7 +107,7 @@ def reason_of(error: Exception) -> str:
 
 
 def unknown_choice(what: str, word: str, choices: Iterable[str]) -> str:
-    """Return the text for a word that is none of the allowed ones."""
+    """Return the text for a word that is not allowed."""
     # Imported here, as only an error needs it.
     import difflib
 

@@ -365,7 +365,7 @@ class VehicleReport(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     attitude_rad: Vec3 | None = None
     """Roll, pitch and yaw; yaw is from true north, as far as the autopilot knows it."""
     heading_rad: float = NAN
-    """Where nothing but the heading is known of the attitude."""
+    """Heading, where roll and pitch are unknown."""
     climb_mps: float = NAN
     airspeed_mps: float = NAN
     alt_home_m: float = NAN

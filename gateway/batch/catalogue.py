@@ -80,7 +80,7 @@ _BREAK: Final = _POSITION.pack(_UNKNOWN, 0, 0)
 _ALLOWED: Final = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION}
 _DAMAGED: Final = "if it is no catalogue or damaged, delete it and index again"
 _NOT_WRITABLE: Final = "make the folder of the recordings writable, or copy them"
-_WAYS_OUT: Final = {
+_REMEDIES: Final = {
     sqlite3.SQLITE_FULL: "make room on the disk and index again",
     sqlite3.SQLITE_BUSY: "another indexing is at work; wait for its end",
     sqlite3.SQLITE_READONLY: _NOT_WRITABLE,
@@ -127,7 +127,7 @@ class Catalogue:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / CATALOGUE_NAME
-        with _with_advice(self.path), ExitStack() as opened:
+        with _catalogue_errors(self.path), ExitStack() as opened:
             self._db = opened.enter_context(closing(sqlite3.connect(self.path, timeout=BUSY_S)))
             if not self._is_made():
                 self._make()
@@ -135,30 +135,30 @@ class Catalogue:
 
     def close(self) -> None:
         """Commit the changes, and close the catalogue."""
-        with _with_advice(self.path), closing(self._db):
+        with _catalogue_errors(self.path), closing(self._db):
             self._db.commit()
 
     def known(self) -> dict[str, tuple[int, int, str]]:
         """Return size, time of modification and digest of every file."""
-        with _with_advice(self.path):
+        with _catalogue_errors(self.path):
             rows = self._db.execute("SELECT DISTINCT path, size, modified, digest FROM flights")
             return {path: (size, modified, digest) for path, size, modified, digest in rows}
 
     def put(self, files: Iterable[CataloguedFile]) -> None:
         """Replace the rows of files, all or none."""
-        with _with_advice(self.path), self._db:
+        with _catalogue_errors(self.path), self._db:
             for file in files:
                 self._delete(file.path)
                 self._insert(file)
 
     def touch(self, path: str, modified_ns: int) -> None:
         """Note that a file has another time of modification and the same bytes."""
-        with _with_advice(self.path), self._db:
+        with _catalogue_errors(self.path), self._db:
             self._db.execute("UPDATE flights SET modified = ? WHERE path = ?", (modified_ns, path))
 
     def discard(self, paths: Iterable[str]) -> None:
         """Drop files that are gone."""
-        with _with_advice(self.path), self._db:
+        with _catalogue_errors(self.path), self._db:
             for path in paths:
                 self._delete(path)
 
@@ -279,7 +279,7 @@ def _asked(folder: Path) -> Iterator[sqlite3.Connection]:
         raise CatalogueError(
             f"{folder} has no catalogue yet; `mavgate catalogue {folder}` makes one"
         )
-    with _with_advice(path):
+    with _catalogue_errors(path):
         db = sqlite3.connect(
             f"file:{quote(str(path.absolute()))}?mode=ro", uri=True, timeout=BUSY_S
         )
@@ -338,14 +338,14 @@ def _select(db: sqlite3.Connection, columns: str, where: str) -> Sequence[tuple[
 
 
 @contextmanager
-def _with_advice(path: Path) -> Iterator[None]:
+def _catalogue_errors(path: Path) -> Iterator[None]:
     """Raise SQLite's errors as CatalogueError, with the catalogue's path and what to do."""
     try:
         yield
     except sqlite3.Error as error:
         # The lowest byte; the others are more specific.
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
-        raise CatalogueError(f"{path}: {error}; {_WAYS_OUT.get(code, _DAMAGED)}") from error
+        raise CatalogueError(f"{path}: {error}; {_REMEDIES.get(code, _DAMAGED)}") from error
 
 
 def _packed(at: TrackPoint) -> bytes:

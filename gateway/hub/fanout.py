@@ -142,7 +142,7 @@ class OwnRoute:
         self.frames = self.size = 0
         self.targets: list[tuple[Callable[[MavFrame], None], _Gap, RateLimit | None]] = []
         self.closed: list[_Gap] = []
-        """Of clients that get none of these frames."""
+        """Clients that get no frame of these."""
 
     def settle(self) -> tuple[int, int]:
         """Return the frames and bytes since the last call."""

@@ -112,7 +112,7 @@ class Forwarding:
         return found
 
     def rest(self) -> bytes:
-        """Return what is left of the present datagram."""
+        """Return the rest of the present datagram."""
         at, offset = self.work[step.AT], self.work[step.OFFSET]
         begin = at * step.MAX_DATAGRAM
         return bytes(self._buffer[begin + offset : begin + int(self._lengths[at])])

@@ -102,7 +102,7 @@ class PlanFiles:
             await self._task
 
     def close(self) -> None:
-        """Write what is pending and end; waits for the disk."""
+        """Write pending data and end; waits for the disk."""
         if self._retry is not None:
             self._retry.cancel()
         if self._task is not None:

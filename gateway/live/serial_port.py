@@ -83,7 +83,7 @@ class SerialSettings(Settings, frozen=True):
 
 
 class PortNotFoundError(UserError):
-    """No port fits the setting, or it cannot be opened; the text says why, and what is there."""
+    """No port fits the setting, or it cannot be opened; the text gives the reason and the ports."""
 
 
 @dataclass(frozen=True, slots=True)

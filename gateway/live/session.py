@@ -162,7 +162,7 @@ class Session:
     def __init__(self, settings: RecordingSettings) -> None:
         self._settings = settings
         self._in_flight = False
-        self._asked: bool | None = None
+        self._requested: bool | None = None
         self._opened_us = 0
         self._retry_us = 0
         self._corrected = False
@@ -185,8 +185,8 @@ class Session:
     @property
     def wanted(self) -> bool:
         """Whether there should be a recording now."""
-        if self._asked is not None:
-            return self._asked
+        if self._requested is not None:
+            return self._requested
         mode = self._settings.mode
         return mode == "always" or (mode != "manual" and (self._in_flight or self._is_after))
 
@@ -197,21 +197,21 @@ class Session:
 
     def start(self) -> None:
         """Start on a user's request; a blocked recording is retried at once."""
-        self._asked = True
+        self._requested = True
         if self.state is SessionState.BLOCKED:
             self.state = SessionState.IDLE
 
     def stop(self) -> None:
         """Stop on a user's request, until the next request or the next flight."""
-        self._asked = False
+        self._requested = False
 
     def set_in_flight(self, in_flight: bool) -> None:
         """Note take-off or landing, in the mode `armed` arming or disarming.
 
         A take-off cancels an earlier request to stop.
         """
-        if in_flight and not self._in_flight and self._asked is False:
-            self._asked = None
+        if in_flight and not self._in_flight and self._requested is False:
+            self._requested = None
         self._in_flight = in_flight
 
     def opened(self, now_us: int) -> list[SessionAction]:

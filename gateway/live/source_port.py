@@ -1,4 +1,4 @@
-"""The transports of sources: they bring bytes, and open again what was lost.
+"""The transports of sources: they bring bytes, and reconnect.
 
 | transport  | opened                                        | lost                              |
 | ---------- | --------------------------------------------- | --------------------------------- |
@@ -182,7 +182,7 @@ class SourcePort:
             self._feed(data)
 
     async def _file(self) -> None:
-        """Follow a file; one that is shorter than what was read was written again."""
+        """Follow a file; one that has become shorter was written again."""
         path = self._source.url.address
         with open(path, "rb", buffering=0) as file:  # noqa: PTH123
             self._opened()
@@ -197,7 +197,7 @@ class SourcePort:
 
 
 class _Datagrams(asyncio.DatagramProtocol):
-    """Pass on datagrams; errors of the network are none of a receiver's."""
+    """Pass on datagrams; a receiver ignores network errors."""
 
     def __init__(self, feed: Callable[[bytes], None]) -> None:
         self._feed = feed

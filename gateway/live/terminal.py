@@ -27,7 +27,7 @@ READ_BYTES: Final = 1024
 MAX_TEXTS: Final = 256
 """Lines of the log, or pictures of the live view, that wait: at most about a megabyte."""
 FLUSH_TIMEOUT_S: Final = 1.0
-"""Longest that the end waits for what is still to be written."""
+"""Longest wait at the end for pending output."""
 KEY_BYTES: Final = 64
 _SEQUENCE: Final = re.compile(r"\x1b(?:[\[O]([0-9;]*)([A-Za-z~]))?")
 _NAMES: Final = {"A": "up", "B": "down", "C": "right", "D": "left", "H": "home", "F": "end"}
@@ -100,7 +100,7 @@ class DetachedStream(io.TextIOBase):
         return len(text)
 
     def finish(self) -> None:
-        """Wait for what is still to be written, but not for long."""
+        """Wait for pending output, with a timeout."""
         try:
             self._waiting.put_nowait(None)
         except queue.Full:

@@ -278,7 +278,7 @@ class Anonymiser:
     def _moved(
         self, fields: Mapping[str, Any], lat: str, lon: str, unit: float
     ) -> dict[str, float]:
-        """Move a latitude and a longitude; 0, 0 and what is not on the earth mean unknown."""
+        """Move a latitude and a longitude; 0, 0 and values out of range mean unknown."""
         lat_deg, lon_deg = fields[lat] / unit, fields[lon] / unit
         moved: dict[str, float] = {}
         if not lat_deg and not lon_deg:

@@ -200,7 +200,7 @@ class FlownFigures:
 
 
 def read_recording(name: str, recording: VehicleRecording) -> Contents:
-    """Read what is compared of a recording; raises FlightError if it has no vehicle."""
+    """Read the compared parts of a recording; raises FlightError if it has no vehicle."""
     facts, reader = FlownFigures(), recording.reader(_IDS.values())
     last_us = 0
     for batch in recording.batches():

@@ -316,7 +316,7 @@ add_writer(".parquet", _packaged("parquet", "Parquet"), Lacks(of_tlogs=NOT_IN_TA
 
 
 class Pieces:
-    """A file to write that cannot be sought and gives away what was written."""
+    """A file in memory, without seek; the bytes written so far can be taken out."""
 
     def __init__(self) -> None:
         self.closed = False

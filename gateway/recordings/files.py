@@ -194,7 +194,7 @@ class Before:
 
 
 def skip_to(begin: re.Pattern[bytes], content: Iterator[bytes]) -> tuple[Iterator[bytes], Before]:
-    """Leave out what is before the begin of a log."""
+    """Leave out the bytes before the begin of a log."""
     head, blank = _behind_blank(content)
     found = begin.search(head, 0, HEAD)
     at = found.end() if found else 0

@@ -390,7 +390,7 @@ def interpolated_positions(fixes: FloatArray, latency_s: float) -> Correct:
 
 
 def smoothed_states(smooth_us: IntArray, smoothed: FloatArray) -> Correct:
-    """Replace each state by the smoothed one of its time; flags of what is in use stay."""
+    """Replace each state by the smoothed one of its time; the flags of sensors in use stay."""
 
     def correct(time_us: IntArray, states: FloatArray) -> FloatArray:
         at = np.searchsorted(smooth_us, time_us).clip(0, max(len(smooth_us) - 1, 0))

@@ -24,7 +24,7 @@ class Moment:
 
 
 def parse_moment(text: str) -> Moment:
-    """Read a moment; raises ValueError if it is none of these."""
+    """Read a moment; raises ValueError if it has another form."""
     if len(text) > MAX_TEXT:
         raise ValueError(f"invalid time of {len(text)} letters; {USE}")
     if match := _CLOCK.fullmatch(text.strip()):

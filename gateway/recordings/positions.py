@@ -81,7 +81,7 @@ RANKS: Final = {message_id: rank for rank, message_id in enumerate(POSITION_SOUR
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """A position of a vehicle; what is unknown is NaN."""
+    """A position of a vehicle; unknown values are NaN."""
 
     lat_deg: float
     lon_deg: float

@@ -11,7 +11,7 @@ from gateway.recordings.tlog import STRIDE, Batch, Damage, Timeline
 from gateway.recordings.tlog_scan import TIME_SIZE
 
 MAX_DAMAGE_RUNS: Final = 1000
-"""Runs that are listed one by one; a file of nothing but damage must not fill the memory."""
+"""Runs that are listed one by one; a file that is damaged throughout must not fill the memory."""
 
 
 class TlogIndex:

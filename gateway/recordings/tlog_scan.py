@@ -31,7 +31,7 @@ ExtraArray = NDArray[np.int16]
 
 TIME_SIZE: Final = 8
 HEADER_SIZE: Final = 9
-"""The time and the frame's first byte: what is looked at of the next record."""
+"""Size of a record's time and the first byte of its frame, which are checked of the next record."""
 SMALLEST_RECORD: Final = 16
 LARGEST_RECORD: Final = 8 + 12 + 255 + 13
 

@@ -103,7 +103,7 @@ class SourceInput:
         self._newest_fault = (fault.detail or fault.kind)[:MAX_DETAIL]
 
     def opened(self) -> None:
-        """Note that the transport was opened, and discard what was received in part."""
+        """Note that the transport was opened, and discard an incomplete line or frame."""
         self.decoder.reset()
         self.connected, self.reason = True, ""
 

@@ -78,7 +78,7 @@ class Location:
     """NaN if unknown."""
 
     def fault(self) -> str:
-        """Return what is wrong with the coordinates or the height; an empty text if nothing is."""
+        """Describe an error of the coordinates or the height; empty if there is none."""
         if not abs(self.lat_deg) <= MAX_LAT_DEG:
             return f"latitude must be between -90 and 90, not {self.lat_deg}"
         if not abs(self.lon_deg) <= MAX_LON_DEG:

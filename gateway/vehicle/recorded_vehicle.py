@@ -230,7 +230,7 @@ class RecordedVehicle:
         return min((time_us for time_us in due if time_us is not None), default=None)
 
     def remove_client(self, client_id: int) -> None:
-        """Drop what was kept for a client that has gone."""
+        """Discard the state of a client that has gone."""
         for service in self._services:
             service.remove_client(client_id)
 

@@ -53,7 +53,7 @@ class RequestReader:
         return Request(incoming.client_id, *sender, message, allowed, reason, is_rejected)
 
     def _decode(self, frame: bytes) -> Any:
-        """Decode a frame, or return what is wrong with it."""
+        """Decode a frame, or return its fault."""
         # An unknown incompatibility flag forbids reading on.
         if not frame or (frame[0] == START_V2 and frame[2:] and frame[2] & ~SIGNED):
             return "malformed"

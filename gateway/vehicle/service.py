@@ -132,7 +132,7 @@ class Service:
         return []
 
     def poll(self, _now_us: int) -> list[Answer]:
-        """Return what is due by time."""
+        """Return the answers that are due."""
         return []
 
     def next_due_us(self) -> int | None:
@@ -140,4 +140,4 @@ class Service:
         return None
 
     def remove_client(self, client_id: int) -> None:
-        """Discard what was kept for a client that has gone."""
+        """Discard the state of a client that has gone."""

@@ -346,7 +346,7 @@ class Vehicle:
         return min(time_us for time_us in due if time_us is not None)
 
     def remove_client(self, client_id: int) -> None:
-        """Drop what was kept for a client that has gone."""
+        """Discard the state of a client that has gone."""
         for service in self._timed:
             service.remove_client(client_id)
 

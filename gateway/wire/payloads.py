@@ -334,7 +334,7 @@ def decode_content(
 def _decode_other(
     content: bytes, size: int
 ) -> RadioFrame | ReceiverStatusFrame | ForeignFrame | Fault:
-    """Read a frame without a plain radio payload, or return what is wrong with it."""
+    """Read a frame without a plain radio payload, or return its fault."""
     if size < _FRAME_HEADER.size:
         return Fault(FaultKind.TOO_SHORT, size)
     first, frame_seq, _, receiver_time_us = _FRAME_HEADER.unpack_from(content)
@@ -383,7 +383,7 @@ def _read_body(first: int, address: int, data: bytes, begin: int) -> Payload | F
 
 
 def _fault_of(first: int, address: int, body_size: int) -> FaultKind:
-    """Return what is wrong with a payload whose layout or address does not exist."""
+    """Return the fault of a payload whose layout or address does not exist."""
     if body_size > MAX_PAYLOAD - _HEADER.size:
         return FaultKind.PAYLOAD
     if first >> 4 != PROTOCOL_VERSION:

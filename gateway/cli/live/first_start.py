@@ -176,7 +176,7 @@ def _choose(report: LinkReport, vehicle: int | None) -> int:
 def _check_nodes(
     report: LinkReport, statuses: dict[tuple[int, int], NodeStatus], vehicle: int
 ) -> None:
-    """Print the boards of the aircraft, and what is wrong with them."""
+    """Print the boards of the aircraft, and their faults."""
     table = table_of(
         "node", "firmware", "sensors", "missing", "payloads/s", "lost %", "supply V", left=4
     )
@@ -332,5 +332,5 @@ def _hint(text: str) -> None:
 
 
 def _stop(text: str, *hints: str) -> NoReturn:
-    """End the command with what is wrong, and what to do."""
+    """End the command with the reason and the remedy."""
     refuse("\n".join([text, *(f"- {hint}" for hint in hints)]))

@@ -101,7 +101,7 @@ def sweep(
     scheduler: SchedulerOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Find one set of settings for many flights; those of other days judge what was chosen."""
+    """Find one set of settings for many flights, validated by those of other days."""
     from gateway.cli.recorded.sweep import SweepOptions, run_season_sweep
 
     work = SeasonWork(files, jobs, scheduler)

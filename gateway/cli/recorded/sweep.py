@@ -295,7 +295,7 @@ def run_season_sweep(
     options: SweepOptions,
     kept: Path | None = None,
 ) -> list[FlightResult]:
-    """Score every point on every flight, show what is best for all, and write it."""
+    """Score every point on every flight, show the best point for all, and write it."""
     import pandas as pd
 
     if kept is not None:
@@ -330,7 +330,7 @@ def run_season_sweep(
 
 
 def _chosen(swept: Sequence[FlightResult]) -> "tuple[FloatArray, Choice]":
-    """Return the errors with the settings that the flights came with, and what is best."""
+    """Return the errors with the settings of the flights, and with the best ones."""
     from gateway.batch.statistics import choose, group_of
 
     # An unknown score is null in JSON.

@@ -426,7 +426,7 @@ class Client:
             self.context.deliver(self, frame, now_us)
 
     def go_on(self, step: Callable[[], None], now_us: int) -> None:
-        """Do what the compiled step has left to Python, until it has walked over what was read."""
+        """Process what the compiled step leaves to Python, until all bytes read are processed."""
         work = self.context.forwarding.work
         while (status := work[kernel.STATUS]) & (kernel.RUN_SENT | kernel.HAND_OVER):
             if status & kernel.RUN_SENT:

@@ -331,7 +331,7 @@ class PrintedDamage(io.TextIOBase):
         self.was_printed = False
 
     def write(self, text: str) -> int:
-        """Count what is reported as skipped."""
+        """Count the bytes that are reported as skipped."""
         self.was_printed = True
         self.bytes += sum(map(int, _SKIPPED.findall(text)))
         return len(text)

@@ -120,7 +120,7 @@ class _Run:
         return sample.time_us - self.samples[0].time_us
 
     def collected(self) -> NodeSamples:
-        """Return what was collected, in body axes, and start again."""
+        """Return the collected samples, in body axes, and start again."""
         found = NodeSamples(
             time_s=np.array([sample.time_us for sample in self.samples]) / US_PER_S,
             accel=np.array([sample.accel_b_mps2 for sample in self.samples]),

@@ -58,7 +58,7 @@ SHORTHANDS: Final = {
 }
 """Older commands for single messages."""
 Outcome = tuple[int, list[Answer]]
-"""Result of a command, and what is sent after its acknowledgement."""
+"""Result of a command, and the answers after its acknowledgement."""
 Explain = Callable[[str, int], list[Answer]]
 """Announces a text to all at a time: why something was refused."""
 Build = Callable[[int, int], Any]

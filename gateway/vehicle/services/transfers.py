@@ -41,7 +41,7 @@ class TransferService(Service):
         return self._due_us if self._transfers else None
 
     def _start(self, key: int, answers: Iterator[Answer], now_us: int) -> list[Answer]:
-        """Start a transfer, or start it again; return what is sent at once."""
+        """Start a transfer, or start it again; return its first answers."""
         if key in self._transfers or len(self._transfers) < MAX_TRANSFERS:
             self._transfers[key] = answers
         return self.poll(now_us)

@@ -107,7 +107,7 @@ class Reported:
         return value if value is not None and now_us - time_us <= timeout_us else None
 
     def state(self, time_us: int, fix: GpsFix | None, timeout_us: int) -> NavState:
-        """Return the state at the time of a report or a fix; what is not known is NaN."""
+        """Return the state at the time of a report or a fix; unknown values are NaN."""
         attitude = self.value("attitude_rad", time_us, timeout_us)
         climb = self.value("climb_mps", time_us, timeout_us)
         flags = NavFlags(0) if attitude is None else NavFlags.ATTITUDE_VALID
