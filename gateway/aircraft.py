@@ -320,22 +320,10 @@ def with_passphrase(settings: AircraftSettings, passphrase: str) -> AircraftSett
 
 
 def migrate_sections(sections: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Convert settings of earlier versions to present ones.
+    """Convert settings of earlier versions, as builtins; return remarks on the changes too.
 
     The filter chain of `sensing` is part of the paper's estimator now, and `complementary` is
     `eskf`. Settings of estimators that no longer exist are left out.
-
-    Parameters
-    ----------
-    sections : mapping
-        Settings as builtins, such as a TOML file or a recording contains them.
-
-    Returns
-    -------
-    sections : dict
-        The same with present names.
-    remarks : list of str
-        One sentence for each change.
     """
     present: dict[str, Any] = dict(sections)
     remarks: list[str] = []

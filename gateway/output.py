@@ -75,30 +75,11 @@ def write_new(
     inputs: Iterable[Path | None] = (),
     rights: int | None = None,
 ) -> int:
-    """Write a file in full or not at all.
+    """Write a file in full or not at all, and return its size in bytes.
 
-    Parameters
-    ----------
-    path : Path
-        Must not exist unless it may be overwritten.
-    pieces : iterable of bytes
-        What to write.
-    overwrite : bool
-        Replace an existing regular file.
-    inputs : iterable of Path or None
-        The input files; none of them is replaced.
-    rights : int, optional
-        Its mode; by default that of the file that it replaces, or `READABLE`.
-
-    Returns
-    -------
-    int
-        Bytes written.
-
-    Raises
-    ------
-    OSError
-        As `check_output`, or if the disk fails.
+    Only with `overwrite` may a regular file be there, which it replaces, but never one of `inputs`.
+    Its mode is `rights`, by default that of the file that it replaces, or `READABLE`. Raises
+    OSError as `check_output`, or if the disk fails.
     """
     check_output(path, inputs, overwrite=overwrite)
     if rights is None:

@@ -47,17 +47,9 @@ _JSON_ESCAPES: Final = {code: _json_escape(code) for code in (*_CONTROL[0x20:], 
 
 
 def printable(text: str) -> str:
-    r"""Return a text with control and direction characters escaped.
+    r"""Return a text with control and direction characters escaped, as `\xNN` or `\uNNNN`.
 
-    Parameters
-    ----------
-    text : str
-        Any text.
-
-    Returns
-    -------
-    str
-        With `\xNN`, `\uNNNN` or `\UNNNNNNNN` for each such character; line feeds and tabs stay.
+    Line feeds and tabs stay.
     """
     return text.translate(_ESCAPES)
 

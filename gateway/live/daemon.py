@@ -87,18 +87,9 @@ SECRET_MESSAGES: Final = ids_of("CHANGE_OPERATOR_CONTROL", "SETUP_SIGNING")
 class Daemon:
     """The running gateway: receiver in, MAVLink out.
 
-    Parameters
-    ----------
-    settings : GatewaySettings
-        All settings.
-    aircraft : mapping of int to AircraftSettings
-        Settings of single aircraft, by vehicle id.
-    read : callable
-        Reads the settings again, or raises ConfigError.
-    line : iterator of TimedFrame, optional
-        Frames of a simulated receiver, instead of the serial port.
-    simulated_kind : str
-        Kind of source whose bytes they are, if they are not the receiver's.
+    `aircraft` has the settings of single aircraft by vehicle id; `read` reads all settings again,
+    or raises ConfigError. `line` brings the frames of a simulated receiver instead of the serial
+    port, or the bytes of a source of `simulated_kind`.
     """
 
     _timer: asyncio.TimerHandle | None = None

@@ -58,22 +58,12 @@ HELD_BYTES: Final = PENDING_LIMIT // 4
 class Recorder:
     """Record MAVLink and flights.
 
-    Parameters
-    ----------
-    settings : RecordingSettings
-    now_us, unix_us : callable
-        The gateway clock, and the machine's civil time.
-    header_of : callable
-        Returns the head of a vehicle's table; session, part and start are filled in here.
-    announce : callable
-        Called with whether it is a problem, and a text for the user.
-    state_of : callable
-        Returns the state of a vehicle's fusion after all records passed to `flight`.
-    introduction_of : callable
-        Returns the frames of a vehicle that every part begins with: version, modes, parameters,
-        missions, home.
-    vehicles_of : callable
-        Returns latitude and longitude of the homes of own aircraft, or None, by id.
+    `now_us` and `unix_us` return the gateway clock and the machine's civil time; `header_of` the
+    head of a vehicle's table, which gets its session, part and start here; `state_of` the state of
+    a vehicle's fusion after all records passed to `flight`; `introduction_of` the frames of a
+    vehicle that every part begins with: version, modes, parameters, missions, home; `vehicles_of`
+    latitude and longitude of the homes of own aircraft, or None, by id. `announce` is called with
+    whether it is a problem, and a text for the user.
     """
 
     def __init__(

@@ -24,21 +24,9 @@ LONGEST_LOSS_US: Final = 60 * US_PER_S
 def gps_outages_us(
     gps_us: IntArray, fixed: NDArray[np.bool_], end_us: int
 ) -> list[tuple[int, int]] | None:
-    """Find the times without a fix, from the first fix on.
+    """Return begin and end of each time without a fix, from the first fix on; None without any fix.
 
-    Parameters
-    ----------
-    gps_us : ndarray, shape (N,)
-        Times of all reports of the receiver.
-    fixed : ndarray, shape (N,)
-        Which of them had a fix.
-    end_us : int
-        End of the flight.
-
-    Returns
-    -------
-    list of (int, int) or None
-        Begin and end of each; None if there was no fix at all.
+    `gps_us`, shape (n,), are the times of all reports of the receiver; `fixed` those with a fix.
     """
     fixes_us = gps_us[fixed]
     if not len(fixes_us):

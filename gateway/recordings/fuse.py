@@ -127,28 +127,15 @@ def fuse(
     smoothed: bool = False,
     on_fix: Callable[[], None] | None = None,
 ) -> Fused:
-    """Fuse the samples of a recording: the only way from recorded samples to states.
+    """Fuse the samples of a recording or of its next stretch: the only way from them to states.
 
-    Parameters
-    ----------
-    samples : Samples
-        The recording, or its next stretch.
-    estimator : Estimator
-        In the order of arrival it advances over the samples, with the bits of live states.
-        Smoothed it has to be the Kalman filter, and is not changed; states are in order of time.
-    smoothed : bool
-        Whether states use the samples after them too; see `smooth`.
-    on_fix : callable, optional
-        Called after each fix, except smoothed.
+    In the order of arrival the estimator advances over the samples, with the bits of live states;
+    `on_fix` is called after each fix. Smoothed, the states use the samples after them too and are
+    in order of time (see `smooth`); the estimator has to be the Kalman filter then, and is not
+    changed.
 
-    Returns
-    -------
-    Fused
-
-    Raises
-    ------
-    ValueError
-        If it is to be smoothed and the clock was set back: there is no order to smooth in.
+    Raises ValueError if it is to be smoothed and the clock was set back: there is no order to
+    smooth in.
     """
     imu = samples.imu
     if smoothed:

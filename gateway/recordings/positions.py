@@ -132,16 +132,9 @@ def holds_position(message_id: int, fields: Any) -> Any:
 def position_of(
     message_id: int, fields: Mapping[str, Any], origin: Position | None = None
 ) -> Position | None:
-    """Return the position in a message; None if it holds none that is valid.
+    """Return the position in a message of `POSITION_SOURCES`; None if it has no valid one.
 
-    Parameters
-    ----------
-    message_id : int
-        One of `POSITION_SOURCES`.
-    fields : mapping
-        Its fields by name.
-    origin : Position, optional
-        Of LOCAL_POSITION_NED, by GPS_GLOBAL_ORIGIN.
+    `origin`, of GPS_GLOBAL_ORIGIN, is that of LOCAL_POSITION_NED.
     """
     if not holds_position(message_id, fields):
         return None
@@ -189,14 +182,7 @@ class Continuity:
     ) -> bool:
         """Return whether a position does not carry on the track before it.
 
-        Parameters
-        ----------
-        time_us : int
-            Time of the position.
-        lat_deg, lon_deg : float
-            The position.
-        boot_us : int, optional
-            The vehicle's own time since its boot.
+        `boot_us` is the vehicle's own time since its boot, if it is known.
         """
         last, self._last = self._last, (time_us, lat_deg, lon_deg)
         is_restarted = boot_us is not None and boot_us < self._boot_us - RESTART_US

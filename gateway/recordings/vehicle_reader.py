@@ -54,19 +54,10 @@ class VehicleMessage:
 
 
 class VehicleReader:
-    """Read the vehicles of a recording, frame by frame or batch by batch.
+    """Read the vehicles of a recording, or one of them, frame by frame or batch by batch.
 
-    Parameters
-    ----------
-    senders : Senders
-        The survey of the whole recording. A system that it lacks is taken to be one of the
-        gateway's own.
-    wanted : iterable of int, optional
-        Ids of further messages.
-    system_id : int, optional
-        The only system to read.
-    with_attitude : bool
-        Whether the attitude is wanted.
+    `senders` is the survey of the whole recording; a system that it lacks is taken to be one of the
+    gateway's own. `wanted` are ids of further messages.
     """
 
     def __init__(

@@ -27,17 +27,10 @@ NEIGHBOUR_DEG: Final = 0.0006
 
 
 class SimulatedAircraft:
-    """One aircraft with its sensors, for an unlimited time.
+    """One aircraft with its sensors, for an unlimited time, from a UTC time on.
 
-    Parameters
-    ----------
-    settings : SimulatorSettings
-    index : int
-        0 for the first aircraft; the next ones have the next ids, other gusts and another home.
-    start_unix_us : int
-        UTC at the start of the simulation.
-    motion : SensorMotion, optional
-        Motion of the aircraft; by default the planned flight.
+    The first one has the index 0; the next ones have the next ids, other gusts and another home. By
+    default its motion is the planned flight.
     """
 
     def __init__(

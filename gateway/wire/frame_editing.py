@@ -42,32 +42,16 @@ def edit_frame(
     sign: Sign | None = None,
     drop_signature: bool = False,
 ) -> MavFrame | None:
-    """Return a frame with other values.
+    """Return a frame of either version with other values.
 
-    Parameters
-    ----------
-    frame : MavFrame
-        Of either version.
-    sequence, system, component : int, optional
-        Of the header, 0 to 255.
-    fields : mapping, optional
-        Of the payload, by name: a number, a text or bytes for an array of characters, and a number
-        or a sequence for another array. Extension fields do not exist in MAVLink 1: skipped there.
-    sign : callable, optional
-        Signs the edited frame; without effect on MAVLink 1, which has no signatures.
-    drop_signature : bool, optional
-        Whether a signed frame becomes an unsigned one if there is no `sign`.
+    `fields` are those of the payload by name: a number, a text or bytes for an array of characters,
+    and a number or a sequence for another array; extension fields are skipped in MAVLink 1. `sign`
+    signs the edited frame, but for MAVLink 1, which has no signatures; without it a signed frame
+    becomes an unsigned one by `drop_signature`.
 
-    Returns
-    -------
-    MavFrame or None
-        None if the frame cannot be edited: its message is unknown, so that its checksum cannot be
-        computed, or it is signed and would keep a wrong signature.
-
-    Raises
-    ------
-    ValueError
-        If the message has no such field, or a value does not fit it.
+    None if the frame cannot be edited: its message is unknown, so that its checksum cannot be
+    computed, or it is signed and would keep a wrong signature. Raises ValueError if the message has
+    no such field, or a value does not fit it.
     """
     message_id, data = frame.message_id, frame.data
     extra = CRC_EXTRA.get(message_id)

@@ -68,18 +68,7 @@ class BadMessageError(ValueError):
 
 
 def to_json(message: Any) -> dict[str, Any]:
-    """Return a decoded message's fields.
-
-    Parameters
-    ----------
-    message : MAVLink_message
-        As pymavlink decodes it.
-
-    Returns
-    -------
-    dict
-        `type` with the message's name, then the fields in the order of the definition.
-    """
+    """Return `type` with the name of a decoded message, then its fields in order."""
     found: dict[str, Any] = {"type": message.msgname}
     for name, kind in zip(message.fieldnames, message.fieldtypes, strict=True):
         found[RENAMED.get(name, name)] = _out(message, name, kind)
@@ -87,22 +76,9 @@ def to_json(message: Any) -> dict[str, Any]:
 
 
 def from_json(fields: Any) -> Any:
-    """Build a message from JSON.
+    """Build a message, to be packed, from fields as `to_json` returns them.
 
-    Parameters
-    ----------
-    fields : dict
-        As `to_json` returns it; extension fields and the target may be missing.
-
-    Returns
-    -------
-    MAVLink_message
-        To be packed.
-
-    Raises
-    ------
-    BadMessageError
-        If it is invalid; the text names the field.
+    Extension fields and the target may be missing. Raises BadMessageError, which names the field.
     """
     if not isinstance(fields, dict):
         raise BadMessageError("a message is an object with its name under 'type'")
@@ -145,18 +121,10 @@ def template(name: str) -> dict[str, Any]:
 
 
 def json_from_frame(frame: bytes) -> tuple[str, bytes, dict[str, bytes]] | None:
-    """Return a frame as mavlink-server publishes it.
+    """Return a complete frame as mavlink-server publishes it; None for an unknown message.
 
-    Parameters
-    ----------
-    frame : bytes
-        A complete frame.
-
-    Returns
-    -------
-    tuple or None
-        Name of the message, `{"header": ..., "message": ...}` as JSON, and the JSON of each field
-        by its name; None for an unknown message.
+    These are the name of the message, `{"header": ..., "message": ...}` as JSON, and the JSON of
+    each field by its name.
     """
     try:
         message = mavlink.MAVLink(None).decode(bytearray(frame))

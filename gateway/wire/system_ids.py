@@ -55,23 +55,9 @@ def rename_systems(
 ) -> MavFrame | None:
     """Return a frame from another sender, with other system ids in its fields.
 
-    Parameters
-    ----------
-    frame : MavFrame
-        Returned itself if nothing changes.
-    sender : int
-        System id of the result's sender.
-    rename : callable
-        Returns the new id of a system; called for ids from 1 to 255.
-    sign : callable, optional
-        Signs the result if the frame is signed and changes.
-    drop_signature : bool, optional
-        Whether a signed frame that changes becomes an unsigned one if there is no `sign`.
-
-    Returns
-    -------
-    MavFrame or None
-        None if the frame must change and cannot; see `edit_frame`.
+    `rename` returns the new id of a system, 1 to 255. A frame that changes is signed by `sign` if
+    it is signed, or becomes unsigned by `drop_signature`. Returns the same frame if nothing
+    changes, and None if it must change and cannot; see `edit_frame`.
     """
     fields = _renamed_fields(frame, rename) if frame.message_id in FIELDS else {}
     if sender == frame.origin[0] and not fields:

@@ -98,19 +98,10 @@ class ClockTracker:
         return (1.0 / (1.0 + self._skew) - 1.0) * 1e6
 
     def observe(self, remote_u32: int, arrival_us: int) -> int:
-        """Process one packet and return its time on the local clock.
+        """Return the time of a packet on the local clock, µs; never later than its arrival.
 
-        Parameters
-        ----------
-        remote_u32 : int
-            The remote clock's stamp, modulo 2**32, in µs.
-        arrival_us : int
-            Arrival on the local clock, in µs.
-
-        Returns
-        -------
-        int
-            The stamp on the local clock, in µs; never later than the arrival.
+        `remote_u32` is the remote clock's stamp in µs, modulo 2**32, `arrival_us` is on the local
+        clock.
         """
         last_us, line, soonest, skew = self._last_us, self._line, self._soonest, self._skew
         remote_us = last_us + (remote_u32 - last_us & WRAP_MASK)
