@@ -176,10 +176,7 @@ class PlayerDaemon:
 
     def _answers_of(self, flight: PlayedFlight, system_id: int, played_as: int) -> VehicleAnswers:
         return VehicleAnswers(
-            flight.answers,
-            system_id,
-            played_as,
-            lambda: self._player.position_us - flight.shift_us,
+            flight.answers, system_id, played_as, lambda: self._player.position_us - flight.shift_us
         )
 
     def _send(self, frames: Iterable[bytes]) -> None:

@@ -73,10 +73,7 @@ def begin_copy(work: Callable[[Any, Connection], None], argument: Any) -> Connec
 
 
 def _send(
-    work: Callable[[Any, Connection], None],
-    argument: Any,
-    sender: Connection,
-    receiver: Connection,
+    work: Callable[[Any, Connection], None], argument: Any, sender: Connection, receiver: Connection
 ) -> None:
     # So that the pipe reports when no process receives.
     receiver.close()

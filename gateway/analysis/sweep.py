@@ -27,10 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from scipy.optimize import OptimizeResult
 
-SHORT: Final = {
-    "alpha": "estimation.paper.alpha_accel",
-    "beta": "estimation.paper.beta_velocity",
-}
+SHORT: Final = {"alpha": "estimation.paper.alpha_accel", "beta": "estimation.paper.beta_velocity"}
 """The paper's own names."""
 ESTIMATOR_KEY: Final = "estimation.estimator"
 LARGEST_GRID: Final = 100_000

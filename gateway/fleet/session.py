@@ -80,10 +80,7 @@ class FleetSession:
     """
 
     def __init__(
-        self,
-        settings: FleetSettings,
-        events: SessionEvents,
-        now_us: Callable[[], int],
+        self, settings: FleetSettings, events: SessionEvents, now_us: Callable[[], int]
     ) -> None:
         self.is_router = not settings.router
         self.locator = settings.router or settings.listen

@@ -49,7 +49,4 @@ def displacement_m(
     """Measure a short way as metres north and east, with the radii at its start."""
     meridian, parallel = radii_m(from_lat_deg, alt_m)
     delta_lon = wrap_180(to_lon_deg - from_lon_deg)
-    return (
-        math.radians(to_lat_deg - from_lat_deg) * meridian,
-        math.radians(delta_lon) * parallel,
-    )
+    return (math.radians(to_lat_deg - from_lat_deg) * meridian, math.radians(delta_lon) * parallel)

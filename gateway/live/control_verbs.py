@@ -216,11 +216,7 @@ class ImuTap:
 
     def verbs(self) -> Verbs:
         """Return the handlers."""
-        return {
-            "imu.samples": self._take,
-            "imu.calibration": self._get,
-            "imu.calibrate": self._set,
-        }
+        return {"imu.samples": self._take, "imu.calibration": self._get, "imu.calibrate": self._set}
 
     def add(self, fused: FusedSample) -> None:
         """Collect a sample, if a client asks for those of its aircraft."""

@@ -154,12 +154,7 @@ class Daemon:
             raise ConfigError(str(error)) from error
         return Pipeline(
             PipelineSettings(
-                default,
-                aircraft,
-                at_zero_us,
-                plans=plans,
-                timestamps=timestamps,
-                sources=sources,
+                default, aircraft, at_zero_us, plans=plans, timestamps=timestamps, sources=sources
             )
         )
 
@@ -177,8 +172,7 @@ class Daemon:
 
     def _make_control(self) -> ControlServer:
         self._imu = ImuTap(
-            lambda vehicle_id: self._pipeline.find(vehicle_id).settings.calibration,
-            self._calibrate,
+            lambda vehicle_id: self._pipeline.find(vehicle_id).settings.calibration, self._calibrate
         )
         return ControlServer(
             socket_path("run"),

@@ -82,9 +82,7 @@ LISTENER_GAUGES: Final = {
     "open": "1 while a listening port accepts clients; 0: another program has it.",
     "clients": "Clients of a listening port.",
 }
-LISTENER_COUNTERS: Final = {
-    "turned_away": "Clients turned away for lack of room: see max_clients.",
-}
+LISTENER_COUNTERS: Final = {"turned_away": "Clients turned away for lack of room: see max_clients."}
 CLIENT_COUNTERS: Final = {
     "sent": "Frames sent to a client.",
     "dropped": "Frames dropped: the client is too slow for them, or out of reach.",

@@ -179,11 +179,7 @@ class LogAnswers:
                 self.add_frame(batch.frame(i), time_us, senders.stations, vehicle)
 
     def add_frame(
-        self,
-        frame: bytes,
-        time_us: int,
-        stations: Set[int] = frozenset(),
-        vehicle: int = AUTOPILOT,
+        self, frame: bytes, time_us: int, stations: Set[int] = frozenset(), vehicle: int = AUTOPILOT
     ) -> None:
         """Use one frame: an answer or a part of a mission; others are ignored.
 

@@ -141,10 +141,7 @@ class Replay:
 
 
 def aircraft_for(
-    files: Sequence[Path],
-    table: RecordedTable,
-    options: ReadOptions,
-    given_s: float | None = None,
+    files: Sequence[Path], table: RecordedTable, options: ReadOptions, given_s: float | None = None
 ) -> AircraftSettings:
     """Choose the settings for a flight, and complete them from its log.
 

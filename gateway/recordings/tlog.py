@@ -221,13 +221,7 @@ class TlogScanner:
         runs = np.empty((2, room + 1), np.int64)
         was_in_step = self._in_step
         end, count, damaged, self._in_step = scan(
-            np.frombuffer(data, np.uint8),
-            final,
-            self._strict,
-            self._in_step,
-            _EXTRA,
-            columns,
-            runs,
+            np.frombuffer(data, np.uint8), final, self._strict, self._in_step, _EXTRA, columns, runs
         )
         offset = self._offset
         self._rest = data[end:]

@@ -105,12 +105,7 @@ class TlogEdits:
 class TlogEditor:
     """Apply edits to the records of some files; the remarks are complete at the end."""
 
-    def __init__(
-        self,
-        edits: TlogEdits,
-        limits: Limits,
-        remark: Callable[[str], None],
-    ) -> None:
+    def __init__(self, edits: TlogEdits, limits: Limits, remark: Callable[[str], None]) -> None:
         self._edits, self._limits, self._remark = edits, limits, remark
         self._left_out: Counter[int] = Counter()
         """Frames that could not be edited, by message."""

@@ -135,11 +135,7 @@ def transform(matrix: Matrix3, v: Vec3) -> Vec3:
     """Multiply a matrix and a vector."""
     x, y, z = v
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
-    return (
-        xx * x + xy * y + xz * z,
-        yx * x + yy * y + yz * z,
-        zx * x + zy * y + zz * z,
-    )
+    return (xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z)
 
 
 def compose(left: Matrix3, right: Matrix3) -> Matrix3:
@@ -228,11 +224,7 @@ class Correction:
         xx, xy, xz, yx, yy, yz, zx, zy, zz, bias_x, bias_y, bias_z = self._numbers
         x, y, z = v
         x, y, z = x * scale - bias_x, y * scale - bias_y, z * scale - bias_z
-        return (
-            xx * x + xy * y + xz * z,
-            yx * x + yy * y + yz * z,
-            zx * x + zy * y + zz * z,
-        )
+        return (xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z)
 
     def apply_all(self, vectors: FloatArray) -> FloatArray:
         """Correct an array of shape (n, 3); bit for bit what `apply` gives for each."""

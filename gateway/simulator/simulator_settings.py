@@ -16,9 +16,7 @@ class SimulatorSettings(Settings, frozen=True):
     seed: Annotated[
         int,
         setting(
-            "Start of every random number; the same seed flies the same flight.",
-            ge=0,
-            le=2**32 - 1,
+            "Start of every random number; the same seed flies the same flight.", ge=0, le=2**32 - 1
         ),
     ] = 1
     vehicle_id: Annotated[

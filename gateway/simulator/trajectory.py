@@ -305,11 +305,7 @@ def rotate_inverse(q_nb: FloatArray, v_n: FloatArray) -> FloatArray:
     # Written out: NumPy's cross product costs more than all the rest on short arrays.
     ta, tb, tc = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
     return np.column_stack(
-        [
-            a + w * ta + y * tc - z * tb,
-            b + w * tb + z * ta - x * tc,
-            c + w * tc + x * tb - y * ta,
-        ]
+        [a + w * ta + y * tc - z * tb, b + w * tb + z * ta - x * tc, c + w * tc + x * tb - y * ta]
     )
 
 

@@ -312,9 +312,7 @@ def encode_receiver_status(status: ReceiverStatusFrame) -> bytes:
     return head + body + pipes
 
 
-def decode_content(
-    content: bytes,
-) -> RadioFrame | ReceiverStatusFrame | ForeignFrame | Fault:
+def decode_content(content: bytes) -> RadioFrame | ReceiverStatusFrame | ForeignFrame | Fault:
     """Read the content of one checked serial frame, without COBS and CRC.
 
     A fault names what does not fit: version, kind, length or a value.

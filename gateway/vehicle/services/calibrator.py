@@ -139,11 +139,7 @@ class Calibrator(Service):
     The newest estimate, if there is any, is where the field of the Earth is looked up.
     """
 
-    def __init__(
-        self,
-        in_flight: Callable[[], bool],
-        state: Callable[[], NavState | None],
-    ) -> None:
+    def __init__(self, in_flight: Callable[[], bool], state: Callable[[], NavState | None]) -> None:
         self._in_flight = in_flight
         self._state = state
         self._run: _Run | None = None

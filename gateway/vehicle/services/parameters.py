@@ -399,11 +399,7 @@ def _general(parameter_path: str, parameter_crc: int) -> bytes:
         "modelName": "mavgate tracker",
         "firmwareVersion": ".".join((*__version__.split("."), "0", "0", "0")[:3]),
         "metadataTypes": [
-            {
-                "type": TYPE_PARAMETER,
-                "uri": f"mftp://{parameter_path}",
-                "fileCrc": parameter_crc,
-            }
+            {"type": TYPE_PARAMETER, "uri": f"mftp://{parameter_path}", "fileCrc": parameter_crc}
         ],
     }
     return _json(general)

@@ -69,12 +69,7 @@ LOGGING: Final = mavlink.MAV_SYS_STATUS_LOGGING
 GEOFENCE: Final = mavlink.MAV_SYS_STATUS_GEOFENCE
 PREARM: Final = mavlink.MAV_SYS_STATUS_PREARM_CHECK
 SENSORS: Final = (GYRO, ACCEL, MAG, PRESSURE, GPS)
-NODE_SENSORS: Final = (
-    (NODE_IMU, GYRO | ACCEL),
-    (1 << 1, MAG),
-    (1 << 2, PRESSURE),
-    (NODE_GPS, GPS),
-)
+NODE_SENSORS: Final = ((NODE_IMU, GYRO | ACCEL), (1 << 1, MAG), (1 << 2, PRESSURE), (NODE_GPS, GPS))
 """Bits of NodeStatus' masks, and the sensors they stand for."""
 
 

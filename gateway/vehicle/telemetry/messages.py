@@ -54,10 +54,7 @@ FIX_TYPES: Final = {
 
 ESTIMATOR_FLAGS: Final = (
     (NavFlags.ATTITUDE_VALID, mavlink.ESTIMATOR_ATTITUDE),
-    (
-        NavFlags.VELOCITY_VALID,
-        mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_VELOCITY_VERT,
-    ),
+    (NavFlags.VELOCITY_VALID, mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_VELOCITY_VERT),
     (
         NavFlags.POSITION_VALID,
         mavlink.ESTIMATOR_POS_HORIZ_REL
