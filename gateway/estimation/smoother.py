@@ -90,8 +90,6 @@ RIDGE: Final = 1e-9
 """Added to the correlation matrix so that it can be inverted."""
 BLOCK: Final = 256
 """Nodes whose gains are computed at once."""
-BYTES_PER_SECOND: Final = round(3 * 8 * STATES * STATES / NODE_S)
-"""Memory for a second of flight."""
 
 STATE_SIZE: Final = STATE_LAYOUT.itemsize
 MATRIX: Final = STATES * STATES
@@ -271,7 +269,7 @@ def smooth(estimator: KernelEstimator, log: SampleLog) -> tuple[FloatArray, floa
         The Kalman filter, fresh or in a state to continue from; it is not changed.
     log : SampleLog
         At each IMU sample, the barometer samples and fixes that are not later come first. Takes
-        `BYTES_PER_SECOND` of memory.
+        32 kB of memory for a second of flight.
 
     Returns
     -------

@@ -20,8 +20,6 @@ FloatArray = NDArray[np.float64]
 
 _FLOAT: Final = np.dtype(np.float64)
 
-IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
-
 
 @compiled
 def multiply(p: Quat, q: Quat) -> Quat:

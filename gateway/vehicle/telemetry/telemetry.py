@@ -203,12 +203,16 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position,
             mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: self._highres_imu,
             mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps_raw,
-            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: self._scaled_pressure,
+            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: lambda _: (
+                self._baro and messages.scaled_pressure(self._baro)
+            ),
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
             mavlink.MAVLINK_MSG_ID_SYS_STATUS: health.sys_status,
             mavlink.MAVLINK_MSG_ID_RADIO_STATUS: health.radio_status,
             mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: self._system_time,
-            mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
+            mavlink.MAVLINK_MSG_ID_HOME_POSITION: lambda _: (
+                self.home and messages.home_position(self.home)
+            ),
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2: self._high_latency,
             mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: health.newest_battery,
@@ -416,9 +420,6 @@ class Telemetry:
         builder = self._builders.get(message_id)
         return builder(now_us) if builder else None
 
-    def _of_state(self, build: Callable[[NavState], Any]) -> Builder:
-        return lambda _: None if self.state is None else build(self.state)
-
     def _of_attitude(self, build: Callable[[NavState], Any]) -> Builder:
         """Build nothing while the attitude is not known, as of a vehicle with GPS only."""
 
@@ -483,15 +484,9 @@ class Telemetry:
             return messages.gps_absent(now_us, self._located_fix)
         return messages.gps_raw_int(self.fix, self._located_fix)
 
-    def _scaled_pressure(self, _now_us: int) -> Any:
-        return None if self._baro is None else messages.scaled_pressure(self._baro)
-
     def _system_time(self, now_us: int) -> Any:
         offset = self._unix_offset_us
         return messages.system_time(now_us, None if offset is None else now_us + offset)
-
-    def _home_position(self, _now_us: int) -> Any:
-        return None if self.home is None else messages.home_position(self.home)
 
     def _extended_sys_state(self, _now_us: int) -> Any:
         return mavlink.MAVLink_extended_sys_state_message(
