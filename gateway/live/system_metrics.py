@@ -19,8 +19,6 @@ from gateway.wire.mavlink_splitter import MavFrame
 
 MAX_SYSTEMS: Final = 32
 """Values of the label; a time series each, and more are forged."""
-HEARD_US: Final = 60 * US_PER_S
-"""A system that was not heard for longer has no samples."""
 SYSTEM: Final = ("system",)
 HALF: Final = 128
 """A number that is further ahead is an older one, of a frame that came late or twice."""
@@ -103,12 +101,7 @@ class SystemMetrics:
         yield counter("system_frames_lost", text, SYSTEM, lost)
 
     def _present(self, now_us: int) -> dict[int, NewestState]:
-        found = {
-            system_id: state
-            for system_id, state in sorted(self._vehicles.states.items())
-            if state.age_us(now_us, *state.heard_us) <= HEARD_US
-        }
-        return dict(list(found.items())[:MAX_SYSTEMS])
+        return dict(list(self._vehicles.heard(now_us).items())[:MAX_SYSTEMS])
 
 
 def _label(system_id: int) -> Labels:

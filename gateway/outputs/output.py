@@ -8,7 +8,7 @@ import asyncio
 import ssl
 from collections.abc import Collection, Iterable
 from dataclasses import replace
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar
 
 from gateway.clock import unix_time_us
 from gateway.hub.endpoint import NO_MESSAGES, Endpoint, number_from
@@ -16,11 +16,8 @@ from gateway.hub.transports.base import Client
 from gateway.outputs.carrier import Carrier, client_context, target_of
 from gateway.recordings.antenna import HOME, AntennaStation, station_from
 from gateway.recordings.newest import STATE_IDS, NewestState, NewestVehicles
-from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
 
-HEARD_US: Final = 60 * US_PER_S
-"""A vehicle that was not heard for longer has gone."""
 MIN_RATE_HZ, MAX_RATE_HZ = 0.01, 50.0
 
 
@@ -93,12 +90,8 @@ class Output(Client):
 
     def heard(self, now_us: int) -> dict[int, NewestState]:
         """Return the chosen vehicle, or all that were heard lately, by their system ids."""
-        return {
-            system_id: state
-            for system_id, state in sorted(self.vehicles.states.items())
-            if self.vehicle_id in (0, system_id)
-            and state.age_us(now_us, *state.heard_us) <= HEARD_US
-        }
+        heard = self.vehicles.heard(now_us).items()
+        return {key: state for key, state in heard if self.vehicle_id in (0, key)}
 
     def chosen(self, now_us: int) -> NewestState | None:
         """Return the chosen vehicle, by default the one with the lowest system id."""

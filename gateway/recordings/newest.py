@@ -31,6 +31,8 @@ from gateway.wire.mavlink_splitter import MavFrame
 
 Fields = Mapping[str, Any]
 
+HEARD_US: Final = 60 * US_PER_S
+"""A vehicle that was not heard for longer has gone."""
 POSITION_FRESH_US: Final = 3 * US_PER_S
 """Positions of a poorer source are left out so long after one of a better source."""
 POSITION_OLD_US: Final = 5 * US_PER_S
@@ -283,6 +285,14 @@ class NewestVehicles:
         self.states: dict[int, NewestState] = {}
         """By system id."""
         self.components = VehicleComponents()
+
+    def heard(self, now_us: int) -> dict[int, NewestState]:
+        """Return those that were heard within `HEARD_US`, by system id in its order."""
+        return {
+            system_id: state
+            for system_id, state in sorted(self.states.items())
+            if state.age_us(now_us, *state.heard_us) <= HEARD_US
+        }
 
     def feed(self, frame: MavFrame, now_us: int) -> NewestState | None:
         """Process a frame of `STATE_IDS`; return the state of its vehicle, if it is of one."""
