@@ -5,8 +5,9 @@ address is accepted, since each hop writes its own. There is no escape: where a 
 decoder moves on by one byte, so that it finds the next frame behind any damage and between bytes of
 other protocols. Bytes that belong to no frame are one fault until the next frame.
 
-Scales are those that flight controllers send and EdgeTX shows; they differ from the published
+Scales are those that Betaflight sends and EdgeTX shows; they differ from the published
 specification where that states 10 uV for a tenth of a volt, and 0.01 km/h for a tenth of a km/h.
+So do the axes of accelerometer and gyroscope (0x13): x forward, y right and z down, of both.
 
 ArduPilot's own frames (0x80) contain packets of FrSky's passthrough protocol. The mode, the arming
 and the type of the vehicle are taken from them where they come, and else from the text of the
@@ -29,22 +30,28 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import (
     NAN,
+    BaroRaw,
     BatteryReport,
     GpsFix,
     GpsFixType,
+    ImuRaw,
     NodeId,
     RadioSignal,
+    Vec3,
     VehicleReport,
 )
 from gateway.sources.flight_modes import FIXED_WING, QUADROTOR, ardupilot_mode, mode_of_text
-from gateway.sources.sampling import fix_at, velocity
+from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import SourceUrl
-from gateway.units import M_PER_CM, RAD_PER_DEG, US_PER_S
+from gateway.units import M_PER_CM, RAD_PER_DEG, STANDARD_GRAVITY_MPS2, US_PER_S
 from gateway.wire.framing import Fault
+from gateway.wire.timesync import WRAP_MASK
 
 MIN_LENGTH, MAX_LENGTH = 2, 62
 """Of type, payload and CRC."""
 HEAD: Final = 2
+MSP_START, MSP_HEAD = b"$X", 8
+"""Of the packet, with a CRC at its end, in which ExpressLRS Backpack sends a frame as a datagram."""
 MAX_NOISE: Final = 64
 """Bytes without a frame that are one fault."""
 EXTENDED: Final = 0x28
@@ -52,6 +59,10 @@ EXTENDED: Final = 0x28
 KMH10_MPS: Final = 1.0 / 36.0
 SPEED_RANGE, SPEED_LINEAR = 0.026, 100.0
 """Of the packed vertical speed, cm/s: (exp(|n| * 0.026) - 1) * 100."""
+ACCEL_LSB_MPS2: Final = 16.0 * STANDARD_GRAVITY_MPS2 / 32767.0
+GYRO_LSB_DPS: Final = 2000.0 / 32767.0
+MAG_LSB_UT: Final = 0.1 / 3.0
+"""A third of a milligauss."""
 EXTRA_AGE_US: Final = 2 * US_PER_S
 """How long the extended frame and the time belong to later fixes."""
 PERCENT: Final = 100
@@ -68,7 +79,8 @@ ADDRESSES: Final = frozenset(
 """Those of the specification."""
 SIZES: Final = {
     0x02: (15, 15), 0x03: (9, 9), 0x06: (20, 20), 0x07: (2, 4), 0x08: (8, 8), 0x09: (2, 4),
-    0x0A: (2, 2), 0x0C: (4, 58), 0x0D: (3, 41), 0x0E: (3, 59), 0x14: (10, 10), 0x16: (22, 22),
+    0x0A: (2, 2), 0x0C: (4, 58), 0x0D: (3, 41), 0x0E: (3, 59), 0x11: (8, 8), 0x12: (6, 6),
+    0x13: (18, 18), 0x14: (10, 10), 0x16: (22, 22),
     0x1C: (5, 5), 0x1D: (6, 6), 0x1E: (6, 6), 0x1F: (9, 9), 0x21: (1, 32), 0x29: (16, 60),
     0x7F: (3, 60), 0x80: (3, 60),
 }  # fmt: skip
@@ -83,6 +95,7 @@ class CrsfDecoder:
 
     def __init__(self, url: SourceUrl, node: NodeId) -> None:
         self._node = node
+        self._is_datagram = url.transport == "udp"
         self._rest = b""
         self._noise = 0
         self._nose_down = url.options.get("pitch") == "down"
@@ -97,10 +110,16 @@ class CrsfDecoder:
         self._velocity: tuple[int, tuple[Any, ...]] | None = None
         self._utc: tuple[int, int] | None = None
         self._fix: GpsFix | None = None
+        self._clock = SampleClock()
+        self._mag_ut: Vec3 | None = None
+        """The compass's newest field, until a sample has it."""
         self._readers: dict[int, Callable[[bytes, int], Any]] = {
             0x02: self._gps,
             0x03: self._gps_time,
             0x06: self._gps_extended,
+            0x11: self._pressure,
+            0x12: self._field,
+            0x13: self._inertial,
             0x1E: self._attitude,
             0x21: self._flight_mode,
             0x29: self._device,
@@ -123,6 +142,8 @@ class CrsfDecoder:
     def feed(self, data: bytes, arrival_us: int) -> list[Any]:
         """Decode every frame that a chunk completes."""
         found: list[Any] = []
+        if self._is_datagram and data.startswith(MSP_START):
+            data = data[MSP_HEAD:-1]
         data = self._rest + data
         at = 0
         while len(data) - at > HEAD:
@@ -209,6 +230,25 @@ class CrsfDecoder:
 
     def _gps_extended(self, payload: bytes, arrival_us: int) -> None:
         self._velocity = (arrival_us, struct.unpack_from(">Bhhhhhhhh", payload))
+
+    def _pressure(self, payload: bytes, arrival_us: int) -> BaroRaw:
+        pascals, centidegrees = struct.unpack_from(">ii", payload)
+        stamp = arrival_us & WRAP_MASK
+        return BaroRaw(arrival_us, self._node, stamp, float(pascals), centidegrees / 100.0)
+
+    def _field(self, payload: bytes, _arrival_us: int) -> None:
+        x, y, z = (count * MAG_LSB_UT for count in struct.unpack_from(">hhh", payload))
+        self._mag_ut = (x, y, z)
+
+    def _inertial(self, payload: bytes, arrival_us: int) -> ImuRaw | None:
+        """Read a sample, whose axes become x forward, y left and z up, as those of the compass."""
+        stamp_us, *counts, centidegrees = struct.unpack_from(">I7h", payload)
+        gx, gy, gz = (count * GYRO_LSB_DPS for count in counts[:3])
+        ax, ay, az = (count * ACCEL_LSB_MPS2 for count in counts[3:])
+        mag, self._mag_ut = self._mag_ut, None
+        time_us = self._clock.own(stamp_us, arrival_us)
+        degc = centidegrees / 100.0
+        return imu_raw(time_us, self._node, (ax, -ay, -az), (gx, -gy, -gz), mag, degc)
 
     def _attitude(self, payload: bytes, _arrival_us: int) -> Parts:
         pitch, roll, yaw = (angle * 1e-4 for angle in struct.unpack_from(">hhh", payload))

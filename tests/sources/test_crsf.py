@@ -10,7 +10,9 @@ from crsf_parser.payloads import PacketsTypes
 from fastcrc.crc8 import dvb_s2
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.records import GpsFix, GpsFixType, NodeId, VehicleReport
+from gateway.records import GpsFix, GpsFixType, ImuFlags, NodeId, VehicleReport
+from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.chain import SensorChain
 from gateway.sources.kinds import make_decoder
 from gateway.sources.settings import parse_source
 from gateway.wire.framing import Fault
@@ -150,6 +152,25 @@ def test_rpm_temperatures_and_cells_are_read() -> None:
     assert battery.voltage_v == pytest.approx(11.52)
 
 
+def test_pressure_field_and_inertial_sample_of_betaflight_are_samples() -> None:
+    stream = decoder()
+    # At rest and level, as Betaflight writes it: specific force is up, and its z axis down.
+    values = (0, 0, 16384, round(32767 / 16), 0, -round(32767 / 16), 2550)
+    data = frame(0x11, struct.pack(">ii", 100_150, 2150)) + frame(
+        0x12, struct.pack(">hhh", 600, -30, -1200)
+    )
+    for stamp_us in (5_000, 15_000):
+        data += frame(0x13, struct.pack(">I7h", stamp_us, *values))
+    baro, first, second = stream.feed(data, 1_000_000)
+    assert (baro.pressure_pa, baro.temperature_degc) == (100_150.0, 21.5)
+    sample = SensorChain(NodeCalibration()).imu(first)
+    assert sample.accel_b_mps2 == pytest.approx((9.806, 0.0, -9.806), abs=0.01)
+    assert sample.gyro_b_radps == pytest.approx((0.0, 0.0, math.radians(1000.0)), rel=1e-3)
+    assert sample.mag_b_ut == pytest.approx((20.0, 1.0, 40.0), abs=0.01)
+    assert sample.temperature_degc == pytest.approx(25.5, abs=0.01)
+    assert not second.flags & ImuFlags.MAG_NEW, "one field, one sample"
+
+
 @pytest.mark.parametrize(
     ("text", "mode", "number", "armed", "kind"),
     [
@@ -244,6 +265,14 @@ def test_frames_are_found_between_bytes_of_other_protocols(noise: bytes) -> None
     assert len(records) == 40
     dropped = sum(each.size for each in found if isinstance(each, Fault))
     assert dropped >= 10 * len(noise)
+
+
+def test_frame_of_a_backpack_is_read_from_its_msp_packet() -> None:
+    content = frame(0x1E, ATTITUDE)
+    body = struct.pack("<BHH", 0, 0x11, len(content)) + content
+    stream = make_decoder(parse_source("crsf-udp:127.0.0.1:14550"), NODE)
+    found = [e for _ in range(3) for e in stream.feed(b"$X<" + body + bytes([dvb_s2(body)]), 0)]
+    assert [type(each) for each in found] == [VehicleReport] * 3
 
 
 def test_damaged_frame_is_one_fault_and_the_next_frame_is_read() -> None:
