@@ -1,10 +1,11 @@
 """The verbs of a gateway's control socket; see docs/control.md."""
 
 import asyncio
+import hmac
 import math
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Annotated, Final
 
@@ -17,6 +18,7 @@ from gateway.live.control_socket import ControlError, Verbs
 from gateway.live.recorder import Recorder
 from gateway.live.serial_port import SerialPort, SerialStatus, list_serial_ports
 from gateway.live.session import SessionState
+from gateway.live.source_port import SourcePort
 from gateway.recordings.index import Recording, delete_recording, find_recording, list_recordings
 from gateway.records import FusedSample, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration
@@ -87,6 +89,25 @@ class RecorderVerbs:
         if not self._recorder.mark(text):
             raise ControlError("sent to the ground stations, but in no file: nothing is recorded")
         return self._recorder.status()
+
+
+def source_verbs(ports: Sequence[SourcePort]) -> Verbs:
+    """Return the handlers of `source.*`: tokens of sources that take posts, and their content."""
+    taking = [port for port in ports if port.token]
+
+    def push(token: str, text: str) -> None:
+        for port in taking:
+            if hmac.compare_digest(port.token.encode(), token.encode()):
+                port.push(text.encode())
+                return
+        for port in taking:
+            port.refuse(len(text))
+        raise ControlError("no source has this token")
+
+    return {
+        "source.tokens": lambda: {port.token: port.name for port in taking},
+        "source.push": push,
+    }
 
 
 def mark_verbs(mark: Callable[[Location | None, int | None], None]) -> Verbs:

@@ -31,6 +31,7 @@ from gateway.live.control_verbs import (
     client_verbs,
     introduction_verb,
     mark_verbs,
+    source_verbs,
 )
 from gateway.live.kept_files import PlanFiles, TimestampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
@@ -182,6 +183,7 @@ class Daemon:
             mark_verbs(self._mark),
             SerialVerbs(self._serial, is_simulated=self._receiver is not None).verbs(),
             client_verbs(self._hub),
+            source_verbs(self._sources),
             self._imu.verbs(),
             introduction_verb(self._introduction),
         )

@@ -6,6 +6,8 @@
 | udp        | at once; an address in use is tried again     | never                             |
 | tcp        | when the server accepts                       | closed by the server: tried again |
 | tcp-listen | when a client connects, one at a time         | when it leaves                    |
+| poll       | when the server answers                       | when it does not: tried again     |
+| push       | with the first content                        | never                             |
 | stdin      | at once                                       | at its end, for good              |
 | file       | as soon as it exists, from its beginning      | shortened: read from its beginning|
 """
@@ -13,6 +15,7 @@
 import asyncio
 import logging
 import os
+import secrets
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -22,13 +25,20 @@ import serial
 
 from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports, open_port
 from gateway.printable import reason_of
-from gateway.sources.source import SourceInput
+from gateway.sources.source import PolledDecoder, SourceInput
+from gateway.wire.framing import Fault
 
 log = logging.getLogger(__name__)
 
 READ_SIZE: Final = 4096
 RETRY_S: Final = 1.0
 FILE_POLL_S: Final = 0.05
+POLL_S: Final = 0.1
+ANSWER_S: Final = 3.0
+"""Longest time for an answer."""
+MAX_ANSWER: Final = 1 << 20
+TOKEN_BYTES: Final = 9
+"""Of a token that the URL does not set: 72 bits."""
 DEFAULT_BAUD: Final = {"crsf": 420_000, "ltm": 9600}
 USUAL_BAUD: Final = 115_200
 
@@ -52,6 +62,10 @@ class SourcePort:
         self._on_bytes = on_bytes
         self._task: asyncio.Task[None] | None = None
         self._complaint = ""
+        self.token = ""
+        """By which content is pushed; empty if this source takes none."""
+        if source.url.transport == "push":
+            self.token = source.url.options.get("token") or secrets.token_urlsafe(TOKEN_BYTES)
 
     def start(self) -> None:
         """Begin to open it; needs a running event loop."""
@@ -69,6 +83,8 @@ class SourcePort:
             "udp": self._udp,
             "tcp": self._tcp,
             "tcp-listen": self._tcp_listen,
+            "poll": self._poll,
+            "push": self._push,
             "stdin": self._stdin,
             "file": self._file,
         }[url.transport]
@@ -173,6 +189,39 @@ class SourcePort:
         finally:
             writer.close()
 
+    async def _poll(self) -> None:
+        """Send the decoder's requests, and take each answer as a line."""
+        decoder = self._source.decoder
+        assert isinstance(decoder, PolledDecoder)
+        url, is_open = self._source.url, False
+        while True:
+            async with asyncio.timeout(ANSWER_S):
+                answer = await _get(url.address, url.port, decoder.request())
+            if not is_open:
+                self._opened()
+                is_open = True
+            self._feed(answer.replace(b"\n", b" ") + b"\n")
+            await asyncio.sleep(POLL_S)
+
+    async def _push(self) -> None:
+        self._source.lost("nothing was posted yet")
+        await asyncio.get_running_loop().create_future()
+
+    @property
+    def name(self) -> str:
+        """The URL without its options."""
+        return self._source.url.name
+
+    def refuse(self, size: int) -> None:
+        """Count a post with a wrong token."""
+        self._source.count(Fault("token", size, "a post to the panel had a wrong token"))
+
+    def push(self, data: bytes) -> None:
+        """Take content that was posted with the token."""
+        if data and not self._source.connected:
+            self._opened()
+        self._feed(data)
+
     async def _stdin(self) -> None:
         reader = asyncio.StreamReader(limit=READ_SIZE)
         protocol = asyncio.StreamReaderProtocol(reader)
@@ -194,6 +243,23 @@ class SourcePort:
                     self._lost("the file was shortened")
                     return
                 await asyncio.sleep(FILE_POLL_S)
+
+
+async def _get(host: str, port: int, path: str) -> bytes:
+    """Request a path by HTTP, and return the answer's content; raises OSError without one."""
+    reader, writer = await asyncio.open_connection(host, port)
+    try:
+        # Of version 1.0 an answer ends with the connection.
+        writer.write(f"GET {path} HTTP/1.0\r\nHost: {host}:{port}\r\n\r\n".encode())
+        answer = b""
+        while len(answer) <= MAX_ANSWER and (data := await reader.read(READ_SIZE)):
+            answer += data
+    finally:
+        writer.close()
+    head, gap, content = answer.partition(b"\r\n\r\n")
+    if head.split()[1:2] != [b"200"] or not gap or len(answer) > MAX_ANSWER:
+        raise ConnectionError("no answer of HTTP with status 200")
+    return content
 
 
 class _Datagrams(asyncio.DatagramProtocol):

@@ -33,6 +33,7 @@ from gateway.panel.open_pages import OpenPages
 from gateway.panel.page import build_page
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.pointing_api import pointing_router
+from gateway.panel.push_api import push_router
 from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.recording_transfer import add_recording_files
 from gateway.panel.response_headers import ScriptNonces
@@ -168,9 +169,9 @@ def make_parts(
 def make_app(parts: PanelParts) -> FastAPI:
     """Build the web application."""
     app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
-    for router in RestApi(parts.uplink).routers():
+    pointing = pointing_router(parts.fleet, parts.clock)
+    for router in (*RestApi(parts.uplink).routers(), pointing, push_router(parts.control)):
         app.include_router(router)
-    app.include_router(pointing_router(parts.fleet, parts.clock))
     telemetry = TelemetryFeed(parts.fleet, parts.clock)
 
     @app.websocket(PATH)

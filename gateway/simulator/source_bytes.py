@@ -1,4 +1,4 @@
-"""The simulated flight as bytes of other trackers: CRSF of a flight controller, and text lines."""
+"""The simulated flight as bytes of other trackers: CRSF of a flight controller, lines, a phone."""
 
 import json
 import math
@@ -137,6 +137,62 @@ def line_of(record: RawRecord) -> str:
             return ""
 
 
+PUSH_S: Final = 0.2
+"""Between two posts of the simulated phone."""
+
+
+def phone_bytes(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:
+    """Fly the simulated boards as a phone whose app Sensor Logger posts its readings, for ever."""
+    link = Link()
+    payload: list[dict[str, object]] = []
+    posted_s, number = 0.0, 0
+    for frame in simulate(settings, start_unix_us).frames():
+        for record in link.feed(frame.data, round(frame.time_s * US_PER_S)):
+            payload += _readings(record, start_unix_us)
+        if payload and frame.time_s - posted_s >= PUSH_S:
+            post = {"messageId": number, "sessionId": "demo", "deviceId": "demo"}
+            text = json.dumps(post | {"payload": payload}) + "\n"
+            yield TimedFrame(frame.time_s, text.encode())
+            posted_s, number, payload = frame.time_s, number + 1, []
+
+
+def _readings(record: RawRecord, start_unix_us: int) -> Iterator[dict[str, object]]:
+    """Yield the readings that Sensor Logger makes of a record."""
+
+    def reading(name: str, **values: float) -> dict[str, object]:
+        time_ns = (start_unix_us + record.time_us) * 1000
+        return {"name": name, "time": time_ns, "values": values}
+
+    match record:
+        case ImuRaw():
+            x, y, z = _scaled(
+                record.accel_raw, record.accel_range_g * STANDARD_GRAVITY_MPS2 / COUNTS
+            )
+            # The axes of a phone that lies with its top to the nose.
+            yield reading("gravity", x=0.0, y=0.0, z=STANDARD_GRAVITY_MPS2)
+            yield reading("accelerometer", x=-y, y=x, z=round(z - STANDARD_GRAVITY_MPS2, 5))
+            rate = math.radians(1.0 / GYRO_LSB[record.gyro_range_dps])
+            x, y, z = _scaled(record.gyro_raw, rate)
+            yield reading("gyroscope", x=-y, y=x, z=z)
+            if record.flags & ImuFlags.MAG_NEW:
+                x, y, z = _scaled(record.mag_raw, 100.0 / record.mag_lsb_per_gauss)
+                yield reading("magnetometer", x=-y, y=x, z=z)
+        case BaroRaw():
+            yield reading("barometer", pressure=round(record.pressure_pa / 100.0, 4))
+        case GpsFix(fix_ok=True):
+            north, east, _ = record.vel_n_mps
+            yield reading(
+                "location",
+                latitude=record.lat_dege7 * 1e-7,
+                longitude=record.lon_dege7 * 1e-7,
+                altitudeAboveMeanSeaLevel=record.alt_amsl_m,
+                speed=math.hypot(north, east),
+                bearing=math.degrees(math.atan2(east, north)) % 360.0,
+                horizontalAccuracy=3.0,
+                verticalAccuracy=5.0,
+            )
+
+
 def _scaled(counts: tuple[int, int, int], scale: float) -> list[float]:
     return [round(count * scale, 5) for count in counts]
 
@@ -173,5 +229,6 @@ def _minutes(dege7: int, sides: str, digits: int) -> str:
 SOURCE_BYTES: Final[dict[str, Callable[[SimulatorSettings, int], Iterator[TimedFrame]]]] = {
     "crsf": crsf_bytes,
     "lines": lines_bytes,
+    "phone": phone_bytes,
 }
 """By the kind of source."""

@@ -51,7 +51,7 @@ MIN_LENGTH, MAX_LENGTH = 2, 62
 """Of type, payload and CRC."""
 HEAD: Final = 2
 MSP_START, MSP_HEAD = b"$X", 8
-"""Of the packet, with a CRC at its end, in which ExpressLRS Backpack sends a frame as a datagram."""
+"""Of the packet, with a CRC at its end, in which an ExpressLRS Backpack sends a frame by UDP."""
 MAX_NOISE: Final = 64
 """Bytes without a frame that are one fault."""
 EXTENDED: Final = 0x28

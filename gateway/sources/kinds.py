@@ -9,8 +9,9 @@ from gateway.records import NodeId
 from gateway.sources.crsf import CrsfDecoder
 from gateway.sources.lines import LinesDecoder
 from gateway.sources.ltm import LtmDecoder
+from gateway.sources.phone import PhoneDecoder
 from gateway.sources.settings import OPTIONS, SourceSettings, SourceUrl, nodes_of, parse_source
-from gateway.sources.source import SourceDecoder, SourceInput
+from gateway.sources.source import PolledDecoder, SourceDecoder, SourceInput
 
 SourceKind = Callable[[SourceUrl, NodeId], SourceDecoder]
 """Makes a decoder of the URL, for its options, and the node that its records are from; raises
@@ -20,6 +21,7 @@ SOURCE_KINDS: Final[dict[str, tuple[SourceKind, tuple[str, ...]]]] = {
     "lines": (LinesDecoder, ("columns", "names")),
     "crsf": (CrsfDecoder, ("pitch", "type")),
     "ltm": (LtmDecoder, ("type",)),
+    "phone": (PhoneDecoder, ("sensors", "geoid_m")),
 }
 """Decoder and options of each kind."""
 
@@ -56,7 +58,7 @@ def check_source(url: SourceUrl) -> None:
         raise ValueError(
             f"source {url.url!r}: unknown option {unknown[0]!r}; there are {', '.join(allowed)}"
         )
-    for name in OPTIONS:
+    for name in ("baud", "id"):
         if name in url.options and not url.options[name].isdecimal():
             raise ValueError(f"source {url.url!r}: {name} must be a whole number")
 
@@ -65,7 +67,10 @@ def make_decoder(url: SourceUrl, node: NodeId) -> SourceDecoder:
     """Make the decoder of a URL; raises ValueError as `check_source`."""
     check_source(url)
     make, _ = SOURCE_KINDS[url.kind]
-    return make(url, node)
+    decoder = make(url, node)
+    if url.transport == "poll" and not isinstance(decoder, PolledDecoder):
+        raise ValueError(f"source {url.url!r}: {url.kind} cannot be polled")
+    return decoder
 
 
 def make_sources(

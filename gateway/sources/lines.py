@@ -85,9 +85,10 @@ REPORTED: Final = frozenset(
 
 
 class LineSplitter:
-    """Lines of a stream of bytes, at most `MAX_LINE` long."""
+    """Lines of a stream of bytes, of a greatest length."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_line: int = MAX_LINE) -> None:
+        self._max = max_line
         self._rest = b""
 
     def feed(self, data: bytes) -> list[str | Fault]:
@@ -95,12 +96,12 @@ class LineSplitter:
         *lines, rest = (self._rest + data).split(b"\n")
         found: list[str | Fault] = [
             line.decode("utf-8", "replace").strip()
-            if len(line) <= MAX_LINE
-            else Fault("too long", len(line), f"a line is longer than {MAX_LINE} bytes")
+            if len(line) <= self._max
+            else Fault("too long", len(line), f"a line is longer than {self._max} bytes")
             for line in lines
         ]
-        if len(rest) > MAX_LINE:
-            found.append(Fault("too long", len(rest), f"no line ends within {MAX_LINE} bytes"))
+        if len(rest) > self._max:
+            found.append(Fault("too long", len(rest), f"no line ends within {self._max} bytes"))
             rest = b""
         self._rest = rest
         return found

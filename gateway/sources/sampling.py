@@ -78,7 +78,11 @@ class SampleClock:
 
     def own(self, stamp_us: int, arrival_us: int) -> int:
         """Return the time of a sample that the source's clock has stamped."""
-        return self._after_last(self._tracker.observe(stamp_us & WRAP_MASK, arrival_us), 1)
+        return self.after_last(self.local(stamp_us, arrival_us))
+
+    def local(self, stamp_us: int, arrival_us: int) -> int:
+        """Return a stamp of the source's clock on the gateway clock."""
+        return self._tracker.observe(stamp_us & WRAP_MASK, arrival_us)
 
     def arrival(self, arrival_us: int) -> int:
         """Return the time of a sample without a stamp.
@@ -88,9 +92,10 @@ class SampleClock:
         gap_us = arrival_us - self._last_us
         if 0 < gap_us < US_PER_S:
             self._period_us += (gap_us - self._period_us) // PACE_WEIGHT
-        return self._after_last(arrival_us, max(self._period_us // 2, 1))
+        return self.after_last(arrival_us, max(self._period_us // 2, 1))
 
-    def _after_last(self, time_us: int, step_us: int) -> int:
+    def after_last(self, time_us: int, step_us: int = 1) -> int:
+        """Return a time, or one a step after the last sample's if it is not later."""
         if self._last_us - time_us > MAX_AHEAD_US:
             step_us = 1
         self._last_us = max(time_us, self._last_us + step_us)

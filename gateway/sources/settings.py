@@ -5,6 +5,8 @@
     KIND:udp:HOST:PORT           datagrams to this address
     KIND:tcp:HOST:PORT           connect, and reconnect when it breaks
     KIND:tcp-listen:HOST:PORT    serve one client at a time
+    KIND:poll:HOST:PORT          ask a server by HTTP, again and again
+    KIND:push                    what is posted to the panel, with a token
     KIND:receiver                packets of other programs that our receiver passes on
     KIND:stdin                   standard input
     KIND:file:PATH               a file that grows
@@ -20,13 +22,15 @@ from urllib.parse import parse_qsl
 from gateway.records import SOURCE_NODE, NodeId
 from gateway.settings import Settings, setting
 
-TRANSPORTS: Final = ("serial", "udp", "tcp", "tcp-listen", "receiver", "stdin", "file")
-PLAIN: Final = frozenset({"receiver", "stdin"})
+TRANSPORTS: Final = (
+    *("serial", "udp", "tcp", "tcp-listen", "poll", "push", "receiver", "stdin", "file"),
+)
+PLAIN: Final = frozenset({"push", "receiver", "stdin"})
 """Transports without an address."""
-NETWORK: Final = frozenset({"udp", "tcp", "tcp-listen"})
+NETWORK: Final = frozenset({"udp", "tcp", "tcp-listen", "poll"})
 MAX_SOURCES: Final = 16
 MAX_PORT: Final = 65535
-OPTIONS: Final = ("baud", "id")
+OPTIONS: Final = ("baud", "id", "token")
 """Of every kind."""
 
 

@@ -9,7 +9,7 @@ boards, and reports of an autopilot (`VehicleReport`), which are passed on with 
 
 from collections import Counter, deque
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import Final, Protocol, runtime_checkable
 
 from gateway.records import (
     BaroRaw,
@@ -46,6 +46,15 @@ class SourceDecoder(Protocol):
         ...
 
 
+@runtime_checkable
+class PolledDecoder(SourceDecoder, Protocol):
+    """A decoder of answers to requests of HTTP."""
+
+    def request(self) -> str:
+        """Return the path and query of the next request."""
+        ...
+
+
 @dataclass(slots=True)
 class _Node:
     """What came from one vehicle of a source."""
@@ -78,7 +87,7 @@ class SourceInput:
         records: list[SourceRecord] = []
         for event in self.decoder.feed(data, now_us):
             if isinstance(event, Fault):
-                self._count(event)
+                self.count(event)
                 continue
             self._records += 1
             node = self._nodes.setdefault(event.node, _Node(now_us))
@@ -97,7 +106,8 @@ class SourceInput:
         """The vehicles that records came from."""
         return frozenset(node.vehicle_id for node in self._nodes)
 
-    def _count(self, fault: Fault) -> None:
+    def count(self, fault: Fault) -> None:
+        """Count a fault."""
         known = fault.kind in self._faults or len(self._faults) < MAX_KINDS
         self._faults[fault.kind if known else "other"] += 1
         self._newest_fault = (fault.detail or fault.kind)[:MAX_DETAIL]

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from gateway.live import source_port
+from gateway.live.control_socket import ControlError
+from gateway.live.control_verbs import source_verbs
 from gateway.live.source_port import SourcePort
 from gateway.records import NodeId
 from gateway.sources.kinds import make_decoder
@@ -23,6 +25,7 @@ pytestmark = pytest.mark.io
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(source_port, "RETRY_S", 0.01)
     monkeypatch.setattr(source_port, "FILE_POLL_S", 0.01)
+    monkeypatch.setattr(source_port, "POLL_S", 0.01)
 
 
 class Opened:
@@ -32,17 +35,17 @@ class Opened:
         parsed, node = parse_source(url), NodeId(1, 8)
         self.source = SourceInput(parsed, node, make_decoder(parsed, node))
         self.data = b""
-        self._port = SourcePort(self.source, self._take)
+        self.port = SourcePort(self.source, self._take)
 
     def _take(self, _source: SourceInput, data: bytes) -> None:
         self.data += data
 
     async def __aenter__(self) -> "Opened":
-        self._port.start()
+        self.port.start()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        self._port.close()
+        self.port.close()
         await asyncio.sleep(0)
 
 
@@ -111,3 +114,50 @@ async def test_listening_source_serves_one_client_at_a_time() -> None:
         second.close()
         first.close()
         await until(lambda: not opened.source.connected)
+
+
+@pytest.mark.parametrize(
+    ("answer", "data"),
+    [
+        (b"HTTP/1.1 200 OK\r\nContent-Type: text/json\r\n\r\n{\n}", b"{ }\n"),
+        (b"HTTP/1.1 404 Not Found\r\n\r\n{}", b""),
+        (b"HTTP/1.1 200 OK\r\n\r\n" + bytes(2000), b""),
+        (b"x", b""),
+        (b"", b""),
+    ],
+)
+async def test_server_is_polled_with_the_requests_of_the_decoder(
+    answer: bytes, data: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(source_port, "MAX_ANSWER", 1000)
+    asked = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        asked.append(await reader.readuntil(b"\r\n\r\n"))
+        writer.write(answer)
+        await writer.drain()
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    async with server, Opened(f"phone:poll:127.0.0.1:{port}") as opened:
+        await until(lambda: len(asked) > 2 and opened.data[:4] == data)
+        assert opened.source.connected == bool(data)
+    assert asked[0].startswith(b"GET /get?acc_time=&accX=&")
+    assert asked[0].split(b"\r\n")[0].endswith(b" HTTP/1.0")
+
+
+async def test_posted_content_is_taken_with_the_token_and_others_are_counted() -> None:
+    async with Opened("phone:push?token=secret") as one, Opened("lines:push") as other:
+        await until(lambda: "posted" in other.source.reason)
+        verbs = source_verbs([one.port, other.port])
+        assert verbs["source.tokens"]() == {"secret": "phone:push", other.port.token: "lines:push"}
+        assert len(other.port.token) == 12
+        verbs["source.push"]("secret", "")
+        assert not one.source.connected
+        verbs["source.push"]("secret", "abc")
+        assert (one.data, other.data, one.source.connected) == (b"abc", b"", True)
+        for wrong in ("", "secre", "sécret"):
+            with pytest.raises(ControlError, match="no source has this token"):
+                verbs["source.push"](wrong, "abc")
+        assert other.source.report().faults == (("token", 3),)

@@ -56,6 +56,7 @@ class SourceName(StrEnum):
 
     CRSF = "crsf"
     LINES = "lines"
+    PHONE = "phone"
 
 
 @app.command()

@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping
 from functools import partial
+from importlib.util import find_spec
 from typing import Any, Final
 
 from nicegui import ui
 
 from gateway.live.control_socket import ControlError
+from gateway.panel.panel_settings import LOOPBACK
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets import (
     Cells,
@@ -24,6 +26,10 @@ from gateway.units import US_PER_S, counted
 REFRESH_S: Final = 1.0
 SERIAL_S: Final = 2.0
 AUTO: Final = "find the receiver by its frames"
+LOOPBACK_ONLY: Final = (
+    "Only this machine reaches the panel: a phone needs panel.address, a password, and a "
+    "certificate or insecure = true"
+)
 SILENT_US: Final = 2 * US_PER_S
 LOSS_WARN: Final = 5.0
 LOSS_BAD: Final = 20.0
@@ -55,6 +61,8 @@ class LinkView:
             with ui.element("div").classes("card padded wide"):
                 heading("Clients")
                 self._build_clients()
+            if context.may_change:
+                self._build_push()
             with ui.element("div").classes("card padded"):
                 heading("Listening")
                 self._ports = DataTable(("Port", "State", "Clients", "Turned away"), "No port.")
@@ -92,6 +100,38 @@ class LinkView:
         self._serial_reason = ui.label().classes("soft").props("data-role=serial")
         self._serial.set_visibility(False)
         self._context.every(SERIAL_S, self._refresh_serial)
+
+    def _build_push(self) -> None:
+        """Build the list of URLs to which a phone posts, which is hidden without such a source."""
+        with ui.element("div").classes("card padded").props("data-role=push") as self._push:
+            heading("Posts of a phone")
+            if self._context.parts.settings.address in LOOPBACK:
+                ui.label(f"{LOOPBACK_ONLY}.").classes("soft")
+            self._push_urls = ui.element("div")
+        self._push.set_visibility(False)
+        self._pushed: Record = {}
+        request = ui.context.client.request
+        self._base = str(request.base_url) if request is not None else "/"
+        self._context.every(SERIAL_S, self._refresh_push)
+
+    async def _refresh_push(self) -> None:
+        try:
+            sources = await self._context.ask("source.tokens")
+        except ControlError:
+            sources = {}
+        self._push.set_visibility(bool(sources))
+        if sources == self._pushed:
+            return
+        self._pushed = sources
+        self._push_urls.clear()
+        with self._push_urls:
+            for token, name in sources.items():
+                url = f"{self._base}push/{token}"
+                ui.label(printable(f"{name}: {url}"))
+                if find_spec("segno") is not None:
+                    import segno
+
+                    ui.html(segno.make(url).svg_inline(scale=4, light="#fff"), sanitize=False)
 
     async def _refresh_serial(self) -> None:
         try:

@@ -1,0 +1,99 @@
+"""Posts of a phone through the panel to a source of the gateway, past the login by a token."""
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from gateway.live.control_socket import ControlServer
+from gateway.live.control_verbs import source_verbs
+from gateway.live.source_port import SourcePort
+from gateway.panel.access import MAX_BODY, AccessControl
+from gateway.panel.logins import Logins
+from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.push_api import push_router
+from gateway.panel.uplink import ControlClient
+from gateway.records import NodeId
+from gateway.sources.kinds import make_decoder
+from gateway.sources.settings import parse_source
+from gateway.sources.source import SourceInput
+
+pytestmark = pytest.mark.io
+
+HASH = "scrypt$32768$" + "A" * 22 + "==$" + "A" * 86 + "=="
+"""Of a password that nobody has."""
+
+
+class Gateway:
+    """A gateway with a source that takes posts, and a panel that is open to the network."""
+
+    def __init__(self, folder: Path) -> None:
+        url, node = parse_source("phone:push?token=right"), NodeId(1, 8)
+        self.source = SourceInput(url, node, make_decoder(url, node))
+        self.lines: list[bytes] = []
+        port = SourcePort(self.source, lambda _, data: self.lines.append(data))
+        self.control = ControlServer(folder / "run.sock", source_verbs([port]))
+        settings = PanelSettings(address="0.0.0.0", password=HASH, insecure=True)
+        app = FastAPI()
+        app.include_router(push_router(ControlClient(self.control.path)))
+        guard = AccessControl(app, settings, Logins(settings.password, ""))
+        self.phone = httpx.AsyncClient(
+            transport=httpx.ASGITransport(app=guard), base_url="http://192.168.1.7:14590"
+        )
+
+
+@pytest.fixture
+async def gateway(tmp_path: Path) -> AsyncIterator[Gateway]:
+    made = Gateway(tmp_path)
+    await made.control.start()
+    async with made.phone:
+        yield made
+    made.control.close()
+
+
+async def test_post_with_the_token_becomes_one_line_of_the_source(gateway: Gateway) -> None:
+    content = '{"payload": [\n' + '"\u00e9\u0007", ' * 4000 + "]}"
+    answer = await gateway.phone.post("/push/right", content=content.encode())
+    assert answer.status_code == 200
+    assert b"".join(gateway.lines).decode() == content.replace("\n", " ") + "\n"
+
+
+@pytest.mark.parametrize(
+    ("path", "status"), [("/push/wrong", 404), ("/push/", 404), ("/push/right/x", 404), ("/", 303)]
+)
+async def test_post_without_the_token_is_refused_and_counted(
+    gateway: Gateway, path: str, status: int
+) -> None:
+    assert (await gateway.phone.post(path, content=b"x" * 9)).status_code == status
+    assert gateway.lines == []
+    assert gateway.source.report().faults == ((("token", 1),) if path == "/push/wrong" else ())
+
+
+@pytest.mark.parametrize(
+    ("headers", "content", "status"),
+    [
+        ({}, b"x" * (MAX_BODY + 1), 413),
+        ({"origin": "http://evil.example"}, b"x", 403),
+        ({"host": "evil.example"}, b"x", 403),
+    ],
+)
+async def test_post_that_is_too_large_or_of_a_foreign_page_is_refused(
+    gateway: Gateway, headers: dict[str, str], content: bytes, status: int
+) -> None:
+    answer = await gateway.phone.post("/push/right", content=content, headers=headers)
+    assert answer.status_code == status
+    assert gateway.lines == []
+
+
+async def test_token_does_not_open_the_rest_of_the_panel(gateway: Gateway) -> None:
+    for path in ("/v1/mavlink", "/push/../v1/mavlink", "/ws/mavlink"):
+        assert (await gateway.phone.get(path)).status_code == 401
+    assert (await gateway.phone.get("/push/right")).status_code == 405
+
+
+async def test_post_is_refused_while_no_gateway_runs(gateway: Gateway) -> None:
+    gateway.control.close()
+    answer = await gateway.phone.post("/push/right", content=b"{}")
+    assert (answer.status_code, answer.json()) == (404, {"detail": "no source takes this"})
