@@ -61,6 +61,7 @@ from gateway.settings import Field, Settings, fields_of
 from gateway.simulator.source_bytes import crsf_frame
 from gateway.sources.kinds import SOURCE_KINDS, make_sources
 from gateway.sources.lines import KEYS as LINE_KEYS
+from gateway.sources.phone import BUFFERS, LOGGED
 from gateway.sources.settings import SourceSettings
 from gateway.vehicle.plan import Location
 from gateway.wire import payloads
@@ -457,7 +458,30 @@ def command(file: tuple[str, bytes], words: tuple[str, ...]) -> None:
 SOURCE_NUMBER: Final = (
     st.floats() | st.integers(-(2**70), 2**70) | st.lists(st.floats(), max_size=4) | st.text()
 )
+READING: Final = st.fixed_dictionaries(
+    {
+        "name": st.sampled_from([*LOGGED]),
+        "time": st.integers(0, 10**10) | SOURCE_NUMBER,
+        "values": st.dictionaries(
+            st.sampled_from([key for _, keys in LOGGED.values() for key in keys]), SOURCE_NUMBER
+        ),
+    }
+)
+"""A reading as Sensor Logger posts it."""
+ANSWER: Final = st.dictionaries(
+    st.sampled_from([name for names in BUFFERS.values() for name in names]),
+    st.builds(lambda values: {"buffer": values}, st.lists(st.floats() | st.none(), max_size=3)),
+)
+"""Buffers as phyphox answers."""
+PHONE: Final = st.one_of(
+    st.builds(lambda readings: {"payload": readings}, st.lists(READING, max_size=4)),
+    st.builds(lambda buffers: {"buffer": buffers, "status": {}}, ANSWER),
+)
 SOURCE_TEXT: Final = st.one_of(
+    PHONE.map(lambda content: json.dumps(content).encode() + b"\n"),
+    st.lists(st.floats(), min_size=13, max_size=13).map(
+        lambda values: ",".join(map(str, values)).encode() + b"\n"
+    ),
     st.dictionaries(
         st.sampled_from(LINE_KEYS), SOURCE_NUMBER | st.text(max_size=9) | st.booleans()
     ).map(lambda content: json.dumps(content).encode() + b"\n"),

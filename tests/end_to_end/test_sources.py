@@ -64,10 +64,36 @@ def test_mavproxy_sees_a_crsf_vehicle(
         proxy.until(rf"{name} \{{.*?{fields}", f"status {name}")
 
 
-def test_lines_are_fused_and_seen(
-    start_gateway: Callable[..., Gateway], connect: Callable[..., Client]
+@pytest.mark.parametrize("kind", ["lines", "phone"])
+async def test_mavsdk_and_mavproxy_see_a_vehicle_of_samples(
+    kind: str,
+    start_gateway: Callable[..., Gateway],
+    start_mavproxy: Callable[[int], MavProxy],
 ) -> None:
-    gateway = start_gateway("demo", "--source", "lines")
+    gateway = start_gateway("demo", "--source", kind)
+    async with mavsdk_system(gateway.port) as system:
+        telemetry = TelemetryAsync(system)
+        async for position in telemetry.subscribe_position():
+            if math.isfinite(position.latitude_deg):
+                break
+        attitude = await anext(telemetry.subscribe_attitude_euler())
+        heading = await anext(telemetry.subscribe_heading())
+    assert abs(attitude.roll_deg) < STEEPEST_DEG
+    assert position.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+    assert 0.0 <= heading.heading_deg <= 360.0
+    proxy = start_mavproxy(gateway.port)
+    proxy.until(r"Detected vehicle 1:1")
+    proxy.until(r"ATTITUDE \{.*?roll : -?[\d.e-]+, pitch : -?[\d.e-]+,", "status ATTITUDE")
+    pattern = r"GLOBAL_POSITION_INT \{.*?lat : (-?\d+), lon : (-?\d+),.*?hdg : \d+\}"
+    found = proxy.until(pattern, "status GLOBAL_POSITION_INT")
+    assert int(found[1]) / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+
+
+@pytest.mark.parametrize("kind", ["lines", "phone"])
+def test_samples_of_a_source_are_fused_and_seen(
+    kind: str, start_gateway: Callable[..., Gateway], connect: Callable[..., Client]
+) -> None:
+    gateway = start_gateway("demo", "--source", kind)
     wanted = {"ATTITUDE", "GLOBAL_POSITION_INT", "HIGHRES_IMU", "GPS_RAW_INT", "ESTIMATOR_STATUS"}
     seen = connect(gateway.port).until(lambda seen: set(seen) >= wanted)
     assert seen["GLOBAL_POSITION_INT"].lat / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)

@@ -1,6 +1,5 @@
 // Any Arduino board with an MPU6050 (I2C) and an NMEA GPS receiver on Serial1: prints lines that
 // `mavgate run --source lines:/dev/ttyUSB0` reads. Needs no library besides Wire.
-// Not compiled by the project's tests: the Arduino core is not part of them.
 #include <Wire.h>
 
 const uint8_t MPU = 0x68;

@@ -1,7 +1,7 @@
 // A LoRa board on the ground with the RadioHead library (RH_RF95): prints each received packet as a
 // line for `mavgate run --source lines:/dev/ttyUSB0`, and the signal as a line of its own.
 // The tracker sends JSON objects or NMEA sentences, at most 251 bytes each.
-// Not compiled by the project's tests: the Arduino core and RadioHead are not part of them.
+// Not compiled by the project's tests: RadioHead is not part of them.
 #include <RH_RF95.h>
 #include <SPI.h>
 

@@ -1,0 +1,35 @@
+"""The example sketches: those whose libraries Debian has compile for an AVR."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parent.parent.parent / "firmware" / "examples"
+ARDUINO = Path("/usr/share/arduino/hardware/arduino/avr")
+FOLDERS = ("cores/arduino", "variants/mega", "libraries/Wire/src", "libraries/SPI/src")
+NOT_COMPILED = "// Not compiled by the project's tests"
+SKETCHES = sorted(EXAMPLES.glob("*/*.ino"))
+
+
+@pytest.mark.io
+@pytest.mark.parametrize("sketch", SKETCHES, ids=[path.stem for path in SKETCHES])
+def test_sketch_compiles_for_avr_or_is_said_to_be_untested(sketch: Path, tmp_path: Path) -> None:
+    if NOT_COMPILED in sketch.read_text():
+        return
+    if not ARDUINO.is_dir() or shutil.which("avr-g++") is None:
+        pytest.skip("gcc-avr or arduino-core-avr not found: apt-get install both")
+    program = tmp_path / "sketch.cpp"
+    program.write_text(f'#include <Arduino.h>\n#line 1 "{sketch.name}"\n{sketch.read_text()}')
+    command = ["avr-g++", "-c", "-std=gnu++11", "-Os", "-Wall", "-Werror", "-mmcu=atmega2560"]
+    command += ["-DF_CPU=16000000UL", "-DARDUINO=10819", "-DARDUINO_ARCH_AVR"]
+    command += [f"-I{ARDUINO / folder}" for folder in FOLDERS]
+    done = subprocess.run([*command, program, "-o", tmp_path / "sketch.o"], capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
+
+
+def test_at_least_one_sketch_is_compiled() -> None:
+    assert [path.stem for path in SKETCHES if NOT_COMPILED not in path.read_text()] == [
+        "lines_mpu6050"
+    ]
