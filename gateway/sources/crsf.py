@@ -1,9 +1,7 @@
 """CRSF: telemetry of ExpressLRS and Crossfire links, as EdgeTX mirrors it or a receiver sends it.
 
 Theory of operation. A frame is address, length, type, payload and a CRC-8 of type and payload; any
-address is accepted, since each hop writes its own. There is no escape: where a CRC fails, the
-decoder moves on by one byte, so that it finds the next frame behind any damage and between bytes of
-other protocols. Bytes that belong to no frame are one fault until the next frame.
+address is accepted, since each hop writes its own.
 
 Scales are those that Betaflight sends and EdgeTX shows; they differ from the published
 specification where that states 10 uV for a tenth of a volt, and 0.01 km/h for a tenth of a km/h.
@@ -43,6 +41,7 @@ from gateway.records import (
 from gateway.sources.flight_modes import FIXED_WING, QUADROTOR, ardupilot_mode, mode_of_text
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import SourceUrl
+from gateway.sources.source import FrameDecoder
 from gateway.units import M_PER_CM, RAD_PER_DEG, STANDARD_GRAVITY_MPS2, US_PER_S
 from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
@@ -52,10 +51,6 @@ MIN_LENGTH, MAX_LENGTH = 2, 62
 HEAD: Final = 2
 MSP_START, MSP_HEAD = b"$X", 8
 """Of the packet, with a CRC at its end, in which an ExpressLRS Backpack sends a frame by UDP."""
-MAX_NOISE: Final = 64
-"""Bytes without a frame that are one fault."""
-EXTENDED: Final = 0x28
-"""From this type on a payload begins with destination and origin."""
 KMH10_MPS: Final = 1.0 / 36.0
 SPEED_RANGE, SPEED_LINEAR = 0.026, 100.0
 """Of the packed vertical speed, cm/s: (exp(|n| * 0.026) - 1) * 100."""
@@ -90,14 +85,13 @@ would hold back the frames behind it."""
 Parts = dict[str, Any]
 
 
-class CrsfDecoder:
+class CrsfDecoder(FrameDecoder):
     """Decode a stream of CRSF."""
 
     def __init__(self, url: SourceUrl, node: NodeId) -> None:
+        super().__init__()
         self._node = node
         self._is_datagram = url.transport == "udp"
-        self._rest = b""
-        self._noise = 0
         self._nose_down = url.options.get("pitch") == "down"
         self._fixed_sign = "pitch" in url.options
         wanted = url.options.get("type")
@@ -135,47 +129,26 @@ class CrsfDecoder:
             0x5008: _passthrough_battery(1),
         }
 
-    def reset(self) -> None:
-        """Discard a part of a frame."""
-        self._rest, self._noise = b"", 0
-
     def feed(self, data: bytes, arrival_us: int) -> list[Any]:
         """Decode every frame that a chunk completes."""
-        found: list[Any] = []
         if self._is_datagram and data.startswith(MSP_START):
             data = data[MSP_HEAD:-1]
-        data = self._rest + data
-        at = 0
-        while len(data) - at > HEAD:
-            length = data[at + 1]
-            end = at + HEAD + length
-            least, most = SIZES.get(data[at + HEAD], (0, -1))
-            if data[at] in ADDRESSES:
-                least, most = 0, MAX_LENGTH - MIN_LENGTH
-            if not least <= length - MIN_LENGTH <= most:
-                at += 1
-                self._noise += 1
-                continue
-            if end > len(data):
-                break
-            if dvb_s2(data[at + HEAD : end - 1]) != data[end - 1]:
-                at += 1
-                self._noise += 1
-                continue
-            found += self._end_noise()
-            found += self._frame(data[at + HEAD], data[at + HEAD + 1 : end - 1], arrival_us)
-            at = end
-        self._rest = data[at:]
-        if self._noise >= MAX_NOISE:
-            found += self._end_noise()
-        return found
+        return super().feed(data, arrival_us)
 
-    def _end_noise(self) -> list[Fault]:
-        dropped, self._noise = self._noise, 0
-        why = f"{dropped} bytes belong to no frame with a right CRC"
-        return [Fault("crc", dropped, why)] if dropped else []
+    def size_at(self, data: bytes, at: int) -> int:
+        """Return the size of the frame that begins there, complete or not; 0 if none does."""
+        length, end = data[at + 1], at + HEAD + data[at + 1]
+        least, most = SIZES.get(data[at + HEAD], (0, -1))
+        if data[at] in ADDRESSES:
+            least, most = 0, MAX_LENGTH - MIN_LENGTH
+        if not least <= length - MIN_LENGTH <= most:
+            return 0
+        wrong = end <= len(data) and dvb_s2(data[at + HEAD : end - 1]) != data[end - 1]
+        return 0 if wrong else HEAD + length
 
-    def _frame(self, kind: int, payload: bytes, arrival_us: int) -> list[Any]:
+    def read(self, frame: bytes, arrival_us: int) -> list[Any]:
+        """Return the records and faults of a frame."""
+        kind, payload = frame[HEAD], frame[HEAD + 1 : -1]
         read = self._readers.get(kind)
         if read is None:
             unknown = Fault("unknown type", len(payload), f"type {kind:#x} is not known")
@@ -348,9 +321,13 @@ def _mavlink_fc(payload: bytes, _arrival_us: int) -> Parts:
     return {"mode": name, "custom_mode": number, "armed": armed, "vehicle_type": kind}
 
 
-def _vario(payload: bytes, _arrival_us: int) -> Parts:
-    (climb,) = struct.unpack_from(">h", payload)
-    return {"climb_mps": climb * M_PER_CM}
+def _scaled(kind: str, at: int, name: str, unit: float) -> Callable[[bytes, int], Parts]:
+    """Return a reader of one number of a payload."""
+
+    def read(payload: bytes, _arrival_us: int) -> Parts:
+        return {name: struct.unpack_from(kind, payload, at)[0] * unit}
+
+    return read
 
 
 def _battery(payload: bytes, _arrival_us: int) -> Parts:
@@ -377,11 +354,6 @@ def _barometer(payload: bytes, _arrival_us: int) -> Parts:
         (speed,) = struct.unpack_from(">h", payload, 2)
         found["climb_mps"] = speed * M_PER_CM
     return found
-
-
-def _airspeed(payload: bytes, _arrival_us: int) -> Parts:
-    (speed,) = struct.unpack_from(">H", payload)
-    return {"airspeed_mps": speed * KMH10_MPS}
 
 
 def _rpm(payload: bytes, _arrival_us: int) -> Parts:
@@ -417,10 +389,6 @@ def _link(payload: bytes, _arrival_us: int) -> Parts:
     return {"signal": signal, "link_quality_percent": float(quality)}
 
 
-def _link_of_receiver(payload: bytes, _arrival_us: int) -> Parts:
-    return {"link_quality_percent": float(payload[2])}
-
-
 def _link_of_transmitter(payload: bytes, _arrival_us: int) -> Parts:
     (snr,) = struct.unpack_from(">b", payload, 3)
     return {"signal": RadioSignal(-payload[0], float(snr))}
@@ -435,16 +403,16 @@ def _channels(payload: bytes, _arrival_us: int) -> Parts:
 
 
 _STATELESS: Final[dict[int, Callable[[bytes, int], Parts]]] = {
-    0x07: _vario,
+    0x07: _scaled(">h", 0, "climb_mps", M_PER_CM),
     0x08: _battery,
     0x09: _barometer,
-    0x0A: _airspeed,
+    0x0A: _scaled(">H", 0, "airspeed_mps", KMH10_MPS),
     0x0C: _rpm,
     0x0D: _temperatures,
     0x0E: _cells,
     0x14: _link,
     0x16: _channels,
-    0x1C: _link_of_receiver,
+    0x1C: _scaled("B", 2, "link_quality_percent", 1.0),
     0x1D: _link_of_transmitter,
     0x1F: _mavlink_fc,
 }

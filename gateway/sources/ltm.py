@@ -12,13 +12,13 @@ from gateway.records import BatteryReport, GpsFixType, NodeId, VehicleReport
 from gateway.sources.flight_modes import FIXED_WING, QUADROTOR
 from gateway.sources.sampling import fix_at, velocity
 from gateway.sources.settings import SourceUrl
+from gateway.sources.source import FrameDecoder
 from gateway.units import M_PER_CM, RAD_PER_DEG
 from gateway.wire.framing import Fault
 
 START: Final = b"$T"
 SIZES: Final = {b"G": 14, b"A": 6, b"S": 7, b"O": 14, b"N": 6, b"X": 6}
 """Bytes of payload by type."""
-MAX_NOISE: Final = 64
 FIX_TYPES: Final = (GpsFixType.NONE, GpsFixType.NONE, GpsFixType.FIX_2D, GpsFixType.FIX_3D)
 MODES: Final[tuple[tuple[str, int | None, int | None], ...]] = (
     ("MANUAL", None, 0), ("RATE", 1, 4), ("ANGLE", 0, 5), ("HORIZON", 0, 2), ("ACRO", 1, 4),
@@ -31,46 +31,28 @@ MODES: Final[tuple[tuple[str, int | None, int | None], ...]] = (
 """Name, and ArduPilot's number of it on a copter and on an aeroplane."""
 
 
-class LtmDecoder:
+class LtmDecoder(FrameDecoder):
     """Decode a stream of LTM."""
 
     def __init__(self, url: SourceUrl, node: NodeId) -> None:
+        super().__init__()
         self._node = node
-        self._rest = b""
         self._home_alt_m = 0.0
         self._course_deg = 0.0
         self._type = FIXED_WING if url.options.get("type") == "fixed_wing" else QUADROTOR
 
-    def reset(self) -> None:
-        """Discard a part of a frame."""
-        self._rest = b""
+    def size_at(self, data: bytes, at: int) -> int:
+        """Return the size of the frame that begins there, complete or not; 0 if none does."""
+        size = SIZES.get(data[at + 2 : at + 3])
+        if size is None or not data.startswith(START, at):
+            return 0
+        end = at + 4 + size
+        wrong = end <= len(data) and reduce(xor, data[at + 3 : end], 0)
+        return 0 if wrong else 4 + size
 
-    def feed(self, data: bytes, arrival_us: int) -> list[Any]:
-        """Decode every frame that a chunk completes."""
-        found: list[Any] = []
-        data = self._rest + data
-        at = dropped = 0
-        while len(data) - at > len(START):
-            size = SIZES.get(data[at + 2 : at + 3])
-            if not data.startswith(START, at) or size is None:
-                at, dropped = at + 1, dropped + 1
-                continue
-            end = at + 4 + size
-            if end > len(data):
-                break
-            payload = data[at + 3 : end - 1]
-            if reduce(xor, payload, 0) != data[end - 1]:
-                at, dropped = at + 1, dropped + 1
-                continue
-            found += self._frame(data[at + 2 : at + 3], payload, arrival_us)
-            at = end
-        self._rest = data[at:]
-        if dropped:
-            why = f"{dropped} bytes belong to no frame with a right checksum"
-            found.append(Fault("checksum", dropped, why))
-        return found
-
-    def _frame(self, kind: bytes, payload: bytes, time_us: int) -> list[Any]:
+    def read(self, frame: bytes, time_us: int) -> list[Any]:
+        """Return the records and faults of a frame."""
+        kind, payload = frame[2:3], frame[3:-1]
         parts: dict[str, Any] = {}
         if kind == b"G":
             return self._gps(payload, time_us)

@@ -7,9 +7,10 @@ boards, and reports of an autopilot (`VehicleReport`), which are passed on with 
 `GpsFix` of a vehicle without an IMU is its position as well.
 """
 
+from abc import ABC, abstractmethod
 from collections import Counter, deque
 from dataclasses import dataclass, field
-from typing import Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 from gateway.records import (
     BaroRaw,
@@ -44,6 +45,54 @@ class SourceDecoder(Protocol):
     def reset(self) -> None:
         """Discard a part of a frame or line, as the transport was opened again."""
         ...
+
+
+class FrameDecoder(ABC):
+    """A decoder of frames with a checksum.
+
+    They have no escape: the search moves on by one byte, and so finds the next frame behind any
+    damage and between bytes of other protocols. Bytes of no frame are one fault until the next.
+    """
+
+    HEAD: Final = 3
+    """Bytes that show the size of a frame."""
+    MAX_NOISE: Final = 64
+    """Bytes without a frame that are one fault."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard a part of a frame."""
+        self._rest, self._noise = b"", 0
+
+    def feed(self, data: bytes, arrival_us: int) -> list[Any]:
+        """Decode every frame that a chunk completes."""
+        found: list[Any] = []
+        data, at = self._rest + data, 0
+        while len(data) - at >= self.HEAD:
+            size = self.size_at(data, at)
+            if size > len(data) - at:
+                break
+            if size:
+                found += self._end_noise() + self.read(data[at : at + size], arrival_us)
+            self._noise += not size
+            at += size or 1
+        self._rest = data[at:]
+        return found if self._noise < self.MAX_NOISE else found + self._end_noise()
+
+    def _end_noise(self) -> list[Any]:
+        dropped, self._noise = self._noise, 0
+        why = f"{dropped} bytes belong to no frame with a right checksum"
+        return [Fault("checksum", dropped, why)] if dropped else []
+
+    @abstractmethod
+    def size_at(self, data: bytes, at: int) -> int:
+        """Return the size of the frame that begins there, complete or not; 0 if none does."""
+
+    @abstractmethod
+    def read(self, frame: bytes, arrival_us: int) -> list[Any]:
+        """Return the records and faults of a frame."""
 
 
 @runtime_checkable

@@ -279,7 +279,7 @@ def test_damaged_frame_is_one_fault_and_the_next_frame_is_read() -> None:
     damaged = bytearray(FLIGHT)
     damaged[4] ^= 0x40
     fault, *records = decoder().feed(bytes(damaged), 0)
-    assert (fault.kind, fault.size) == ("crc", len(frame(0x1E, ATTITUDE)))
+    assert (fault.kind, fault.size) == ("checksum", len(frame(0x1E, ATTITUDE)))
     assert len(records) == 3
 
 
@@ -317,6 +317,6 @@ def test_ltm_is_read_behind_the_same_interface() -> None:
 def test_ltm_noise_is_counted_and_the_next_frame_is_read() -> None:
     stream = make_decoder(parse_source("ltm:/dev/ttyUSB0"), NODE)
     good = ltm(b"A", struct.pack("<hhh", 0, 0, 90))
-    report, fault = stream.feed(b"$TA123456x" + good, 0)
+    fault, report = stream.feed(b"$TA123456x" + good, 0)
     assert isinstance(fault, Fault)
     assert report.attitude_rad is not None
