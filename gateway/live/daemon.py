@@ -357,6 +357,9 @@ class Daemon:
         self._perform(self._pipeline.feed(data, now_us))
 
     def _on_source(self, source: SourceInput, data: bytes) -> None:
+        if self._settings.recording.source_bytes:
+            for frame in source.tunnel.frames(data):
+                self._recorder.frame(frame)
         self._perform(self._pipeline.feed_source(source, data, self.now_us()))
 
     def _on_frame(self, incoming: Incoming) -> None:

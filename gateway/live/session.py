@@ -69,6 +69,13 @@ class RecordingSettings(Settings, frozen=True):
     table: Annotated[
         bool, setting("Record raw samples and fused states, one CSV per aircraft.")
     ] = True
+    source_bytes: Annotated[
+        bool,
+        setting(
+            "Record the bytes of sources in the tlog too, as TUNNEL messages: `mavgate run "
+            "--source KIND:file:NAME.tlog` decodes them again."
+        ),
+    ] = False
     rotate_mb: Annotated[
         float, setting("A larger file is closed and the next one started.", "MB", ge=1, le=1e6)
     ] = 512.0

@@ -10,6 +10,7 @@
 | push       | with the first content                        | never                             |
 | stdin      | at once                                       | at its end, for good              |
 | file       | as soon as it exists, from its beginning      | shortened: read from its beginning|
+| (a tlog)   | the same, at the times of what it holds       | at its end, for good              |
 """
 
 import asyncio
@@ -25,6 +26,7 @@ import serial
 
 from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports, open_port
 from gateway.printable import reason_of
+from gateway.sources.recorded_bytes import tunnelled
 from gateway.sources.source import PolledDecoder, SourceInput
 from gateway.wire.framing import Fault
 
@@ -33,6 +35,7 @@ log = logging.getLogger(__name__)
 READ_SIZE: Final = 4096
 RETRY_S: Final = 1.0
 FILE_POLL_S: Final = 0.05
+TLOG: Final = ".tlog"
 POLL_S: Final = 0.1
 ANSWER_S: Final = 3.0
 """Longest time for an answer."""
@@ -93,7 +96,7 @@ class SourcePort:
                 await read()
             except (OSError, PortNotFoundError) as error:
                 self._lost(str(error) if isinstance(error, PortNotFoundError) else reason_of(error))
-            if url.transport == "stdin":
+            if url.transport == "stdin" or url.address.endswith(TLOG):
                 self._lost("its end was reached")
                 return
             await asyncio.sleep(RETRY_S)
@@ -233,6 +236,9 @@ class SourcePort:
     async def _file(self) -> None:
         """Follow a file; one that has become shorter was written again."""
         path = self._source.url.address
+        if path.endswith(TLOG):
+            await self._recorded(path)
+            return
         with open(path, "rb", buffering=0) as file:  # noqa: PTH123
             self._opened()
             while True:
@@ -243,6 +249,23 @@ class SourcePort:
                     self._lost("the file was shortened")
                     return
                 await asyncio.sleep(FILE_POLL_S)
+
+    async def _recorded(self, path: str) -> None:
+        """Read what a recording has of this source, at the times at which it came."""
+        from gateway.recordings.tlog import TlogScanner
+
+        scanner, loop, start_s = TlogScanner(), asyncio.get_running_loop(), None
+        with open(path, "rb") as file:  # noqa: PTH123
+            self._opened()
+            while block := file.read(READ_SIZE):
+                for record in scanner.feed(block).records():
+                    data = tunnelled(record.frame, self._source.node)
+                    if not data:
+                        continue
+                    time_s = record.time_us / 1e6
+                    start_s = loop.time() - time_s if start_s is None else start_s
+                    await asyncio.sleep(max(start_s + time_s - loop.time(), 0.0))
+                    self._feed(data)
 
 
 async def _get(host: str, port: int, path: str) -> bytes:

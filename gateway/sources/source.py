@@ -22,6 +22,7 @@ from gateway.records import (
     SourceReport,
     VehicleReport,
 )
+from gateway.sources.recorded_bytes import TunnelWriter
 from gateway.sources.settings import SourceUrl
 from gateway.units import US_PER_S
 from gateway.wire.framing import Fault
@@ -123,6 +124,7 @@ class SourceInput:
         self.connected = False
         self.reason = "not opened yet"
         self.decoder = decoder
+        self.tunnel = TunnelWriter(node)
         self._bytes = self._records = 0
         self._faults: Counter[str] = Counter()
         self._newest_fault = ""

@@ -12,6 +12,7 @@ from mavsdk.plugins.telemetry.telemetry import FlightMode
 
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import CONFIG, Client, Gateway, MavProxy, mavsdk_system
+from tests.kit.cli import invoke
 from tests.ports import free_port
 
 HOME = SimulatorSettings()
@@ -124,3 +125,28 @@ def test_datagrams_of_any_program_are_a_vehicle(
                 is_seen({})
     assert seen["GLOBAL_POSITION_INT"].get_srcSystem() == 9
     assert seen["GLOBAL_POSITION_INT"].lat == 480000000
+
+
+@pytest.mark.parametrize(
+    ("kind", "wanted"),
+    [("crsf", ["state roll", "GPS fix"]), ("phone", ["accelerometer", "barometer"])],
+)
+def test_recorded_bytes_of_a_source_are_decoded_again(
+    kind: str,
+    wanted: list[str],
+    start_gateway: Callable[..., Gateway],
+    connect: Callable[..., Client],
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "recordings"
+    config = CONFIG + f'[recording]\nfolder = "{folder}"\nsource_bytes = true\n'
+    gateway = start_gateway("demo", "--record", "--source", kind, config=config)
+    connect(gateway.port).until(
+        lambda seen: "ATTITUDE" in seen and seen["ATTITUDE"].time_boot_ms > 3000
+    )
+    gateway.end()
+    (path,) = folder.glob("*.tlog")
+    done = invoke("source", "test", f"{kind}:file:{path}?id=1", "--seconds", "2")
+    for words in wanted:
+        assert words in done.output, done.output
+    assert "fault" not in done.output

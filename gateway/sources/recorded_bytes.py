@@ -1,0 +1,44 @@
+"""A source's bytes as TUNNEL messages of a tlog, from which they can be decoded again."""
+
+from collections.abc import Iterator
+from typing import Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.records import NodeId
+from gateway.wire.mavlink_splitter import message_id_of
+
+FIRST_TYPE: Final = 0x8000
+"""Payload types from here on are free for any program; the node's id is added."""
+PIECE: Final = 128
+
+
+class TunnelWriter:
+    """Pack the bytes of one source."""
+
+    def __init__(self, node: NodeId) -> None:
+        self._type = FIRST_TYPE + node.node_id
+        self._sender = mavlink.MAVLink(None, node.vehicle_id, mavlink.MAV_COMP_ID_LOG)
+
+    def frames(self, data: bytes) -> Iterator[bytes]:
+        """Yield the frames that hold some bytes."""
+        for at in range(0, len(data), PIECE):
+            piece = data[at : at + PIECE]
+            padded = [*piece.ljust(PIECE, b"\0")]
+            message = mavlink.MAVLink_tunnel_message(0, 0, self._type, len(piece), padded)
+            yield message.pack(self._sender)
+            self._sender.seq = (self._sender.seq + 1) % 256
+
+
+def tunnelled(frame: bytes, node: NodeId) -> bytes:
+    """Return the bytes of a source that a frame holds; none if it is another's, or damaged."""
+    if message_id_of(frame) != mavlink.MAVLINK_MSG_ID_TUNNEL:
+        return b""
+    try:
+        message = mavlink.MAVLink(None).decode(bytearray(frame))
+    except mavlink.MAVError:
+        return b""
+    sender = (message.get_srcSystem(), message.payload_type)
+    if sender != (node.vehicle_id, FIRST_TYPE + node.node_id):
+        return b""
+    return bytes(message.payload[: message.payload_length])
