@@ -41,7 +41,7 @@ from gateway.records import (
 from gateway.sources.flight_modes import FIXED_WING, QUADROTOR, ardupilot_mode, mode_of_text
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import SourceUrl
-from gateway.sources.source import FrameDecoder
+from gateway.sources.source import CheckedFrames
 from gateway.units import M_PER_CM, RAD_PER_DEG, STANDARD_GRAVITY_MPS2, US_PER_S
 from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
@@ -85,7 +85,7 @@ would hold back the frames behind it."""
 Parts = dict[str, Any]
 
 
-class CrsfDecoder(FrameDecoder):
+class CrsfDecoder(CheckedFrames):
     """Decode a stream of CRSF."""
 
     def __init__(self, url: SourceUrl, node: NodeId) -> None:

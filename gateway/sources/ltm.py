@@ -12,7 +12,7 @@ from gateway.records import BatteryReport, GpsFixType, NodeId, VehicleReport
 from gateway.sources.flight_modes import FIXED_WING, QUADROTOR
 from gateway.sources.sampling import fix_at, velocity
 from gateway.sources.settings import SourceUrl
-from gateway.sources.source import FrameDecoder
+from gateway.sources.source import CheckedFrames
 from gateway.units import M_PER_CM, RAD_PER_DEG
 from gateway.wire.framing import Fault
 
@@ -31,7 +31,7 @@ MODES: Final[tuple[tuple[str, int | None, int | None], ...]] = (
 """Name, and ArduPilot's number of it on a copter and on an aeroplane."""
 
 
-class LtmDecoder(FrameDecoder):
+class LtmDecoder(CheckedFrames):
     """Decode a stream of LTM."""
 
     def __init__(self, url: SourceUrl, node: NodeId) -> None:

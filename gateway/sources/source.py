@@ -48,7 +48,7 @@ class SourceDecoder(Protocol):
         ...
 
 
-class FrameDecoder(ABC):
+class CheckedFrames(ABC):
     """A decoder of frames with a checksum.
 
     They have no escape: the search moves on by one byte, and so finds the next frame behind any
