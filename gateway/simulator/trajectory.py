@@ -14,7 +14,7 @@ The lengths of seven straight legs are solved for, so that the aircraft comes to
 whatever the wind, after exactly `FLIGHT_S`: the flight can be repeated without a jump. The Earth
 does not rotate here, and is flat around home (a few centimetres at one kilometre).
 
-`Workbench` is the other motion: an aircraft that lies level until a person turns it by hand.
+`Workbench` is the other motion: an aircraft that lies as a person puts it, or is turned by hand.
 """
 
 import math
@@ -374,6 +374,12 @@ class Workbench:
         self._settings = settings
         self._turned_from_s = np.inf
         self._sampled_s = 0.0
+        self._lies_rad = np.zeros(3)
+
+    def lay(self, roll_rad: float, pitch_rad: float) -> None:
+        """Lay it down at this attitude, from the next sampled time on."""
+        self._turned_from_s = np.inf
+        self._lies_rad = np.array([roll_rad, pitch_rad, 0.0])
 
     def turn(self) -> None:
         """Begin to turn it, from the last sampled time on."""
@@ -411,7 +417,7 @@ class Workbench:
         s, s_rate = since_s + np.expm1(-since_s), -np.expm1(-since_s)
         pitch = PITCH_RAD * np.sin(PITCH_RADPS * s)
         pitch_rate = PITCH_RAD * PITCH_RADPS * np.cos(PITCH_RADPS * s)
-        angles = np.column_stack([ROLL_RADPS * s, pitch, YAW_RADPS * s])
+        angles = self._lies_rad + np.column_stack([ROLL_RADPS * s, pitch, YAW_RADPS * s])
         ones = np.ones_like(s)
         rates = np.column_stack([ROLL_RADPS * ones, pitch_rate, YAW_RADPS * ones])
         return angles, rates * s_rate[:, np.newaxis]

@@ -1,13 +1,17 @@
 """`mavgate calibrate`: guide a person through a node's calibration, live or from a recording."""
 
+from __future__ import annotations
+
 import asyncio
 import math
+import threading
 import time
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from enum import StrEnum
+from itertools import cycle
 from pathlib import Path
-from typing import Annotated, Final, Protocol
+from typing import TYPE_CHECKING, Annotated, Final, Protocol
 
 import msgspec
 import typer
@@ -17,9 +21,10 @@ from gateway.cli.support.control import ask, is_running
 from gateway.cli.support.options import CONFIG, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import files_of
 from gateway.cli.support.terminal import console_of, refuse, table_of
-from gateway.clock import GatewayClock
+from gateway.clock import GatewayClock, unix_time_us
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.live.control_verbs import raw_of
+from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import SerialPort, SerialSettings, find_receiver
 from gateway.printable import figure
 from gateway.recordings.reading import open_rows
@@ -27,9 +32,13 @@ from gateway.records import ImuRaw, LinkReport, NodeStatus, RawRecord
 from gateway.sensing import calibrating
 from gateway.sensing.calibrating import CalibrationError, NodeSamples, node_samples
 from gateway.sensing.calibration import NodeCalibration
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.units import RAD_PER_DEG, US_PER_S
 from gateway.wire.link import Link
 from gateway.wire.payloads import SENSOR_IMU
+
+if TYPE_CHECKING:
+    from gateway.simulator.trajectory import Workbench
 
 POLL_S: Final = 0.5
 """Interval of the requests to a running gateway."""
@@ -70,6 +79,15 @@ class Step(StrEnum):
     MAG = "mag"
 
 
+STEPS: Final = (Step.GYRO, Step.ACCEL, Step.LEVEL, Step.MAG)
+"""The steps of a first calibration, in their order."""
+ATTITUDES_DEG: Final = {
+    Step.MOUNTING: ((0.0, 0.0), (0.0, 45.0)),
+    Step.ACCEL: ((0.0, 0.0), (180.0, 0.0), (90.0, 0.0), (-90.0, 0.0), (0.0, 90.0), (0.0, -90.0)),
+}
+"""Roll and pitch of the poses of a step; of others it is level."""
+
+
 class Capture(Protocol):
     """Waits for samples."""
 
@@ -84,7 +102,7 @@ Poses = Callable[[Step], list[NodeSamples]]
 @app.command()
 def calibrate(
     steps: Annotated[
-        list[Step] | None, typer.Argument(help="Steps; by default gyro accel level mag.")
+        list[Step] | None, typer.Argument(help=f"Steps; by default {' '.join(STEPS)}.")
     ] = None,
     *,
     vehicle: Annotated[int, typer.Option("--vehicle", min=1, max=31, help="Its id.")] = 1,
@@ -102,6 +120,9 @@ def calibrate(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show the result, but do not save it.")
     ] = False,
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="Try it on the simulated receiver; saves nothing.")
+    ] = False,
 ) -> None:
     """Calibrate an aircraft's sensors and save the result with its residuals.
 
@@ -111,15 +132,15 @@ def calibrate(
     """
     settings = read_settings()
     aircraft = load_aircraft(settings).get(vehicle, settings.default_aircraft)
-    chosen = steps or [Step.GYRO, Step.ACCEL, Step.LEVEL, Step.MAG]
     old = aircraft.calibration
-    is_live = log is None and port is None and CONFIG.get() is None and is_running()
+    is_other = simulated or log is not None or port is not None or CONFIG.get() is not None
+    is_live = not is_other and is_running()
     if is_live:
         found = ask("imu.calibration", {"vehicle_id": vehicle})
         old = msgspec.convert(found, NodeCalibration)
 
     def save(calibration: NodeCalibration) -> None:
-        if dry_run:
+        if dry_run or simulated:
             return
         if is_live:
             values = msgspec.to_builtins(calibration)
@@ -129,13 +150,19 @@ def calibrate(
         changed = msgspec.structs.replace(aircraft, calibration=calibration)
         console.print(f"saved in {save_aircraft(settings, vehicle, changed)}")
 
-    if log is not None:
-        poses = _poses_of_log(_read_log(log, settings, vehicle))
-    else:
-        serial = settings.serial
-        serial = serial if port is None else msgspec.structs.replace(serial, port=port)
-        poses = poses_from(_capture_live(vehicle) if is_live else capture_from(serial, vehicle))
-    new, missing = calibrate_each(chosen, poses, old, save, field_ut)
+    serial = settings.serial
+    serial = serial if port is None else msgspec.structs.replace(serial, port=port)
+    with ExitStack() as opened:
+        if log is not None:
+            poses = _poses_of_log(_read_log(log, settings, vehicle))
+        elif simulated:
+            simulator = msgspec.structs.replace(settings.simulator, vehicle_id=vehicle)
+            path, bench = opened.enter_context(simulated_receiver(simulator))
+            serial = msgspec.structs.replace(serial, port=path)
+            poses = poses_on(bench, capture_from(serial, vehicle))
+        else:
+            poses = poses_from(_capture_live(vehicle) if is_live else capture_from(serial, vehicle))
+        new, missing = calibrate_each(steps or [*STEPS], poses, old, save, field_ut)
     _show(old, new)
     if missing:
         raise typer.Exit(1)
@@ -213,6 +240,52 @@ def poses_from(capture: Capture) -> Poses:
         return level
 
     return poses
+
+
+def poses_on(bench: Workbench, capture: Capture) -> Poses:
+    """Return the poses of a simulated aircraft, which follows what a person is asked for."""
+
+    def poses(step: Step) -> list[NodeSamples]:
+        attitudes = cycle(ATTITUDES_DEG.get(step, ((0.0, 0.0),)))
+
+        def moved(seconds: float, *, turned: bool = False) -> NodeSamples:
+            bench.lay(*(angle * RAD_PER_DEG for angle in next(attitudes)))
+            if turned:
+                bench.turn()
+            return capture(seconds, turned=turned)
+
+        return poses_from(moved)(step)
+
+    return poses
+
+
+@contextmanager
+def simulated_receiver(settings: SimulatorSettings) -> Iterator[tuple[str, Workbench]]:
+    """Run a simulated receiver and an aircraft on a workbench behind a pseudo-terminal."""
+    # Imported here: SciPy draws the simulated flight, and a real first start needs none.
+    from gateway.simulator.flight import SimulatedAircraft
+    from gateway.simulator.node import nodes_of
+    from gateway.simulator.receiver import SimulatedReceiver
+    from gateway.simulator.trajectory import Workbench
+
+    bench = Workbench(settings)
+    # The flight's dropouts do not occur on a workbench.
+    settings = msgspec.structs.replace(settings, gps_outages_s=())
+    aircraft = SimulatedAircraft(settings, start_unix_us=unix_time_us(), motion=bench)
+    receiver = SimulatedReceiver(settings, nodes_of(aircraft, settings))
+    # In a thread with a loop of its own, since a person is asked in between.
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    port = PtyPort(receiver.frames())
+    thread.start()
+    loop.call_soon_threadsafe(port.start)
+    try:
+        yield port.path, bench
+    finally:
+        loop.call_soon_threadsafe(port.close)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
 
 
 def _poses_of_log(samples: NodeSamples) -> Poses:

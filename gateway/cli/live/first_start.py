@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn
@@ -15,18 +13,22 @@ import typer
 from msgspec.structs import replace
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from gateway.cli.live.calibrate import Step, calibrate_each, capture_from, listen, poses_from
+from gateway.cli.live.calibrate import (
+    STEPS,
+    calibrate_each,
+    capture_from,
+    listen,
+    poses_from,
+    poses_on,
+    simulated_receiver,
+)
 from gateway.cli.support.options import read_settings
 from gateway.cli.support.terminal import console_of, refuse, table_of
-from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
-from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
 from gateway.printable import figure
 from gateway.records import LORA_CHANNEL, GpsFix, LinkReport, NodeStatus, RawRecord, channel_name
-from gateway.sensing.calibrating import NodeSamples
 from gateway.sensing.calibration import NodeCalibration
-from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.units import MV_PER_V
 from gateway.wire.payloads import SENSOR_BARO, SENSOR_GPS, SENSOR_IMU, SENSOR_MAG
 
@@ -48,8 +50,6 @@ SENSORS: Final = {
     SENSOR_GPS: "GPS",
 }
 """Bits of a node's report."""
-STEPS: Final = (Step.GYRO, Step.LEVEL, Step.MAG)
-
 console = console_of()
 app = typer.Typer()
 
@@ -110,8 +110,7 @@ def _guide(
     done = _calibrate(settings, serial, number, bench)
     _head("Done" if done == len(STEPS) else f"Calibrated: {done} of {len(STEPS)} steps")
     console.print("Start the gateway with `mavgate run`, and a ground station on UDP port 14550.")
-    console.print("A step that failed can be repeated: `mavgate calibrate gyro`, `level` or `mag`.")
-    console.print("For the accelerometer, `mavgate calibrate accel` asks for all six sides.")
+    console.print(f"A step that failed can be repeated: `mavgate calibrate {'`, `'.join(STEPS)}`.")
     if done < len(STEPS):
         raise typer.Exit(1)
 
@@ -239,15 +238,10 @@ def _calibrate(
     settings: GatewaySettings, serial: SerialSettings, vehicle: int, bench: Workbench | None
 ) -> int:
     """Run the calibration and save it; return the number of steps that succeeded."""
-    _head("4 of 5: calibration of gyroscope, level and compass")
+    _head("4 of 5: calibration of gyroscope, accelerometer, level and magnetometer")
     aircraft = load_aircraft(settings).get(vehicle, settings.default_aircraft)
-    from_receiver = capture_from(serial, vehicle)
-
-    def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
-        if turned and bench is not None:
-            bench.turn()
-        return from_receiver(seconds, turned=turned)
-
+    capture = capture_from(serial, vehicle)
+    poses = poses_from(capture) if bench is None else poses_on(bench, capture)
     results: list[NodeCalibration] = []
     files: set[Path] = set()
 
@@ -257,7 +251,7 @@ def _calibrate(
             changed = replace(aircraft, calibration=calibration)
             files.add(save_aircraft(settings, vehicle, changed))
 
-    calibrate_each([*STEPS], poses_from(capture), aircraft.calibration, save)
+    calibrate_each([*STEPS], poses, aircraft.calibration, save)
     _head("5 of 5: saving")
     if bench is not None:
         _hint("not saved: the receiver is simulated")
@@ -288,35 +282,6 @@ def _observe(
     bar.add_task("", total=None)
     with bar:
         return asyncio.run(listen(serial, feed, limit_s))[0]
-
-
-@contextmanager
-def simulated_receiver(settings: SimulatorSettings) -> Iterator[tuple[str, Workbench]]:
-    """Run a simulated receiver and an aircraft on a workbench behind a pseudo-terminal."""
-    # Imported here: SciPy draws the simulated flight, and a real first start needs none.
-    from gateway.simulator.flight import SimulatedAircraft
-    from gateway.simulator.node import nodes_of
-    from gateway.simulator.receiver import SimulatedReceiver
-    from gateway.simulator.trajectory import Workbench
-
-    bench = Workbench(settings)
-    # The flight's dropouts do not occur on a workbench.
-    settings = replace(settings, gps_outages_s=())
-    aircraft = SimulatedAircraft(settings, start_unix_us=unix_time_us(), motion=bench)
-    receiver = SimulatedReceiver(settings, nodes_of(aircraft, settings))
-    # In a thread with a loop of its own, since a person is asked in between.
-    loop = asyncio.new_event_loop()
-    thread = threading.Thread(target=loop.run_forever, daemon=True)
-    port = PtyPort(receiver.frames())
-    thread.start()
-    loop.call_soon_threadsafe(port.start)
-    try:
-        yield port.path, bench
-    finally:
-        loop.call_soon_threadsafe(port.close)
-        loop.call_soon_threadsafe(loop.stop)
-        thread.join()
-        loop.close()
 
 
 def _head(text: str) -> None:

@@ -38,12 +38,12 @@ def fast_port(frames: Iterator[TimedFrame]) -> PtyPort:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibrate, "GatewayClock", FastClock)
-    monkeypatch.setattr(first_start, "PtyPort", fast_port)
+    monkeypatch.setattr(calibrate, "PtyPort", fast_port)
     monkeypatch.setattr(first_start, "GPS_WAIT_S", 0.5)
 
 
 def setup(*words: str) -> Result:
-    return invoke("setup", *words, answers="\n" * 10)
+    return invoke("setup", *words, answers="\n" * 20)
 
 
 @pytest.mark.slow
@@ -57,6 +57,8 @@ def test_every_step_passes_on_the_simulated_receiver_and_saves_nothing(tmp_path:
         "channel 76",
         "MPU6050, HMC5883L, BMP180",
         "gyro: done",
+        "5 of 6 sides are done",
+        "accel: done",
         "level: done",
         "mag: done",
     ):
@@ -69,13 +71,25 @@ def test_every_step_passes_on_the_simulated_receiver_and_saves_nothing(tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
+def test_calibrate_command_runs_on_the_simulated_receiver_and_saves_nothing(tmp_path: Path) -> None:
+    config = tmp_path / "gateway.toml"
+    config.write_text(f'aircraft_folder = "{tmp_path}"\n')
+    words = ("calibrate", "mounting", "gyro", "--simulated", "--vehicle", "2", "--config", config)
+    done = invoke(*words, answers="\n" * 3, code=0)
+    assert "mounting: done" in done.output
+    assert "gyro_bias, °/s" in done.output
+    assert load_aircraft(load(config)) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
 def test_calibration_of_a_receiver_at_a_port_is_saved(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(first_start, "STEPS", (calibrate.Step.GYRO,))
     config = tmp_path / "gateway.toml"
     config.write_text(f'aircraft_folder = "{tmp_path}"\n')
-    with first_start.simulated_receiver(SimulatorSettings(vehicle_id=3)) as (path, _):
+    with calibrate.simulated_receiver(SimulatorSettings(vehicle_id=3)) as (path, _):
         wrong = setup("--port", path, "--vehicle", "4", "--config", str(config))
         done = setup("--port", path, "--config", str(config))
     assert wrong.exit_code == 2
