@@ -2,6 +2,7 @@
 
 import ast
 import json
+import os
 import subprocess
 import sys
 import tomllib
@@ -22,7 +23,14 @@ from gateway.compiled.entry_point import (
     stamp_in,
     stamp_of,
 )
-from tools.build_kernels import KERNEL_MODULES, build_library, compiled_again, is_current
+from tools.build_kernels import (
+    KERNEL_MODULES,
+    MAX_CACHED,
+    build_library,
+    cached_object,
+    compiled_again,
+    is_current,
+)
 
 pytestmark = pytest.mark.io
 
@@ -67,6 +75,31 @@ def test_machine_code_gives_results_of_python(
     assert use(scaling) == use(scale) == [12.25, 30.25]
     assert use(scaling, 0.0) == [np.inf, np.inf], "Python would raise"
     assert [*tmp_path.iterdir()] == [path]
+
+
+def test_cached_machine_code_is_not_compiled_again(
+    scaling: EntryPoint[[int, int, float]], tmp_path: Path
+) -> None:
+    cached = tmp_path / "cache" / "code.o"
+    build_library(tmp_path / "first.so", [scaling], cached=cached)
+    build_library(path := tmp_path / "second.so", [], cached=cached)
+    scaling.load(path)
+    assert use(scaling) == [12.25, 30.25]
+    assert [*cached.parent.iterdir()] == [cached]
+
+
+def test_cache_keeps_the_newest_of_each_source(
+    scaling: EntryPoint[[int, int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cached = [cached_object(f"gateway/units.py 1 {k}") for k in range(MAX_CACHED + 1)]
+    assert len({*cached}) == len(cached)
+    cached[0].parent.mkdir(parents=True)
+    for age, path in enumerate(cached[:-1]):
+        path.touch()
+        os.utime(path, ns=(age, age))
+    build_library(tmp_path / "kernels.so", [scaling], cached=cached[-1])
+    assert {*cached[0].parent.iterdir()} == {*cached[1:]}
 
 
 def test_experiment_compiles_patched_constants_until_its_end(

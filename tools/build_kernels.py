@@ -2,12 +2,15 @@
 
     python -m tools.build_kernels [--force] [--output FILE [--architecture aarch64]]
 
+Machine code of sources that were compiled before is taken from the user's cache folder.
+
 The C compiler of the system links the library or, where there is none, the one of the package
 `ziglang`, which can also link for another architecture and for older systems.
 """
 
 import argparse
 import gc
+import hashlib
 import importlib
 import os
 import platform
@@ -17,7 +20,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -47,6 +51,9 @@ OLDEST_GLIBC: Final = "2.17"
 """The library of a wheel runs with this version of the C library and later ones."""
 NO_KERNELS: Final = ("gateway.compiled", "gateway.settings")
 """Modules that all kernels import, but no constant from."""
+COMPILER: Final = Path(__file__).with_name("kernel_compiler.py")
+MAX_CACHED: Final = 8
+"""Object files that are kept, of 0.2 MB each."""
 SHOW_S: Final = 0.2
 """Interval of the progress on a terminal."""
 
@@ -54,14 +61,14 @@ SHOW_S: Final = 0.2
 def main() -> None:
     """Build the library of this source tree, unless it is current."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--force", action="store_true", help="build it even if it is current")
+    parser.add_argument("--force", action="store_true", help="compile it even if it is current")
     parser.add_argument("--output", type=Path, help="where to build it, for a package")
     parser.add_argument(
         "--architecture", choices=ARCHITECTURES, help="for a wheel, which runs on older systems too"
     )
     options = parser.parse_args()
     if options.output or options.force or not is_current():
-        build_installed(options.output or LIBRARY, options.architecture)
+        build_installed(options.output or LIBRARY, options.architecture, afresh=options.force)
 
 
 def is_current() -> bool:
@@ -72,7 +79,7 @@ def is_current() -> bool:
         return False
 
 
-def build_installed(path: Path, architecture: str | None = None) -> None:
+def build_installed(path: Path, architecture: str | None = None, *, afresh: bool = False) -> None:
     """Build the library that the gateway loads; in a process that has imported nothing else.
 
     Parameters
@@ -80,6 +87,8 @@ def build_installed(path: Path, architecture: str | None = None) -> None:
     path : Path
     architecture : str, optional
         See `build_library`.
+    afresh : bool
+        Use no object file of the cache.
     """
     for name in KERNEL_MODULES:
         importlib.import_module(name)
@@ -87,7 +96,19 @@ def build_installed(path: Path, architecture: str | None = None) -> None:
     names = [name for name in sys.modules if name.startswith("gateway.")]
     files = {sys.modules[name].__file__ for name in names if not name.startswith(NO_KERNELS)}
     stamp = "\n".join(sorted(stamp_of(Path(file)) for file in files if file))
-    build_library(path, ENTRY_POINTS, stamp=stamp, architecture=architecture, show=True)
+    cached = None if afresh or architecture else cached_object(stamp)
+    build_library(
+        path, ENTRY_POINTS, stamp=stamp, architecture=architecture, cached=cached, show=True
+    )
+
+
+def cached_object(stamp: str) -> Path:
+    """Return where the cache has the object file of these sources and this compiler."""
+    versions = [f"{name} {version(name)}" for name in ("numba", "llvmlite", "numpy")]
+    parts = (stamp, COMPILER.read_text(), platform.machine(), *versions)
+    key = hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return folder / "mavgate" / "kernels" / f"{key}.o"
 
 
 @contextmanager
@@ -119,6 +140,7 @@ def build_library(
     *,
     stamp: str = "",
     architecture: str | None = None,
+    cached: Path | None = None,
     show: bool = False,
 ) -> None:
     """Compile entry points, and all functions that they call, into a library.
@@ -132,6 +154,8 @@ def build_library(
         The value of `SOURCES_SYMBOL`.
     architecture : str, optional
         For a wheel: `x86_64` or `aarch64`. By default the library is for this machine alone.
+    cached : Path, optional
+        Of the object file, which is compiled and stored there unless it exists.
     show : bool
         Print the progress.
 
@@ -140,20 +164,13 @@ def build_library(
     TypeError
         If a function needs the run-time library of Python or numba, because it allocates.
     """
-    # Imported late: without numba, the command can still find that the library is current.
-    from tools.kernel_compiler import compile_object
-
     progress = _Progress(len(entry_points)) if show else None
-    was_enabled = gc.isenabled()
-    # The garbage collector would take a fifth of the time.
-    gc.disable()
-    try:
-        machine_code = compile_object(
-            entry_points, stamp, architecture, progress.step if progress else None
-        )
-    finally:
-        if was_enabled:
-            gc.enable()
+    if cached is not None and cached.exists():
+        machine_code = cached.read_bytes()
+    else:
+        machine_code = _compiled(entry_points, stamp, architecture, progress)
+        if cached is not None:
+            _keep(cached, machine_code)
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".kernels-") as folder:
         relocatable, library = Path(folder, "kernels.o"), Path(folder, "kernels.so")
@@ -162,6 +179,39 @@ def build_library(
         library.replace(path)
     if progress is not None:
         progress.end(path)
+
+
+def _compiled(
+    entry_points: Sequence[EntryPoint[...]],
+    stamp: str,
+    architecture: str | None,
+    progress: "_Progress | None",
+) -> bytes:
+    # Imported late: without numba, the command can still find that the library is current.
+    from tools.kernel_compiler import compile_object
+
+    was_enabled = gc.isenabled()
+    # The garbage collector would take a fifth of the time.
+    gc.disable()
+    try:
+        return compile_object(
+            entry_points, stamp, architecture, progress.step if progress else None
+        )
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def _keep(cached: Path, machine_code: bytes) -> None:
+    """Store an object file, and remove the oldest others; a cache that fails does no harm."""
+    with suppress(OSError):
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=cached.parent, delete=False) as file:
+            file.write(machine_code)
+        Path(file.name).replace(cached)
+        kept = sorted(cached.parent.iterdir(), key=lambda path: path.stat().st_mtime)
+        for path in kept[:-MAX_CACHED]:
+            path.unlink()
 
 
 def _link(relocatable: Path, library: Path, architecture: str | None) -> None:
@@ -210,6 +260,9 @@ class _Progress:
     def end(self, path: Path) -> None:
         """Print the result."""
         size = f"{path.stat().st_size / 1e3:.0f} kB"
+        if not self._done:
+            print(f"compiled kernels of the same sources are in the cache: {path.name}, {size}")
+            return
         begin = "\r" if self._redraws else ""
         print(f"{begin}{self._text()}: {path.name}, {size}")
 
