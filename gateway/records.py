@@ -214,6 +214,12 @@ def node_role(sensors_present: int) -> str:
     return "GPS node" if sensors_present & NODE_GPS else "Node"
 
 
+def board_name(node: NodeId, sensors_present: int = 0) -> str:
+    """Name a board by aircraft and sensors, `1 IMU`, or before its report by number: `1.0`."""
+    role = node_role(sensors_present).removesuffix(" node")
+    return f"{node.vehicle_id}.{node.node_id}" if role == "Node" else f"{node.vehicle_id} {role}"
+
+
 class NodeStatus(msgspec.Struct, frozen=True, gc=False):
     """A node's own once-a-second report."""
 

@@ -7,7 +7,7 @@ from gateway.aircraft import Aircraft
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, HubCounters, ListenerStats
 from gateway.printable import figure, receiver_state
-from gateway.records import GpsFix, LinkReport, LoggedRequest, NavState, NodeStatus
+from gateway.records import GpsFix, LinkReport, LoggedRequest, NavState, NodeStatus, board_name
 from gateway.units import counted
 from gateway.vehicle.plan import Location, distance_and_bearing
 
@@ -114,9 +114,10 @@ def summary_line(snapshot: Snapshot) -> str:
     report = snapshot.report
     received = report.bytes_received, report.frames
     parts = [receiver_state(report.port, report.connected, *received)]
+    sensors = {board.node: board.sensors_present for a in snapshot.aircraft for board in a.boards}
     parts += [
-        f"aircraft {node.node.vehicle_id} board {node.node.node_id} {node.rate_hz:.0f} Hz "
-        f"{node.lost} lost"
+        f"aircraft {board_name(node.node, sensors.get(node.node, 0))} board "
+        f"{node.rate_hz:.0f} Hz {node.lost} lost"
         for node in report.nodes
     ]
     for vehicle_id, state in snapshot.states:

@@ -8,7 +8,7 @@ import pytest
 from tools.make_troubleshooting import EXPLANATIONS, PAGE, ROOT, Sources, explained, page_of
 
 PACKAGE = """
-PREFIX: Final = "Mark: "
+PREFIX: Final = "Note: "
 STATES: Final = ((1, "bent", "straight"), (2, "hot", "cool"))
 
 def emit(text):
@@ -48,7 +48,7 @@ def test_tool_finds_messages_behind_parameters_conditions_and_constants(tmp_path
     assert found == {
         ("text", "radio lost"),
         ("text", "radio … is back"),
-        ("text", "Mark: …"),
+        ("text", "Note: …"),
         *(("text", state) for state in STATES),
         ("log", "…: no answer after … s"),
     }
@@ -74,7 +74,7 @@ def test_tool_reports_unexplained_messages(tmp_path: Path) -> None:
     (folder / "radio.py").write_text(PACKAGE)
     entries = [
         {"match": "radio", "cause": "a", "remedy": "b"},
-        *({"match": word, "cause": "a", "remedy": "b"} for word in ("Mark", *STATES)),
+        *({"match": word, "cause": "a", "remedy": "b"} for word in ("Note", *STATES)),
     ]
     _, wrong = explained(Sources(folder).messages(), entries)
     assert len(wrong) == 1

@@ -295,7 +295,7 @@ def catalogue(place: Path, count: int) -> None:
     _index(place, "first index")
     _index(place, "again, nothing new")
     for path in paths[::100]:
-        path.write_bytes(path.read_bytes() + b'# mark: {"time_us": 1, "text": "new"}\n')
+        path.write_bytes(path.read_bytes() + b'# note: {"time_us": 1, "text": "new"}\n')
     _index(place, "again, 1 % changed")
     print(f"  {(place / CATALOGUE_NAME).stat().st_size / 1e6:.1f} MB in {CATALOGUE_NAME}")
     asked: dict[str, Callable[[], Any]] = {

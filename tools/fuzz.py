@@ -284,7 +284,7 @@ def tables(draw: st.DrawFn) -> bytes:
         for place in draw(st.lists(st.integers(0, len(COLUMNS) - 1), max_size=12)):
             cells[place] = draw(st.sampled_from(NUMBERS))
         lines.append(",".join(cells) + "\n")
-    lines += draw(st.lists(st.sampled_from(["# mark: {", "# node: 3\n", "# header: {}\n", "\n"])))
+    lines += draw(st.lists(st.sampled_from(["# note: {", "# node: 3\n", "# header: {}\n", "\n"])))
     data = "".join(lines).encode(errors="replace")
     return draw(st.sampled_from([b"", b"\xef\xbb\xbf"])) + data + draw(st.binary(max_size=5))
 

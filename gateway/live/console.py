@@ -30,6 +30,7 @@ from gateway.records import (
     NodeLink,
     NodeStatus,
     RadioSignal,
+    board_name,
     channel_name,
 )
 from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot
@@ -213,18 +214,18 @@ def _nodes(report: LinkReport, boards: Mapping[NodeId, NodeStatus]) -> _Grid:
     signals = any(node.signal is not None for node in report.nodes)
     heads = ("Hz", "lost %", "age s", *(("dBm", "SNR") if signals else ()))
     boards_heads = ("V", "bus", "TX failed", "retries", "overruns", "restarts", "fw")
-    grid = _Grid("node", *heads, *boards_heads)
+    grid = _Grid("board", *heads, *boards_heads)
     for node in report.nodes:
         pipes = report.receiver.pipes if report.receiver is not None else ()
         overruns = str(pipes[node.pipe].overruns) if node.pipe < len(pipes) else UNKNOWN
-        total = node.received + node.lost
+        total, board = node.received + node.lost, boards.get(node.node)
         grid.add_row(
-            f"{node.node.vehicle_id}.{node.node.node_id}",
+            board_name(node.node, board.sensors_present if board else 0),
             f"{node.rate_hz:.0f}",
             figure(100 * node.lost / total if total else None, ".2f"),
             _age(report.time_us, node.last_time_us),
             *(_signal_cells(node.signal) if signals else ()),
-            *_board_cells(boards.get(node.node), overruns, node),
+            *_board_cells(board, overruns, node),
         )
     return grid
 

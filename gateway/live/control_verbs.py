@@ -86,7 +86,7 @@ class RecorderVerbs:
             raise ControlError("the note is empty: describe what happens now")
         if not self._has_vehicle():
             raise ControlError("no vehicle is received, to whose recording the note could be added")
-        if not self._recorder.mark(text):
+        if not self._recorder.note(text):
             raise ControlError("sent to the ground stations, but in no file: nothing is recorded")
         return self._recorder.status()
 

@@ -6,7 +6,7 @@ from typing import Final
 import msgspec
 
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
-from gateway.recordings.table import TableHeader, TableMark, encode_head, encode_line
+from gateway.recordings.table import TableHeader, TableNote, encode_head, encode_line
 from gateway.recordings.tlog import Stamper, encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 
@@ -86,11 +86,11 @@ class Part:
         self._write(table, table.rows.flush())
         self.add(table_ending(header.vehicle_id), encode_line(header).encode())
 
-    def add_mark(self, mark: TableMark) -> None:
+    def add_note(self, note: TableNote) -> None:
         """Add a remark to every table that has begun."""
         for vehicle_id, table in self._tables.items():
             if table.begun:
-                self.add(table_ending(vehicle_id), encode_line(mark).encode())
+                self.add(table_ending(vehicle_id), encode_line(note).encode())
 
     def flush_rows(self) -> None:
         """Buffer also the records that still wait for an IMU sample to share its row."""

@@ -42,7 +42,7 @@ from gateway.live.session import (
 )
 from gateway.output import sync_folder
 from gateway.recordings.index import RecordingError, find_recording, move_recording, part_of
-from gateway.recordings.table import REMARK, TableHeader, TableMark
+from gateway.recordings.table import NOTE, TableHeader, TableNote
 from gateway.recordings.tlog import CivilClock
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 from gateway.status import RecorderStatus
@@ -158,11 +158,11 @@ class Recorder:
             in_flight = operates or self._watch.is_armed(self._clock(), self._seen)
         self._session.set_in_flight(in_flight)
 
-    def mark(self, text: str) -> bool:
+    def note(self, text: str) -> bool:
         """Send a note, and add it to the recording at this moment; return whether one runs."""
         for part in self._parts():
-            part.add_mark(TableMark(self._clock(), text))
-        self._announce(False, REMARK + text)
+            part.add_note(TableNote(self._clock(), text))
+        self._announce(False, NOTE + text)
         return self._part is not None
 
     async def save(self, name: str) -> None:

@@ -9,7 +9,7 @@ import msgspec
 from gateway.recordings.columns import TIMES
 from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_table import RecordedTable
-from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader, TableMark
+from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader, TableNote
 from gateway.recordings.tlog import JUMP_US
 from gateway.recordings.trimming import first_true
 from gateway.records import FusionState, NodeStatus
@@ -107,6 +107,6 @@ def shifted(block: TableBlock, shift_us: int) -> TableBlock:
 
 
 def _moved(comment: TableComment, shift_us: int) -> TableComment:
-    if isinstance(comment, TableMark | NodeStatus):
+    if isinstance(comment, TableNote | NodeStatus):
         return msgspec.structs.replace(comment, time_us=comment.time_us + shift_us)
     return comment

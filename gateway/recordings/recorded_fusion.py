@@ -64,10 +64,10 @@ from gateway.recordings.recorded_table import (
 )
 from gateway.recordings.table import (
     FORMAT_LINE,
-    REMARK,
+    NOTE,
     TableBlock,
     TableHeader,
-    TableMark,
+    TableNote,
     TableReader,
     encode_line,
 )
@@ -110,10 +110,10 @@ class Replay:
                 now_us = self._now_us or 0
                 yield now_us, self._pipeline.change(row.vehicle_id, settings_of(row), now_us)
             return
-        if isinstance(row, TableMark):
+        if isinstance(row, TableNote):
             yield from self._wait(row.time_us)
             now_us = self._now_us or 0
-            yield now_us, self._pipeline.say(StatusText(INFO, REMARK + row.text), now_us)
+            yield now_us, self._pipeline.say(StatusText(INFO, NOTE + row.text), now_us)
             return
         if isinstance(row, FusionState):
             self._pipeline.restore(row)

@@ -20,14 +20,14 @@ from gateway.recordings.table import (
     TableBlock,
     TableFault,
     TableHeader,
-    TableMark,
+    TableNote,
     TableReader,
     block_of,
 )
 from gateway.records import FusionState, NodeStatus
 from gateway.sensing.calibration import NodeCalibration
 
-Line = TableRow | TableHeader | TableMark | FusionState | NodeStatus
+Line = TableRow | TableHeader | TableNote | FusionState | NodeStatus
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,7 +39,7 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.positions import GroundDistance
 from gateway.recordings.senders import Senders
-from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableMark, TableReader
+from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableNote, TableReader
 from gateway.recordings.tlog import DAY_US, Batch
 from gateway.recordings.tlog_index import TlogIndex
 from gateway.recordings.tlog_scan import IntArray
@@ -108,7 +108,7 @@ class FileInfo:
     unfinished_bytes: int = 0
     """Of a last record or line that is not whole: it is being written, or was cut."""
     header: TableHeader | None = None
-    notes: tuple[TableMark, ...] = ()
+    notes: tuple[TableNote, ...] = ()
     remarks: tuple[str, ...] = ()
     """Remarks of its reader for the user."""
 
@@ -230,7 +230,7 @@ class TableSummary:
 
     def __init__(self) -> None:
         self._header: TableHeader | None = None
-        self._notes: list[TableMark] = []
+        self._notes: list[TableNote] = []
         self._counts: Counter[str] = Counter()
         self._damaged_bytes = self._unfinished_bytes = 0
         self._last_us: int | None = None
@@ -241,7 +241,7 @@ class TableSummary:
         """Add the next block of the file."""
         self._header = header
         for _, comment in block.comments:
-            if isinstance(comment, TableMark):
+            if isinstance(comment, TableNote):
                 self._notes.append(comment)
             elif isinstance(comment, TableFault) and comment.is_cut:
                 self._unfinished_bytes += comment.size

@@ -5,7 +5,7 @@
     time_us,node_id,…
     # state: {"vehicle_id": …, "fits": …, "estimation": …}
     12000,0,…
-    # mark: {"time_us": 12345, "text": "…"}
+    # note: {"time_us": 12345, "text": "…"}
     # node: {"time_us": 12345, "supply_mv": 3290, "bus_errors": 0, …}
     # header: {…}
 
@@ -43,7 +43,7 @@ FORMAT_PREFIX: Final = "# mavgate table "
 FORMAT_LINE: Final = f"{FORMAT_PREFIX}1"
 HEADER_PREFIX: Final = "# header: "
 STATE_PREFIX: Final = "# state: "
-MARK_PREFIX: Final = "# mark: "
+NOTE_PREFIX: Final = "# note: "
 NODE_PREFIX: Final = "# node: "
 
 HEAD_LINES: Final = 3
@@ -55,7 +55,7 @@ MAX_LINE: Final = 1 << 20
 TimeUs = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
 """A time in µs; the sum of two fits 64 bits."""
 IntArray = NDArray[np.int64]
-REMARK: Final = "Mark: "
+NOTE: Final = "Note: "
 """Begin of the STATUSTEXT with an operator's remark."""
 NO_ROWS: Final = np.empty((0, len(COLUMNS)))
 BLOCK_ROWS: Final = 1000
@@ -81,7 +81,7 @@ class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
     """The calibration of the aircraft's IMU node."""
 
 
-class TableMark(msgspec.Struct, frozen=True):
+class TableNote(msgspec.Struct, frozen=True):
     """A remark at a moment of the flight."""
 
     time_us: TimeUs
@@ -103,11 +103,11 @@ class TableFault:
 _COMMENTS: Final[dict[str, Any]] = {
     HEADER_PREFIX: TableHeader,
     STATE_PREFIX: FusionState,
-    MARK_PREFIX: TableMark,
+    NOTE_PREFIX: TableNote,
     NODE_PREFIX: NodeStatus,
 }
 
-TableEvent = TableRow | TableMark | TableFault | TableHeader | FusionState | NodeStatus
+TableEvent = TableRow | TableNote | TableFault | TableHeader | FusionState | NodeStatus
 """A header here is one after rows: the settings were changed."""
 
 
@@ -116,7 +116,7 @@ def encode_head(header: TableHeader) -> str:
     return f"{FORMAT_LINE}\n{encode_line(header)}{','.join(COLUMNS)}\n"
 
 
-def encode_line(event: TableRow | TableHeader | FusionState | TableMark | NodeStatus) -> str:
+def encode_line(event: TableRow | TableHeader | FusionState | TableNote | NodeStatus) -> str:
     """Write any line of a table: a row, or a comment line."""
     if isinstance(event, TableRow):
         return row_to_line(event)
@@ -124,7 +124,7 @@ def encode_line(event: TableRow | TableHeader | FusionState | TableMark | NodeSt
     return f"{prefix}{msgspec.json.encode(event).decode()}\n"
 
 
-TableComment = TableHeader | TableMark | TableFault | FusionState | NodeStatus
+TableComment = TableHeader | TableNote | TableFault | FusionState | NodeStatus
 """A line between rows."""
 
 

@@ -51,17 +51,17 @@ async def test_telemetry_of_an_autopilot_goes_to_all_byte_for_byte(world: Any) -
 async def test_text_of_a_router_is_sent_as_a_component_of_each_vehicle(world: Any) -> None:
     foreign = len(world.foreign)
     for number in range(2):
-        assert world.world.say([dialect.MAVLink_statustext_message(6, b"Mark: here")])
+        assert world.world.say([dialect.MAVLink_statustext_message(6, b"Note: here")])
         for station in (world.first, world.second):
             frame = frame_of(await station.receive())
             assert (frame.origin[0], frame.message_id, frame.sequence) == (42, 253, number)
-            assert b"Mark: here" in frame.data
+            assert b"Note: here" in frame.data
     assert len(world.foreign) == foreign + 2
 
 
 async def test_router_without_vehicles_sends_no_text(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
-    assert not hub.say([dialect.MAVLink_statustext_message(6, b"Mark: here")])
+    assert not hub.say([dialect.MAVLink_statustext_message(6, b"Note: here")])
 
 
 async def test_request_goes_to_the_system_that_it_addresses(world: Any) -> None:

@@ -59,7 +59,7 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(
     assert [Path(file).name for file in deleted["result"]["files"]] == ["first_01.tlog"]
     assert (await ask(server, "record.list"))["result"] == []
     assert not (await ask(server, "record.delete", name="first"))["ok"]
-    assert bench.announced[1] == (False, "Mark: here")
+    assert bench.announced[1] == (False, "Note: here")
 
 
 async def test_note_that_no_vehicle_could_get_is_refused(bench: Bench, tmp_path: Path) -> None:

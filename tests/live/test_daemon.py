@@ -114,8 +114,8 @@ def test_note_without_an_own_aircraft_is_sent_by_the_hub(
     monkeypatch.setattr(daemon._hub, "say", say)
     daemon._announce(False, "to the aircraft")
     daemon._pipeline.aircraft.clear()
-    daemon._announce(False, "Mark: " + "x" * 50)
-    assert b"".join(said).startswith(b"Mark: xxx")
+    daemon._announce(False, "Note: " + "x" * 50)
+    assert b"".join(said).startswith(b"Note: xxx")
     assert len(said) == 2
     assert daemon._has_vehicle()
 

@@ -159,7 +159,7 @@ def test_newest_log_lines_are_shown() -> None:
 
 def test_summary_line_contains_receiver_nodes_aircraft_and_clients() -> None:
     assert summary_line(SNAPSHOT) == (
-        "receiver: /dev/ttyUSB0 connected; aircraft 1 board 0 100 Hz 10 lost; "
+        "receiver: /dev/ttyUSB0 connected; aircraft 1.0 board 100 Hz 10 lost; "
         "aircraft 1 at -7.765612 110.372834 171.5 m, roll -12 pitch +3 yaw 270; 1 client"
     )
 

@@ -16,7 +16,7 @@ from gateway.live.recorder import HELD_BYTES, Recorder
 from gateway.live.session import RETRY_US, RecordingSettings, session_name
 from gateway.recordings.columns import TableRow
 from gateway.recordings.index import RecordingError, list_recordings
-from gateway.recordings.table import TableHeader, TableMark, TableReader
+from gateway.recordings.table import TableHeader, TableNote, TableReader
 from gateway.records import FusedSample, FusionState
 from gateway.wire.timesync import ENOUGH
 from tests.conftest import ManualClock
@@ -159,7 +159,7 @@ async def test_table_contains_the_flight_and_its_header(
     flight = make_flight(rng, 50)
     for record in flight[:25]:
         bench.recorder.flight(record)
-    bench.recorder.mark("over the wood")
+    bench.recorder.note("over the wood")
     for record in flight[25:]:
         bench.recorder.flight(record)
     bench.recorder.close()
@@ -180,7 +180,7 @@ async def test_table_contains_the_flight_and_its_header(
     flat = [r for row in rows for r in (row.baro, row.gps, row.raw) if r is not None]
     wanted = [r.imu if isinstance(r, FusedSample) else r for r in flight]
     assert repr(flat) == repr(wanted)
-    assert [e.text for e in events if isinstance(e, TableMark)] == ["over the wood"]
+    assert [e.text for e in events if isinstance(e, TableNote)] == ["over the wood"]
 
 
 async def test_changed_settings_write_a_new_header_after_the_samples_before(

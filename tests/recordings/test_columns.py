@@ -24,7 +24,7 @@ from gateway.recordings.table import (
     TableEvent,
     TableFault,
     TableHeader,
-    TableMark,
+    TableNote,
     TableReader,
     block_of,
     encode_block,
@@ -156,13 +156,13 @@ def test_invalid_line_leaves_others_unchanged() -> None:
     """Then each line is read by itself: the numbers are the same."""
     rows = make_rows(7, 60)
     lines = [row_to_line(row).encode() for row in rows]
-    mark = encode_line(TableMark(3, "here")).encode()
+    mark = encode_line(TableNote(3, "here")).encode()
     head = encode_head(TableHeader()).encode()
     text = b"".join([head, *lines[:9], b"1,2\n", mark, b"\r\n", *lines[9:]])
     block = TableReader().feed_block(text)
     assert block.cells.tobytes() == block_of(rows).cells.tobytes()
     (at_fault, fault), (at_mark, found) = block.comments
-    assert (at_fault, at_mark, found) == (9, 9, TableMark(3, "here"))
+    assert (at_fault, at_mark, found) == (9, 9, TableNote(3, "here"))
     assert isinstance(fault, TableFault)
     assert (fault.line, fault.size) == (13, 4)
 

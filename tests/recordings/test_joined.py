@@ -7,7 +7,7 @@ from gateway.recordings.columns import COLUMNS
 from gateway.recordings.files import FlightError
 from gateway.recordings.joining import joined_tables
 from gateway.recordings.recorded_table import RecordedTable
-from gateway.recordings.table import TableBlock, TableHeader, TableMark
+from gateway.recordings.table import TableBlock, TableHeader, TableNote
 
 SECOND_US = 1_000_000
 EPOCH_US = 1_780_000_000 * SECOND_US
@@ -26,7 +26,7 @@ def table(begin_s: int, end_s: int, zero_us: int | None, session: str = "") -> R
         zero_us += zero_s * SECOND_US
     head = TableHeader(vehicle_id=1, unix_us_at_zero=zero_us, session=session)
     marks = [
-        (k, TableMark((second - zero_s) * SECOND_US, f"{second}"))
+        (k, TableNote((second - zero_s) * SECOND_US, f"{second}"))
         for k, second in enumerate(seconds.tolist())
         if second % 10 == 0
     ]

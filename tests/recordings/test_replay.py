@@ -19,7 +19,7 @@ from gateway.recordings.recorded_table import header_for, settings_of
 from gateway.recordings.table import (
     TableEvent,
     TableHeader,
-    TableMark,
+    TableNote,
     TableReader,
     block_of,
     encode_head,
@@ -174,7 +174,7 @@ def test_marks_and_settings_of_the_flight_are_replayed_at_their_time(
             *_, (last_us, _) = playing.feed(row)
         texts = [
             (now_us, sent.message_id)
-            for now_us, out in playing.feed(TableMark(last_us + 40_000, "over the gate"))
+            for now_us, out in playing.feed(TableNote(last_us + 40_000, "over the gate"))
             for sent in out.frames
             if b"over the gate" in sent.frame
         ]

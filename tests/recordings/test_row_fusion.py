@@ -13,7 +13,7 @@ from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
 from gateway.recordings.fuse import Fusion
 from gateway.recordings.recorded_fusion import Replay
 from gateway.recordings.recorded_table import Line, header_for
-from gateway.recordings.table import TableEvent, TableHeader, TableMark, block_of
+from gateway.recordings.table import TableEvent, TableHeader, TableNote, block_of
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, ImuRaw
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tools.simulated_flight import fly
@@ -98,14 +98,14 @@ def test_repeated_or_decreasing_times_are_fused_bit_equally(
 def test_lines_between_rows_stay_there_and_settings_are_followed() -> None:
     lines, settings = flown(), settings_for("eskf")
     other = msgspec.structs.replace(settings, estimation=EstimationSettings())
-    mark, header = TableMark(1, "here"), header_for(other, 1)
+    mark, header = TableNote(1, "here"), header_for(other, 1)
     begun = Aircraft(1, settings).fusion_state
     lines = [begun, *lines[:500], mark, header, *lines[500:900]]
     expected = [row_to_line(row) for row in one_by_one(lines, settings)]
     found = at_once(lines, settings)
     assert [row_to_line(row) for row in found if isinstance(row, TableRow)] == expected
     assert [type(line) for line in found if not isinstance(line, TableRow)] == [
-        FusionState, TableMark, TableHeader
+        FusionState, TableNote, TableHeader
     ]  # fmt: skip
     assert found[501:503] == [mark, header]
 

@@ -6,7 +6,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.columns import RowBuilder, row_to_line
 from gateway.recordings.summary import FileInfo, Rate, TableSummary, TlogSummary
-from gateway.recordings.table import TableHeader, TableMark, TableReader, encode_head, encode_line
+from gateway.recordings.table import TableHeader, TableNote, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from tests.kit.mavlink import packed
 from tests.recordings.frames import START_US, make_tlog, senders_of
@@ -124,7 +124,7 @@ def test_table_is_summarised(rng: np.random.Generator) -> None:
         records = [make_fused(rng, i * 10_000)]
         for record in [make_baro(rng, i * 10_000), *records] if i % 10 == 0 else records:
             text += "".join(map(row_to_line, builder.add(record)))
-    text += encode_line(TableMark(5, "here")) + "broken,line\n"
+    text += encode_line(TableNote(5, "here")) + "broken,line\n"
     summary, reader = TableSummary(), TableReader()
     summary.add(reader.feed_block(text.encode(), final=True), reader.header)
     info = summary.result(len(text))

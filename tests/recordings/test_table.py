@@ -9,7 +9,7 @@ from gateway.recordings.table import (
     TableEvent,
     TableFault,
     TableHeader,
-    TableMark,
+    TableNote,
     TableReader,
     block_of,
     encode_head,
@@ -49,7 +49,7 @@ def test_written_file_is_read_in_any_chunks(chunk: int | None) -> None:
 
 def test_marks_are_read_between_rows() -> None:
     rows = make_rows(2, 4)
-    mark = TableMark(1234, 'over the "gate", # 2')
+    mark = TableNote(1234, 'over the "gate", # 2')
     data = make_table(rows[:1]) + encode_line(mark).encode() + row_to_line(rows[1]).encode()
     assert repr(read(data)[1]) == repr([rows[0], mark, rows[1]])
 
@@ -142,7 +142,7 @@ def test_first_and_last_columns_are_fixed() -> None:
 @pytest.mark.parametrize("size", [1, 7, 20, 1000])
 @pytest.mark.parametrize("count", [0, 20])
 def test_pieces_of_a_block_contain_all_events_in_order(size: int, count: int) -> None:
-    rows, mark = make_rows(1, count)[:20], TableMark(5, "here")
+    rows, mark = make_rows(1, count)[:20], TableNote(5, "here")
     events = [mark, *rows[:7], mark, mark, *rows[7:], mark]
     pieces = [*block_of(events).pieces(size)]
     assert max(map(len, pieces)) <= size
@@ -153,8 +153,8 @@ def test_pieces_of_a_block_contain_all_events_in_order(size: int, count: int) ->
     "line",
     [
         f'# header: {{"unix_us_at_zero": {10**30}}}',
-        f'# mark: {{"time_us": {10**30}, "text": "over the wood"}}',
-        f'# mark: {{"time_us": {-(10**30)}, "text": "over the wood"}}',
+        f'# note: {{"time_us": {10**30}, "text": "over the wood"}}',
+        f'# note: {{"time_us": {-(10**30)}, "text": "over the wood"}}',
         '# state: {"vehicle_id": 256, "fits": "", "estimation": ""}',
         '# state: {"vehicle_id": 0, "fits": "", "estimation": ""}',
     ],

@@ -21,7 +21,7 @@ from gateway.cli.support.terminal import (
 )
 from gateway.live.other_gateways import Gateway, other_gateways
 from gateway.printable import UNKNOWN, figure, printable, receiver_state
-from gateway.records import RadioState, node_role
+from gateway.records import NodeId, RadioState, board_name
 from gateway.units import MV_PER_V, US_PER_S, counted
 
 US_PER_MS: Final = 1000
@@ -167,7 +167,7 @@ def _summary(snapshot: Record) -> str:
         problem = RadioState(report["receiver"]["radio"]).problem
         lines += [f"receiver: {problem}"] if problem else []
     lines += [
-        f"{_board_name(board)}: {', '.join(board['chips'])}"
+        f"aircraft {_name_of(board, board)} board: {', '.join(board['chips'])}"
         for one in snapshot["aircraft"]
         for board in one["boards"]
         if board["chips"]
@@ -230,28 +230,23 @@ def _requests(found: Sequence[Record], now_us: int) -> Table:
 
 def _nodes(nodes: Sequence[Record], snapshot: Record) -> Table:
     heads = ("supply V", "bus errors", "TX failed", "retries", "overruns", "firmware")
-    table = table_of("node", "rate Hz", "received", "lost", "restarts", *heads)
-    boards = {_node_name(b): b for one in snapshot["aircraft"] for b in one["boards"]}
+    table = table_of("board", "rate Hz", "received", "lost", "restarts", *heads)
+    boards = {_name_of(b): b for one in snapshot["aircraft"] for b in one["boards"]}
     receiver = snapshot["report"]["receiver"]
     for node in nodes:
         overruns = UNKNOWN if receiver is None else receiver["pipes"][node["pipe"]]["overruns"]
+        board = boards.get(_name_of(node))
         table.add_row(
-            _node_name(node),
+            _name_of(node, board),
             figure(node["rate_hz"], ".0f"),
             *(str(node[key]) for key in ("received", "lost", "restarts")),
-            *_board(boards.get(_node_name(node)), str(overruns)),
+            *_board(board, str(overruns)),
         )
     return table
 
 
-def _board_name(board: Record) -> str:
-    """Name a board by its aircraft and its sensors."""
-    role = node_role(board["sensors_present"]).removesuffix(" node")
-    return f"aircraft {board['node']['vehicle_id']} {role} board"
-
-
-def _node_name(record: Record) -> str:
-    return f"{record['node']['vehicle_id']}.{record['node']['node_id']}"
+def _name_of(record: Record, board: Record | None = None) -> str:
+    return board_name(NodeId(**record["node"]), board["sensors_present"] if board else 0)
 
 
 def _board(board: Record | None, overruns: str) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from gateway.recordings.answers import HOME_POSITION_ID
 from gateway.recordings.columns import TableRow
 from gateway.recordings.positions import Continuity, TrackPoint, named_position
 from gateway.recordings.recorded_table import RecordedTable
-from gateway.recordings.table import REMARK, TableMark
+from gateway.recordings.table import NOTE, TableNote
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.records import FusionState, GpsFix, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, US_PER_S
@@ -50,12 +50,13 @@ class MarkerKind(StrEnum):
 
     HOME = "home"
     MARK = "mark"
+    NOTE = "note"
     EVENT = "event"
 
 
 @dataclass(frozen=True, slots=True)
 class MapMarker:
-    """Home, a mark, or where the vehicle was when something happened."""
+    """Home, a mark, a note, or where the vehicle was when something happened."""
 
     kind: MarkerKind
     name: str
@@ -335,8 +336,9 @@ class _Drawing:
             if marked := _MARKED.fullmatch(text):
                 lat_deg, lon_deg = map(float, marked.groups())
                 at = replace(at, lat_deg=lat_deg, lon_deg=lon_deg)
-            kind = MarkerKind.MARK if marked or text.startswith(REMARK) else MarkerKind.EVENT
-            self.track.markers.append(MapMarker(kind, text.removeprefix(REMARK), at))
+            others = MarkerKind.NOTE if text.startswith(NOTE) else MarkerKind.EVENT
+            kind = MarkerKind.MARK if marked else others
+            self.track.markers.append(MapMarker(kind, text.removeprefix(NOTE), at))
         return self.track if points else None
 
 
@@ -366,8 +368,8 @@ def tracks_of_table(table: RecordedTable, aircraft: AircraftSettings) -> list[Ve
     name = f"aircraft {table.header.vehicle_id}"
     one, of_fixes = _Drawing(name), _Drawing(name)
     for row in table.rows:
-        if isinstance(row, TableMark):
-            one.add_text(zero_us + row.time_us, REMARK + row.text)
+        if isinstance(row, TableNote):
+            one.add_text(zero_us + row.time_us, NOTE + row.text)
         elif isinstance(row, FusionState) and row.home is not None and not one.homes:
             lat_deg, lon_deg, alt_m, since_us = row.home
             one.add_home(TrackPoint(zero_us + since_us, lat_deg, lon_deg, alt_m))

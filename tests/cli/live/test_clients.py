@@ -121,7 +121,7 @@ async def test_status_is_printed_as_text(asked: list[object]) -> None:
     assert "255.190" in text
     assert "radio: No such device" in text
     rows = [line.split() for line in text.splitlines()]
-    assert ["1.2", "60", "100", "7", "1", "3.29", "12", "3", "450", "—", "1.4"] in rows
+    assert ["1", "IMU", "60", "100", "7", "1", "3.29", "12", "3", "450", "—", "1.4"] in rows
     assert ["udp-listen:0.0.0.0:14551", "open", "1", "0"] in rows
     assert ["observers", "Address", "already", "in", "use", "0", "8"] in rows
 

@@ -311,7 +311,7 @@ def test_text_of_a_recording_cannot_control_the_terminal(tmp_path: Path) -> None
     recorded = table(tmp_path / "a\x1b[31m[red].csv")
     mark = msgspec.json.encode({"time_us": 1000, "text": evil}).decode()
     with recorded.open("a") as file:
-        file.write(f"# mark: {mark}\n")
+        file.write(f"# note: {mark}\n")
     printed = run("info", recorded)
     assert r"\x1b]0;owned\x07 \x9b2J [red] :bomb: \u202egnp.exe" in printed
     assert r"a\x1b[31m[red].csv: table" in printed

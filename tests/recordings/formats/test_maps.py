@@ -27,7 +27,7 @@ from gateway.recordings.formats.maps import (
 )
 from gateway.recordings.positions import TrackPoint
 from gateway.recordings.recorded_table import RecordedTable
-from gateway.recordings.table import TableMark, block_of
+from gateway.recordings.table import TableNote, block_of
 from gateway.recordings.tlog import TlogRecord
 from gateway.records import NavFlags
 from tests.kit.mavlink import packed
@@ -41,7 +41,7 @@ ATTITUDE = TrackPoint(POINTS[-1].time_us + 10**6, 47.2, -8.5, 431.0, (-10.0, 5.0
 VEHICLES = [
     VehicleTrack("wood & <field>", [[*POINTS, ATTITUDE]], [
         MapMarker(MarkerKind.HOME, "Home", POINTS[0]),
-        MapMarker(MarkerKind.MARK, "over <the> gate", POINTS[2]),
+        MapMarker(MarkerKind.NOTE, "over <the> gate", POINTS[2]),
         MapMarker(MarkerKind.EVENT, "GPS fix lost", POINTS[3]),
     ]),
     VehicleTrack("system 7", [POINTS[:2]]),
@@ -81,7 +81,7 @@ def test_kml_contains_home_marks_and_events() -> None:
     ]  # fmt: skip
     assert found == [
         ("home", "Home", "-8.5000000,47.1000000,430.25"),
-        ("mark", "over <the> gate", "-8.5000000,47.1000020,430.25"),
+        ("note", "over <the> gate", "-8.5000000,47.1000020,430.25"),
         ("event", "GPS fix lost", "-8.5000000,47.1000030,430.25"),
     ]
 
@@ -162,7 +162,7 @@ def test_geojson_contains_every_vehicle_with_times_and_markers() -> None:
     assert {feature["type"] for feature in found["features"]} == {"Feature"}
     kinds = [(f["geometry"]["type"], f["properties"]["kind"]) for f in found["features"]]
     assert kinds == [
-        ("LineString", "track"), ("Point", "home"), ("Point", "mark"), ("Point", "event"),
+        ("LineString", "track"), ("Point", "home"), ("Point", "note"), ("Point", "event"),
         ("LineString", "track"),
     ]  # fmt: skip
     line, home, mark = found["features"][:3]
@@ -225,7 +225,7 @@ SAID: list[tuple[tuple[int, int], Any]] = [
     (ONE, position(470_000_001)),
     (TWO, position(480_000_000)),
     (ONE, home(470_000_000)),
-    (ONE, text("Mark: over the gate")),
+    (ONE, text("Note: over the gate")),
     (ONE, text("Marked 47.500000, 8.600000")),
     (ONE, text("for programmers", severity=7)),
     (TWO, mavlink.MAVLink_attitude_quaternion_message(0, 1.0, 0, 0, 0, 0, 0, 0)),
@@ -273,7 +273,7 @@ def test_tracks_of_frames_have_home_marks_and_events() -> None:
     assert markers(one) == [
         (MarkerKind.HOME, "Home"),
         (MarkerKind.EVENT, "Attitude valid"),
-        (MarkerKind.MARK, "over the gate"),
+        (MarkerKind.NOTE, "over the gate"),
         (MarkerKind.MARK, "Marked 47.500000, 8.600000"),
         (MarkerKind.EVENT, "A" * 50 + "B"),
     ]
@@ -283,7 +283,7 @@ def test_tracks_of_frames_have_home_marks_and_events() -> None:
     assert by_name["Home"].alt_amsl_m == pytest.approx(400.0)
 
 
-def test_tracks_of_a_table_have_home_and_marks(rng: np.random.Generator) -> None:
+def test_tracks_of_a_table_have_home_and_notes(rng: np.random.Generator) -> None:
     settings = GatewaySettings().default_aircraft
     header, rows = read(fly(settings, make_flight(rng, 12))[0])
     rows = [
@@ -292,9 +292,9 @@ def test_tracks_of_a_table_have_home_and_marks(rng: np.random.Generator) -> None
         else row
         for row in rows
     ]
-    mark = TableMark(rows[-1].time_us, "over the gate")
+    mark = TableNote(rows[-1].time_us, "over the gate")
     (track,) = tracks_of_table(RecordedTable(header, iter([block_of([*rows, mark])])), settings)
-    assert markers(track) == [(MarkerKind.HOME, "Home"), (MarkerKind.MARK, "over the gate")]
+    assert markers(track) == [(MarkerKind.HOME, "Home"), (MarkerKind.NOTE, "over the gate")]
     assert len(track.points) > 10
     known = [row.state for row in rows if row.state and NavFlags.ATTITUDE_VALID in row.state.flags]
     assert any(point.attitude_deg is not None for point in track.points) == bool(known)

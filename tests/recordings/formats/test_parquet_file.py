@@ -13,7 +13,7 @@ from gateway.recordings.columns import COLUMNS
 from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.formats import parquet as parquet_file
 from gateway.recordings.recorded_table import header_for
-from gateway.recordings.table import TableMark, encode_line
+from gateway.recordings.table import TableNote, encode_line
 from tests.kit.cli import run
 from tests.recordings.flights import OPTIONS, fly, make_flight
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
@@ -29,8 +29,8 @@ def table(tmp_path: Path, rng: np.random.Generator) -> Path:
     text = text.replace('"unix_us_at_zero":null', f'"unix_us_at_zero":{START_US}')
     lines = text.splitlines(keepends=True)
     lines.insert(300, encode_line(header_for(settings, 1)))
-    lines.insert(300, encode_line(TableMark(123, "over the wood")))
-    lines.append(encode_line(TableMark(456, "landed")))
+    lines.insert(300, encode_line(TableNote(123, "over the wood")))
+    lines.append(encode_line(TableNote(456, "landed")))
     path = tmp_path / "flight.csv"
     path.write_text("".join(lines))
     return path

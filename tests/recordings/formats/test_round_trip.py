@@ -28,7 +28,7 @@ from gateway.recordings.formats import parquet
 from gateway.recordings.formats.maps import tracks_of_messages, tracks_of_table
 from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_table import aircraft_of, header_for
-from gateway.recordings.table import TableMark, encode_line
+from gateway.recordings.table import TableNote, encode_line
 from gateway.recordings.tlog import TlogRecord, encode_record
 from gateway.records import NodeId, NodeStatus
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
@@ -50,12 +50,12 @@ def table() -> bytes:
     text = text.replace('"unix_us_at_zero":null', f'"unix_us_at_zero":{START_US}')
     lines = text.splitlines(keepends=True)
     lines.insert(300, encode_line(header_for(AIRCRAFT, 1)))
-    lines.insert(300, encode_line(TableMark(123, "over the wood")))
+    lines.insert(300, encode_line(TableNote(123, "over the wood")))
     node = NodeStatus(
         9, NodeId(1, 0), 8, (1, 2), 0, 3, 0, 0, 1, 2, 900, 100, 3300, chips=("BMP280",)
     )
     lines.insert(200, encode_line(node))
-    lines.append(encode_line(TableMark(456, "landed")))
+    lines.append(encode_line(TableNote(456, "landed")))
     return "".join(lines).encode()
 
 
