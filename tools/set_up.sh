@@ -1,6 +1,7 @@
 #!/bin/sh
 # Make the virtual environment .venv, install locked packages into it, and compile the kernels.
 # usage: tools/set_up.sh LOCK_FILE...
+# The kernels are compiled while the packages that they do not need are installed.
 # Prints one line a step, and the output of a step only if it fails. Installs Debian's python3-venv
 # if it is missing and this user may install packages.
 set -eu
@@ -22,7 +23,9 @@ fi
 
 step_of=set-up
 . tools/steps.sh
-trap 'rm -f "$step_log"' EXIT
+compiling=
+kernel_log=$(mktemp) compiler_lock=$(mktemp)
+trap 'rm -f "$step_log" "$kernel_log" "$compiler_lock"; [ -z "$compiling" ] || kill "$compiling" 2>/dev/null || :' EXIT
 
 # The lock lists every package with its hashes: what it leaves out is not installed.
 install() {
@@ -36,13 +39,24 @@ if [ ! -x .venv/bin/pip ]; then
     fi
     step "virtual environment .venv with $("$python" --version)" "$python" -m venv .venv
 fi
-for lock; do
-    count=$(grep -c '^[A-Za-z]' "$lock")
-    step "$count packages of $lock" install --require-hashes --requirement "$lock"
-done
+awk '/^[a-z]/ { on = /^(msgspec|pygeomag)==/ } on' requirements.lock |
+    cat requirements-build.lock - >"$compiler_lock"
+step "the packages that compile the kernels" \
+    install --require-hashes --requirement "$compiler_lock"
 if ! command -v cc >/dev/null; then
     step "a linker, as there is no C compiler" \
         install --require-hashes --requirement requirements-linker.lock
 fi
+.venv/bin/python -m tools.build_kernels >"$kernel_log" 2>&1 &
+compiling=$!
+for lock; do
+    count=$(grep -c '^[A-Za-z]' "$lock")
+    step "$count packages of $lock" install --require-hashes --requirement "$lock"
+done
 step "mavgate itself" install --no-build-isolation --editable .
-step "compiling the kernels, for up to a minute" .venv/bin/python -m tools.build_kernels
+
+end_of_compiling() {
+    wait "$compiling" || { cat "$kernel_log"; return 1; }
+    compiling=
+}
+step "the rest of compiling the kernels" end_of_compiling
