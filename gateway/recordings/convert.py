@@ -137,6 +137,9 @@ class FlightToWrite:
             return []
         sources = [open_tlog(file) for file in self.files]
         for source in sources:
+            # A part that was begun when the power failed may be empty.
+            if not source.senders.origins and ".tlog" not in source.path.suffixes:
+                raise FlightError(f"{source.path}: {NO_RECORDING}")
             self.senders.merge(source.senders)
             self._remarks += [f"{source.path}: {text}" for text in source.remarks]
         if not self.senders.origins:

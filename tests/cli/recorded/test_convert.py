@@ -285,3 +285,6 @@ def test_files_of_different_kinds_are_refused(tlog: Path, table: Path, tmp_path:
     text = run("convert", tlog, table, "-o", tmp_path / "x.kml", code=2)
     assert "the files differ in kind" in text
     assert f"{tlog}: tlog" in text
+    (page := tmp_path / "page.html").write_text("<html></html>")
+    text = run("convert", tlog, page, "-o", tmp_path / "x.tlog", code=2)
+    assert f"{page}: unknown file format" in text
