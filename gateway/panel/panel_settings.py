@@ -9,6 +9,10 @@ from gateway.settings import Settings, setting
 LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
 ORIGIN: Final = re.compile(r"https?://[a-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
 """Origin of a page as a browser writes it; the port only if it is not the default one."""
+LEAST_COST: Final = 1 << 14
+"""Least N of scrypt: fewer make a stolen hash easy to guess."""
+LEAST_BYTES: Final = 16
+"""Of salt and digest."""
 
 
 class MapStyle(Settings, frozen=True):
@@ -24,12 +28,6 @@ class MapStyle(Settings, frozen=True):
     ]
     attribution: Annotated[str, setting("Attribution that the owner requires.")] = ""
     max_zoom: Annotated[int, setting("Greatest available zoom.", ge=1, le=24)] = 19
-
-
-LEAST_COST: Final = 1 << 14
-"""Least N of scrypt: fewer make a stolen hash easy to guess."""
-LEAST_BYTES: Final = 16
-"""Of salt and digest."""
 
 
 def why_weak(hashed: str) -> str:

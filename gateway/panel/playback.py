@@ -29,10 +29,21 @@ from gateway.recordings.table import TableReader
 from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.units import US_PER_S
 
+log = logging.getLogger(__name__)
+
 PROFILE_POINTS: Final = 400
 HEIGHT_GAP_US: Final = US_PER_S // 5
 RECORDED: Final = "recorded"
 FUSED_AGAIN: Final = "fused again"
+READY_S: Final = 120.0
+"""A table of hours is opened in some seconds. A player that fails is noticed when it ends."""
+STEP_S: Final = 0.1
+WATCH_S: Final = 0.25
+LEAP_S: Final = 0.5
+"""A larger step back is not jitter of the player's clock, but a loop or a seek."""
+MAX_PLAYERS: Final = 4
+"""Each is a process."""
+SPEEDS: Final = (0.25, 0.5, 1, 2, 5, 10, 50)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,19 +138,6 @@ def _profile(points: Sequence[TrackPoint], begin_us: int) -> Profile:
         tuple((point.time_us - begin_us) / US_PER_S for point in kept),
         tuple(point.alt_amsl_m for point in kept),
     )
-
-
-log = logging.getLogger(__name__)
-
-READY_S: Final = 120.0
-"""A table of hours is opened in some seconds. A player that fails is noticed when it ends."""
-STEP_S: Final = 0.1
-WATCH_S: Final = 0.25
-LEAP_S: Final = 0.5
-"""A larger step back is not jitter of the player's clock, but a loop or a seek."""
-MAX_PLAYERS: Final = 4
-"""Each is a process."""
-SPEEDS: Final = (0.25, 0.5, 1, 2, 5, 10, 50)
 
 
 class PlaybackError(Exception):

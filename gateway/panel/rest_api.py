@@ -47,6 +47,30 @@ DROPPED_SHARE: Final = 8
 
 Key = tuple[int, int, str]
 """System, component and name of the message."""
+MAX_WAITING_BYTES: Final = 1 << 20
+"""Of one subscriber: some seconds of one aircraft."""
+MAX_PATTERN: Final = 300
+"""Letters; the longest expression is compiled in some milliseconds."""
+EVERYTHING: Final = ".*"
+PIECE: Final = 1 << 15
+"""Bytes that are encoded before others get their turn; some ms."""
+JSON: Final = "application/json"
+API_VERSION: Final = 0
+"""Version of the answers' format, as in mavlink2rest."""
+DEFAULT_HEADER: Final = {"system_id": 255, "component_id": 0, "sequence": 0}
+MAX_ID: Final = 255
+NOTHING: Final = "None"
+"""Answer for a path without a value."""
+NOT_A_MESSAGE: Final = "Failed to parse message, not a valid MAVLinkMessage."
+NOT_ALLOWED: Final = "viewers may not send; log in as the operator"
+WS_INVALID: Final = 1007
+PREFIX: Final = "/mavlink2rest"
+"""Prefix under which some clients expect these paths, as BlueOS serves them."""
+DOCS: Final = Path(__file__).parent / "web" / "rest.html"
+DOCS_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
 
 
 @dataclass(slots=True)
@@ -158,13 +182,6 @@ def _iso_time(time_s: float) -> str:
     return datetime.fromtimestamp(time_s, UTC).astimezone().isoformat()
 
 
-MAX_WAITING_BYTES: Final = 1 << 20
-"""Of one subscriber: some seconds of one aircraft."""
-MAX_PATTERN: Final = 300
-"""Letters; the longest expression is compiled in some milliseconds."""
-EVERYTHING: Final = ".*"
-
-
 class Subscriber:
     """A client that receives some kinds of message of some systems."""
 
@@ -251,11 +268,6 @@ def with_header(message: Any) -> dict[str, Any]:
     return {"header": header, "message": to_json(message)}
 
 
-PIECE: Final = 1 << 15
-"""Bytes that are encoded before others get their turn; some ms."""
-JSON: Final = "application/json"
-
-
 def encode(value: Any, line: bytes = b"\n") -> Iterator[bytes]:
     """Encode a value or a part of the tree as indented JSON, entry by entry.
 
@@ -276,24 +288,6 @@ def encode(value: Any, line: bytes = b"\n") -> Iterator[bytes]:
 def pretty(value: Any) -> str:
     """Return a value as indented JSON."""
     return b"".join(encode(value)).decode()
-
-
-API_VERSION: Final = 0
-"""Version of the answers' format, as in mavlink2rest."""
-DEFAULT_HEADER: Final = {"system_id": 255, "component_id": 0, "sequence": 0}
-MAX_ID: Final = 255
-NOTHING: Final = "None"
-"""Answer for a path without a value."""
-NOT_A_MESSAGE: Final = "Failed to parse message, not a valid MAVLinkMessage."
-NOT_ALLOWED: Final = "viewers may not send; log in as the operator"
-WS_INVALID: Final = 1007
-PREFIX: Final = "/mavlink2rest"
-"""Prefix under which some clients expect these paths, as BlueOS serves them."""
-DOCS: Final = Path(__file__).parent / "web" / "rest.html"
-DOCS_POLICY: Final = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
 
 
 class RestApi:

@@ -34,6 +34,26 @@ READING: Final = frozenset(
     {"status", "verbs", "clients.list", "record.status", "record.list", "play.status"}
 )
 """Verbs that a viewer may use: they change nothing."""
+STATUS_S: Final = 1.0
+SYSTEM_ID: Final = 253
+FIRST_COMPONENT: Final = 25
+USER_COMPONENTS: Final = 75
+"""MAV_COMP_ID_USER1 and on: two panels of one gateway must not be taken for one."""
+HEARTBEAT_S: Final = 1.0
+PROBE_S: Final = 0.2
+"""Between heartbeats while nothing is received: the first one may come before the socket is
+open."""
+SILENT_US: Final = 3 * US_PER_S
+ACK_TIMEOUT_S: Final = 1.5
+PROGRESS_TIMEOUT_S: Final = 20.0
+"""After an acknowledgement that it is being carried out: a busy disk may take that long."""
+ATTEMPTS: Final = 3
+MAX_SENDERS: Final = 64
+"""Programs that send through the panel under their own ids."""
+LOCAL_ADDRESS: Final = "udp-listen:127.0.0.1:0"
+LOCAL_URL: Final = f"{LOCAL_ADDRESS}?name=panel"
+PLAYBACK_URL: Final = "udp-listen:127.0.0.1:0?name=playback&trusted=yes"
+"""Where the panel's player sends its frames."""
 
 
 class ControlClient:
@@ -50,9 +70,6 @@ class ControlClient:
         return await asyncio.to_thread(
             lambda: request(self.path or find_socket("run"), verb, params)
         )
-
-
-STATUS_S: Final = 1.0
 
 
 class GatewayWatch:
@@ -106,28 +123,6 @@ def _spot_of(mark: dict[str, Any] | None) -> Location | None:
         return None
     alt_amsl_m = NAN if mark["alt_amsl_m"] is None else mark["alt_amsl_m"]
     return Location(mark["lat_deg"], mark["lon_deg"], alt_amsl_m)
-
-
-SYSTEM_ID: Final = 253
-FIRST_COMPONENT: Final = 25
-USER_COMPONENTS: Final = 75
-"""MAV_COMP_ID_USER1 and on: two panels of one gateway must not be taken for one."""
-HEARTBEAT_S: Final = 1.0
-PROBE_S: Final = 0.2
-"""Between heartbeats while nothing is received: the first one may come before the socket is
-open."""
-SILENT_US: Final = 3 * US_PER_S
-ACK_TIMEOUT_S: Final = 1.5
-PROGRESS_TIMEOUT_S: Final = 20.0
-"""After an acknowledgement that it is being carried out: a busy disk may take that long."""
-ATTEMPTS: Final = 3
-MAX_SENDERS: Final = 64
-"""Programs that send through the panel under their own ids."""
-
-LOCAL_ADDRESS: Final = "udp-listen:127.0.0.1:0"
-LOCAL_URL: Final = f"{LOCAL_ADDRESS}?name=panel"
-PLAYBACK_URL: Final = "udp-listen:127.0.0.1:0?name=playback&trusted=yes"
-"""Where the panel's player sends its frames."""
 
 
 class CommandFailedError(Exception):

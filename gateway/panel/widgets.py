@@ -27,6 +27,19 @@ FAILURES: Final = (
     ControlError, CommandFailedError, ExportError, NotAllowedError, PlaybackError, RecordingError,
     OSError,
 )  # fmt: skip
+WRITE: Final = 1.0
+"""PREFLIGHT_STORAGE_PARAMETER_ACTION."""
+Cells = Sequence[str | tuple[str, ...]]
+"""Each cell's text alone, or its text, style class, icon and track; the class is `""`, `good`,
+`warn`, `bad`, `info` or `soft`; the icon is a name of a Material icon; the track, corners of a line
+in a box of 46 by 24, may be left out."""
+REFRESH_S: Final = 0.5
+IDLE: Final = "idle"
+LOOKS: Final = {"recording": "bad", "opening": "warn", "blocked": "bad", "idle": ""}
+ANSWER_S: Final = 60.0
+"""Longest wait for the browser: drawing a picture takes seconds of a small or busy computer."""
+Points = tuple[IntArray, FloatArray]
+"""Times in ms since 1970, and values."""
 
 
 def heading(text: str) -> TextElement:
@@ -121,10 +134,6 @@ def allow(button: ui.button, reason: str = "") -> None:
         button.props["title"] = reason
 
 
-WRITE: Final = 1.0
-"""PREFLIGHT_STORAGE_PARAMETER_ACTION."""
-
-
 async def store_parameters(context: ViewContext, done: str) -> bool:
     """Have the selected aircraft store its parameters; return whether it has."""
     try:
@@ -134,12 +143,6 @@ async def store_parameters(context: ViewContext, done: str) -> bool:
         return False
     ui.notify(done, type="positive")
     return True
-
-
-Cells = Sequence[str | tuple[str, ...]]
-"""Each cell's text alone, or its text, style class, icon and track; the class is `""`, `good`,
-`warn`, `bad`, `info` or `soft`; the icon is a name of a Material icon; the track, corners of a line
-in a box of 46 by 24, may be left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,11 +189,6 @@ class DataTable(Element, component=WEB / "data_table.js"):
             result = self._buttons[int(number)].act(key)
             if hasattr(result, "__await__"):
                 await result
-
-
-REFRESH_S: Final = 0.5
-IDLE: Final = "idle"
-LOOKS: Final = {"recording": "bad", "opening": "warn", "blocked": "bad", "idle": ""}
 
 
 class RecorderControls:
@@ -283,13 +281,6 @@ def _detail_of(recorder: dict[str, Any]) -> str:
         parts += [recorder["name"], f"{recorder['part_bytes'] / 1e6:.1f} MB"]
     parts += [f"{recorder['free_bytes'] / 1e9:.1f} GB free in {recorder['folder']}"]
     return " · ".join(parts)
-
-
-ANSWER_S: Final = 60.0
-"""Longest wait for the browser: drawing a picture takes seconds of a small or busy computer."""
-
-Points = tuple[IntArray, FloatArray]
-"""Times in ms since 1970, and values."""
 
 
 class StripChart(ui.echart, component=WEB / "strip_chart.js"):

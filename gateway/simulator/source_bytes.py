@@ -28,6 +28,8 @@ FLYING_MPS: Final = 3.0
 FULL_V, EMPTY_V, CAPACITY_MAH = 12.6, 10.8, 1300.0
 COUNTS: Final = 32768.0
 GYRO_LSB: Final = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
+PUSH_S: Final = 0.2
+"""Between two posts of the simulated phone."""
 
 
 def crsf_frame(kind: int, payload: bytes) -> bytes:
@@ -135,10 +137,6 @@ def line_of(record: RawRecord) -> str:
             return nmea_of(record)
         case _:
             return ""
-
-
-PUSH_S: Final = 0.2
-"""Between two posts of the simulated phone."""
 
 
 def phone_bytes(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:

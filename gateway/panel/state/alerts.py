@@ -40,6 +40,10 @@ _ENDS: Final = (
     (re.compile(r"^(Recording (?!stopped:).+)$"), "recording"),
 )
 """Texts that end alerts, and a regular expression of their keys."""
+NODE_SILENT_US: Final = 3 * US_PER_S
+BLOCKED: Final = "blocked"
+OWN_KEYS: Final = ("node ", "receiver", "recording")
+"""Key prefixes of the alerts made here, which come from texts if there is no status."""
 
 
 class AlertLevel(IntEnum):
@@ -118,12 +122,6 @@ def _texts(vehicle: VehicleState, now_us: int) -> list[Alert]:
             key = f"text {text.number}"
             standing[key] = Alert(key, AlertLevel.CRITICAL, text.text)
     return list(standing.values())
-
-
-NODE_SILENT_US: Final = 3 * US_PER_S
-BLOCKED: Final = "blocked"
-OWN_KEYS: Final = ("node ", "receiver", "recording")
-"""Key prefixes of the alerts made here, which come from texts if there is no status."""
 
 
 def with_status(

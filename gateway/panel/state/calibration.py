@@ -25,6 +25,46 @@ _FACES: Final = (
     (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9),
     (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1),
 )  # fmt: skip
+MILLI: Final = 1e-3
+NO_ANSWER_US: Final = 4 * US_PER_S
+"""After the last message of a vehicle that never answered the command."""
+GIVEN_UP_US: Final = 200 * US_PER_S
+AFTER_US: Final = 2 * US_PER_S
+"""How long the samples after the calibration are evaluated."""
+WINDOW: Final = 25
+"""Samples for a position: half a second at the requested rate."""
+MAX_SAMPLES: Final = 3000
+MIN_FIT: Final = 30
+SIDES: Final = ("down", "up", "left", "right", "front", "back")
+"""Which side of the aircraft lies below, as in the `[cal]` texts; down is level."""
+SIDE_NAMES: Final = {
+    "down": "level",
+    "up": "upside down",
+    "left": "on its left side",
+    "right": "on its right side",
+    "front": "nose down",
+    "back": "tail down",
+}
+ORIENTATIONS: Final = {
+    f"{face}, arrow to {way}": (roll_deg, 0.0, yaw_deg)
+    for face, roll_deg in (("face up", 180.0), ("face down", 0.0))
+    for way, yaw_deg in (
+        ("the nose", 0.0), ("the right wing", 90.0), ("the tail", 180.0), ("the left wing", -90.0),
+    )
+}  # fmt: skip
+"""Roll, pitch and yaw from the sensor's axes to the body's, deg, by how the board lies in the
+aircraft; its x arrow is printed next to the chips."""
+_POSES: Final = (("back", "front"), ("left", "right"), ("up", "down"))
+"""By axis of body FRD: the side that lies below while gravity is felt along it, and against it."""
+SIDE_SHARE: Final = 0.85
+_STARTED: Final = re.compile(r"^\[cal\] calibration started: \d+ (\w+)")
+_PROGRESS: Final = re.compile(r"^\[cal\] progress <(\d+)>")
+_SIDE_DONE: Final = re.compile(r"^\[cal\] (\w+) side done")
+_DONE: Final = re.compile(r"^\[cal\] calibration done")
+_FAILED: Final = re.compile(r"^\[cal\] calibration failed: (.+)")
+_CANCELLED: Final = re.compile(r"^\[cal\] calibration cancelled")
+CALIBRATE: Final = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
+_Vector = tuple[float, float, float]
 
 
 def _make_cells() -> FloatArray:
@@ -65,48 +105,6 @@ def seen_cells(vectors: FloatArray) -> list[bool]:
     return seen
 
 
-MILLI: Final = 1e-3
-NO_ANSWER_US: Final = 4 * US_PER_S
-"""After the last message of a vehicle that never answered the command."""
-GIVEN_UP_US: Final = 200 * US_PER_S
-AFTER_US: Final = 2 * US_PER_S
-"""How long the samples after the calibration are evaluated."""
-WINDOW: Final = 25
-"""Samples for a position: half a second at the requested rate."""
-MAX_SAMPLES: Final = 3000
-MIN_FIT: Final = 30
-
-SIDES: Final = ("down", "up", "left", "right", "front", "back")
-"""Which side of the aircraft lies below, as in the `[cal]` texts; down is level."""
-SIDE_NAMES: Final = {
-    "down": "level",
-    "up": "upside down",
-    "left": "on its left side",
-    "right": "on its right side",
-    "front": "nose down",
-    "back": "tail down",
-}
-ORIENTATIONS: Final = {
-    f"{face}, arrow to {way}": (roll_deg, 0.0, yaw_deg)
-    for face, roll_deg in (("face up", 180.0), ("face down", 0.0))
-    for way, yaw_deg in (
-        ("the nose", 0.0), ("the right wing", 90.0), ("the tail", 180.0), ("the left wing", -90.0),
-    )
-}  # fmt: skip
-"""Roll, pitch and yaw from the sensor's axes to the body's, deg, by how the board lies in the
-aircraft; its x arrow is printed next to the chips."""
-_POSES: Final = (("back", "front"), ("left", "right"), ("up", "down"))
-"""By axis of body FRD: the side that lies below while gravity is felt along it, and against it."""
-SIDE_SHARE: Final = 0.85
-
-_STARTED: Final = re.compile(r"^\[cal\] calibration started: \d+ (\w+)")
-_PROGRESS: Final = re.compile(r"^\[cal\] progress <(\d+)>")
-_SIDE_DONE: Final = re.compile(r"^\[cal\] (\w+) side done")
-_DONE: Final = re.compile(r"^\[cal\] calibration done")
-_FAILED: Final = re.compile(r"^\[cal\] calibration failed: (.+)")
-_CANCELLED: Final = re.compile(r"^\[cal\] calibration cancelled")
-
-
 class CalibrationStep(StrEnum):
     """The calibrations, in the recommended order."""
 
@@ -125,7 +123,6 @@ PARAMS: Final[dict[CalibrationStep, tuple[float, ...]]] = {
     CalibrationStep.LEVEL: (0.0, 0.0, 0.0, 0.0, 2.0),
 }
 """Of the command."""
-CALIBRATE: Final = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
 
 
 class RunState(StrEnum):
@@ -152,9 +149,6 @@ class Residual:
     unit: str
     before: float
     after: float
-
-
-_Vector = tuple[float, float, float]
 
 
 @dataclass(slots=True)

@@ -30,6 +30,11 @@ UNIT_TEXTS: Final = {
     "deg": "°", "deg/s": "°/s", "m/s/s": "m/s²", "m/s2": "m/s²", "m/s^2": "m/s²", "uT": "µT",
     "degC": "°C", "us": "µs", "m2": "m²",
 }  # fmt: skip
+FIRST_ROWS: Final = 256
+MAX_KINDS: Final = 200
+"""Messages of one aircraft, instances counted apart; more are forged."""
+MAX_ARRAY: Final = 32
+"""Longer arrays are files and logs, not quantities."""
 
 
 def parameter_unit(unit: str) -> tuple[float, str]:
@@ -40,13 +45,6 @@ def parameter_unit(unit: str) -> tuple[float, str]:
 def shown_unit(unit: str) -> tuple[float, str]:
     """Return the factor and the unit in which a field of a MAVLink unit is shown."""
     return SHOWN_UNITS.get(unit) or parameter_unit(unit)
-
-
-FIRST_ROWS: Final = 256
-MAX_KINDS: Final = 200
-"""Messages of one aircraft, instances counted apart; more are forged."""
-MAX_ARRAY: Final = 32
-"""Longer arrays are files and logs, not quantities."""
 
 
 class FieldHistory:

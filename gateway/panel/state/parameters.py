@@ -30,6 +30,29 @@ MAX_READS: Final = 6
 """Half a minute: a radio link may be silent for so long."""
 MAX_FILE: Final = 4_000_000
 """Metadata of the largest autopilots has two; more is refused."""
+GENERAL_PATHS: Final = ("/general.json", "/etc/extras/component_general.json.xz")
+"""Default paths of the general metadata file."""
+TYPE_PARAMETER: Final = 1
+MAX_PLAIN: Final = 16_000_000
+"""Limit of an unpacked metadata file, against decompression bombs."""
+RENAMED: Final = {
+    "short": "shortDesc", "long": "longDesc", "unit": "units", "low": "min", "high": "max",
+    "choices": "values",
+}  # fmt: skip
+QUIET_US: Final = US_PER_S
+MISSING_AT_ONCE: Final = 20
+MAX_ATTEMPTS: Final = 5
+MAX_PARAMETERS: Final = 5000
+"""Large autopilots have some 1500; more are forged."""
+NOT_REQUESTED: Final = 65_535
+"""The index of a value that was not requested by its index."""
+AUTOPILOT: Final = mavlink.MAV_COMP_ID_AUTOPILOT1
+ERRORS: Final = {
+    mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST: "there is no such parameter",
+    mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE: "the value is out of range",
+    mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED: "this client may not change parameters",
+    mavlink.MAV_PARAM_ERROR_READ_ONLY: "it is read-only",
+}
 
 
 @dataclass(slots=True)
@@ -141,24 +164,11 @@ class FileClient:
         )
 
 
-GENERAL_PATHS: Final = ("/general.json", "/etc/extras/component_general.json.xz")
-"""Default paths of the general metadata file."""
-TYPE_PARAMETER: Final = 1
-MAX_PLAIN: Final = 16_000_000
-"""Limit of an unpacked metadata file, against decompression bombs."""
-
-
 class ParameterChoice(msgspec.Struct, frozen=True):
     """One value of a parameter, and its meaning."""
 
     value: float
     description: str = ""
-
-
-RENAMED: Final = {
-    "short": "shortDesc", "long": "longDesc", "unit": "units", "low": "min", "high": "max",
-    "choices": "values",
-}  # fmt: skip
 
 
 class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True, rename=RENAMED):
@@ -209,23 +219,6 @@ def _parsed(content: bytes) -> Any:
 def _items(tree: Any, key: str) -> list[Mapping[str, Any]]:
     items = tree.get(key, []) if isinstance(tree, dict) else []
     return [item for item in items if isinstance(item, dict)] if isinstance(items, list) else []
-
-
-QUIET_US: Final = US_PER_S
-MISSING_AT_ONCE: Final = 20
-MAX_ATTEMPTS: Final = 5
-MAX_PARAMETERS: Final = 5000
-"""Large autopilots have some 1500; more are forged."""
-NOT_REQUESTED: Final = 65_535
-"""The index of a value that was not requested by its index."""
-AUTOPILOT: Final = mavlink.MAV_COMP_ID_AUTOPILOT1
-
-ERRORS: Final = {
-    mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST: "there is no such parameter",
-    mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE: "the value is out of range",
-    mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED: "this client may not change parameters",
-    mavlink.MAV_PARAM_ERROR_READ_ONLY: "it is read-only",
-}
 
 
 class ListState(StrEnum):

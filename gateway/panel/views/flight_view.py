@@ -18,6 +18,8 @@ from gateway.vehicle.plan import Location
 STYLES_S: Final = 2.0
 LEAFLET: Final = ui.leaflet
 """The map library is that of NiceGUI's own map, whose import registers it with the page."""
+THREE: Final = ui.scene
+"""The 3D library is that of NiceGUI's own scene, whose import registers it with the page."""
 
 
 class FlightMap(Element, component=WEB / "flight_map.js"):
@@ -100,10 +102,6 @@ async def _clear(context: ViewContext, _: Location) -> None:
         context.vehicle.exact_mark = None
         context.vehicle.state.fields.pop("NAV_CONTROLLER_OUTPUT", None)
     ui.notify("Mark cleared", type="positive")
-
-
-THREE: Final = ui.scene
-"""The 3D library is that of NiceGUI's own scene, whose import registers it with the page."""
 
 
 class FlightDisplay(Element, component=WEB / "flight_display.js"):

@@ -40,6 +40,7 @@ NODE_COLUMNS: Final = (
 )  # fmt: skip
 
 Record = Mapping[str, Any]
+_SHOWN: Final = ("HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT")
 
 
 class LinkView:
@@ -234,9 +235,6 @@ class LinkView:
             return UNKNOWN
         age_us = self._context.now_us - heard_us
         return (f"{age_us / US_PER_S:.1f} s ago", "bad" if age_us > SILENT_US else "")
-
-
-_SHOWN: Final = ("HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT")
 
 
 def _serial_line(status: Record) -> str:

@@ -27,6 +27,29 @@ from gateway.panel.widgets import DataTable, LiveChart, StripChart, allow, headi
 from gateway.printable import figure, printable, reason_of
 from gateway.units import counted
 
+QUANTITIES: Final = {
+    "roll_deg": ("Roll", "°", "ATTITUDE.roll", math.degrees(1.0)),
+    "pitch_deg": ("Pitch", "°", "ATTITUDE.pitch", math.degrees(1.0)),
+    "yaw_deg": ("Heading", "°", "ATTITUDE.yaw", math.degrees(1.0)),
+    "alt_amsl_m": ("Altitude", "m", "VFR_HUD.alt", 1.0),
+}
+"""Title, unit, and the aircraft's own field with its factor, by field of `Estimate`."""
+REFRESH_S: Final = 0.25
+MAX_ROWS: Final = 120
+"""More would be confusing; the search finds the others."""
+ALL: Final = "all groups"
+EFFECTS: Final = {
+    "attitude": ("ATTITUDE.roll", "ATTITUDE.pitch"),
+    "heading": ("ATTITUDE.yaw",),
+    "height": ("VFR_HUD.alt", "VFR_HUD.climb"),
+    "speed": ("VFR_HUD.groundspeed", "VFR_HUD.airspeed"),
+    "rates": ("ATTITUDE.rollspeed", "ATTITUDE.pitchspeed", "ATTITUDE.yawspeed"),
+    "acceleration": ("HIGHRES_IMU.xacc", "HIGHRES_IMU.yacc", "HIGHRES_IMU.zacc"),
+    "field": ("HIGHRES_IMU.xmag", "HIGHRES_IMU.ymag", "HIGHRES_IMU.zmag"),
+    "accuracy": ("ESTIMATOR_STATUS.pos_horiz_accuracy", "ESTIMATOR_STATUS.pos_vert_accuracy"),
+}
+"""Plots in which a change may show, by the label of the choice."""
+
 
 class ParameterRow:
     """A row, built at the current place of the page."""
@@ -131,15 +154,6 @@ def range_of(meta: ParameterMeta) -> str:
         words = (each.description for each in meta.choices if each.value == meta.default)
         parts.append(f"default {next(words, '') or f'{default:.5g}'}")
     return " · ".join(parts)
-
-
-QUANTITIES: Final = {
-    "roll_deg": ("Roll", "°", "ATTITUDE.roll", math.degrees(1.0)),
-    "pitch_deg": ("Pitch", "°", "ATTITUDE.pitch", math.degrees(1.0)),
-    "yaw_deg": ("Heading", "°", "ATTITUDE.yaw", math.degrees(1.0)),
-    "alt_amsl_m": ("Altitude", "m", "VFR_HUD.alt", 1.0),
-}
-"""Title, unit, and the aircraft's own field with its factor, by field of `Estimate`."""
 
 
 class ComparisonCard:
@@ -256,24 +270,6 @@ def _rms(estimate: Estimate, key: str, flown: tuple[str, IntArray, FloatArray]) 
     if key.endswith("_deg"):
         apart = wrap_180(apart)
     return rms(apart)
-
-
-REFRESH_S: Final = 0.25
-MAX_ROWS: Final = 120
-"""More would be confusing; the search finds the others."""
-ALL: Final = "all groups"
-
-EFFECTS: Final = {
-    "attitude": ("ATTITUDE.roll", "ATTITUDE.pitch"),
-    "heading": ("ATTITUDE.yaw",),
-    "height": ("VFR_HUD.alt", "VFR_HUD.climb"),
-    "speed": ("VFR_HUD.groundspeed", "VFR_HUD.airspeed"),
-    "rates": ("ATTITUDE.rollspeed", "ATTITUDE.pitchspeed", "ATTITUDE.yawspeed"),
-    "acceleration": ("HIGHRES_IMU.xacc", "HIGHRES_IMU.yacc", "HIGHRES_IMU.zacc"),
-    "field": ("HIGHRES_IMU.xmag", "HIGHRES_IMU.ymag", "HIGHRES_IMU.zmag"),
-    "accuracy": ("ESTIMATOR_STATUS.pos_horiz_accuracy", "ESTIMATOR_STATUS.pos_vert_accuracy"),
-}
-"""Plots in which a change may show, by the label of the choice."""
 
 
 class TuningView:
