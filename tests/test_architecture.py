@@ -191,6 +191,37 @@ def lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
 
 
+def late_constants(tree: ast.Module) -> list[str]:
+    """Return the constants below a definition that use no name bound since the first one."""
+    bound: set[str] = set()
+    found: list[str] = []
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            bound.add(node.name)
+        elif bound and isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            parts = [part for target in targets for part in ast.walk(target)]
+            names = [part.id for part in parts if isinstance(part, ast.Name)]
+            # The body of a lambda is evaluated later.
+            bodies = [each.body for each in ast.walk(node) if isinstance(each, ast.Lambda)]
+            later = {id(part) for body in bodies for part in ast.walk(body)}
+            used = {
+                part.id
+                for part in ast.walk(node)
+                if isinstance(part, ast.Name) and id(part) not in later
+            }
+            if bound & used or any(isinstance(part, ast.Attribute) for part in parts):
+                bound.update(names)
+            else:
+                found += names
+    return found
+
+
+def test_constants_stand_at_the_head_of_a_file() -> None:
+    late = {names_of([path])[0]: late_constants(tree_of(path)) for path in SOURCES}
+    assert {path: names for path, names in late.items() if names} == {}
+
+
 def test_functions_have_at_most_40_lines() -> None:
     long = {
         f"{path.relative_to(ROOT)}: {node.name}": lines_of(node)
