@@ -5,6 +5,7 @@ loses whole messages, and the next ones are newer.
 """
 
 import asyncio
+import os
 import ssl
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -108,8 +109,7 @@ class Carrier:
     async def _connect(self, loop: asyncio.AbstractEventLoop) -> None:
         host, port = self._inner.host, self._inner.port
         if self._kind == EndpointKind.SERIAL:
-            line = serial.Serial(host, port, timeout=0, write_timeout=0, exclusive=True)
-            await loop.connect_write_pipe(lambda: _Link(self), line)
+            self.add(SerialLine(host, port, self.lose))
         elif self._kind == LISTEN:
             self._server = await loop.create_server(lambda: _Link(self), host, port)
         elif self._kind in DATAGRAMS:
@@ -156,6 +156,41 @@ class _Link(asyncio.Protocol, asyncio.DatagramProtocol):
 
     def error_received(self, error: Exception) -> None:
         self._carrier.refuse(error)
+
+
+class SerialLine:
+    """A serial port that is only written; bytes that it has no room for wait here.
+
+    Not a pipe of the event loop: uvloop closes its descriptor, which pyserial then closes again.
+
+    Raises OSError or ValueError if it cannot be opened.
+    """
+
+    def __init__(
+        self, device: str, baud: int, lose: Callable[[Any, Exception | None], None]
+    ) -> None:
+        self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
+        self._lose = lose
+        self._waiting = b""
+
+    def get_write_buffer_size(self) -> int:
+        """Return the number of bytes that wait."""
+        return len(self._waiting)
+
+    def write(self, data: bytes) -> None:
+        """Write as much as there is room for."""
+        self._waiting += data
+        try:
+            self._waiting = self._waiting[os.write(self._port.fileno(), self._waiting) :]
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self._lose(self, error)
+            self.abort()
+
+    def abort(self) -> None:
+        """Close the port."""
+        self._port.close()
 
 
 def client_context(authority: str, certificate: str, key: str) -> ssl.SSLContext:
