@@ -48,22 +48,49 @@ MAX_EXPORTED: Final = 1 << 29
 that is being made, a role uses at most 1 GiB."""
 MEASURED_S: Final = 0.25
 """Between two measurements of an export that is being made."""
+ANONYMISED: Final = "anonymised"
 INDEX_AGAIN_S: Final = 20.0
 """Shortest time between two indexings."""
 FORMATS: Final = {
-    "csv": ("CSV table", "convert", ".csv"),
-    "tlog": ("tlog", "convert", ".tlog"),
-    "kml": ("KML (Google Earth)", "convert", ".kml"),
-    "gpx": ("GPX", "convert", ".gpx"),
-    "mcap": ("MCAP (Foxglove)", "convert", ".mcap"),
-    "page": ("Page (one HTML file)", "page", ".html"),
-    "report": ("Report (figures and tables)", "report", ".zip"),
+    "csv": ("CSV table", ("convert", "-o"), ".csv"),
+    "tlog": ("tlog", ("convert", "-o"), ".tlog"),
+    "kml": ("KML (Google Earth)", ("convert", "-o"), ".kml"),
+    "gpx": ("GPX", ("convert", "-o"), ".gpx"),
+    "mcap": ("MCAP (Foxglove)", ("convert", "-o"), ".mcap"),
+    "page": ("Page (one HTML file)", ("page", "-o"), ".html"),
+    "report": ("Report (figures and tables)", ("report", "-o"), ".zip"),
 }
-"""Title, command and ending of the file of each export."""
+"""Title, command and ending of the file of each export; the command ends with the option of the
+file."""
+CUTS: Final = {
+    "cut": ("Cut to a tlog", ("convert", "-o"), ".tlog"),
+    ANONYMISED: ("Anonymised tlog", ("convert", "--anonymise", "-o"), ".tlog"),
+}
+"""The same of tlogs that are made of a part of a recording."""
+EXTRACTS: Final = {
+    "params": ("Parameters", ("extract", "--params"), ".param"),
+    "plan": ("Mission, fence, rally", ("extract", "--mission"), ".plan"),
+    "texts": ("Texts", ("extract", "--texts"), ".csv"),
+    "events": ("Events", ("extract", "--events"), ".csv"),
+}
+"""The same of what is extracted of one vehicle."""
+KINDS: Final = FORMATS | CUTS | EXTRACTS
 
 
 class ExportError(Exception):
     """A recording cannot be exported; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What is to be made of a recording."""
+
+    folder: Path
+    name: str
+    kind: str
+    """One of `KINDS`."""
+    options: tuple[str, ...] = ()
+    """Further ones of its command, checked by the caller."""
 
 
 @dataclass(eq=False)
@@ -107,19 +134,19 @@ class RecordingJobs:
         self._indexed, self._indexed_s = state, time.monotonic()
         self._indexing = asyncio.get_running_loop().create_task(self._index(folder))
 
-    async def export(self, folder: Path, name: str, kind: str, holder: Holder = LOCAL) -> str:
+    async def export(self, order: Order, holder: Holder = LOCAL) -> str:
         """Export a recording, and return the address of the file; an equal one is used again.
 
         Raises ExportError if it cannot be made; RecordingError if there is no such recording.
         """
-        recording = find_recording(folder, name)
-        key = (holder.role, folder, name, kind, recording.size, recording.modified_s)
+        recording = find_recording(order.folder, order.name)
+        key = (holder.role, order, recording.size, recording.modified_s)
         export = self._exports.get(key)
         if export is None:
             if not self._places.admit(key, holder):
                 raise ExportError("other exports are being made; try again in a while")
             export = self._exports[key] = _Export(holder.role)
-            export.task = asyncio.create_task(self._export(key, export, folder, name, kind))
+            export.task = asyncio.create_task(self._export(key, export, order))
         task = export.task
         assert task is not None
         export.users += 1
@@ -161,9 +188,7 @@ class RecordingJobs:
         if export.users <= 0:
             self._delete(key, export)
 
-    async def _export(
-        self, key: Hashable, export: _Export, folder: Path, name: str, kind: str
-    ) -> Path:
+    async def _export(self, key: Hashable, export: _Export, order: Order) -> Path:
         if self._folder is None:
             self._folder = Path(tempfile.mkdtemp(prefix="mavgate-export-"))
         token = secrets.token_urlsafe(16)
@@ -171,7 +196,7 @@ class RecordingJobs:
         try:
             async with self._exporting[export.role]:
                 work.mkdir()
-                target = await _make(folder, work, name, kind)
+                target = await _make(work, order)
         except BaseException:
             # Half a file of a large recording may take gigabytes.
             shutil.rmtree(work, ignore_errors=True)
@@ -209,15 +234,17 @@ class RecordingJobs:
             log.info("the recordings in %s are not indexed: %s", folder, error)
 
 
-async def _make(folder: Path, work: Path, name: str, kind: str) -> Path:
+async def _make(work: Path, order: Order) -> Path:
     """Export a recording into an empty folder, and return the only file in it."""
-    _, command, suffix = FORMATS[kind]
-    target = work / f"{name}{suffix}"
+    folder, name, kind = order.folder, order.name, order.kind
+    _, (command, *of_file), suffix = KINDS[kind]
+    # The name of a recording holds its date, and may hold its place.
+    target = work / f"{ANONYMISED if kind == ANONYMISED else name}{suffix}"
     output = work / name if kind == "report" else target
     # Settings with the folder of the recordings, which commands take names from.
     config = work / "settings.toml"
     config.write_text(f"[recording]\nfolder = {json.dumps(str(folder), ensure_ascii=False)}\n")
-    arguments = ["--config", str(config), "-o", str(output), "--", name]
+    arguments = ["--config", str(config), *order.options, *of_file, str(output), "--", name]
     await _run([*own_command(command), *arguments], work)
     config.unlink()
     if kind == "report":

@@ -235,6 +235,7 @@ def test_recording_is_saved_downloaded_uploaded_played_and_deleted(
         tlog = next(name for name in names if name.endswith(".tlog"))
         (tmp_path / "evening_01.tlog").write_bytes(packed.read(tlog))
     assert {"morning flight_01_v1.csv", "morning flight_01_v2.csv"} <= set(names)
+    _cut_and_extract(page, row)
     view.get_by_label("Upload a recording").set_input_files(tmp_path / "evening_01.tlog")
     brought = view.locator("tr[data-key='evening']")
     expect(brought).to_be_visible()
@@ -247,6 +248,25 @@ def test_recording_is_saved_downloaded_uploaded_played_and_deleted(
         page.locator(".asks").get_by_role("button", name="Delete").click()
         expect(view.locator(f"tr[data-key='{name}']")).to_have_count(0)
         expect(page.locator(".asks")).to_have_count(0)
+
+
+def _cut_and_extract(page: Page, row: object) -> None:
+    cut = row.get_by_label("Cut or extract")  # type: ignore[attr-defined]
+    cut.click()
+    dialog = page.locator(".asks")
+    dialog.get_by_label("From").fill("soon")
+    dialog.get_by_role("button", name="Cut to a tlog").click()
+    expect(page.get_by_text("invalid time 'soon'")).to_be_visible()
+    cut.click()
+    dialog.get_by_label("To").fill("1.5")
+    with page.expect_download(timeout=60_000) as waiting:
+        dialog.get_by_role("button", name="Anonymised tlog").click()
+    assert waiting.value.suggested_filename == "anonymised.tlog"
+    cut.click()
+    dialog.get_by_label("Vehicle").fill("1")
+    with page.expect_download(timeout=60_000) as waiting:
+        dialog.get_by_role("button", name="Parameters").click()
+    assert waiting.value.suggested_filename == "morning flight.param"
 
 
 def _move_in_time(page: Page, row: object) -> None:

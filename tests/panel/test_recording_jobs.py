@@ -9,7 +9,7 @@ import pytest
 from gateway.batch.catalogue import FlightFigures
 from gateway.panel import recording_jobs
 from gateway.panel.admission import Holder, Role
-from gateway.panel.recording_jobs import FORMATS, ExportError, RecordingJobs
+from gateway.panel.recording_jobs import FORMATS, ExportError, Order, RecordingJobs
 from gateway.panel.recording_search import RecordingFacts
 from gateway.recordings.index import RecordingError, list_recordings
 from gateway.recordings.tlog import encode_record
@@ -36,13 +36,32 @@ async def test_export_is_fetched_under_an_unguessable_address(
 ) -> None:
     jobs = RecordingJobs()
     async with client_of(jobs.serve) as client:
-        url = await jobs.export(exported, NAME, kind)
+        url = await jobs.export(Order(exported, NAME, kind))
         answer = await client.get(url)
         assert answer.content.startswith(begin)
         assert FORMATS[kind][2] in answer.headers["content-disposition"]
         assert (await client.get("/exports/guessed")).status_code == 404
         jobs.close()
         assert (await client.get(url)).status_code == 404
+
+
+@pytest.mark.slow
+async def test_part_of_a_recording_is_cut_anonymised_and_extracted(exported: Path) -> None:
+    jobs, found = RecordingJobs(), {}
+    async with client_of(jobs.serve) as client:
+        whole = [("cut", ()), ("cut", ("--to=10",)), ("anonymised", ()), ("texts", ("--system=3",))]
+        for kind, options in whole:
+            answer = await client.get(await jobs.export(Order(exported, NAME, kind, options)))
+            found[kind, options] = answer.content
+            is_named = "flight" in answer.headers["content-disposition"]
+            assert is_named == (kind != "anonymised")
+        with pytest.raises(ExportError, match="no parameters"):
+            await jobs.export(Order(exported, NAME, "params", ("--system=3",)))
+    jobs.close()
+    assert found["cut", ()] == (exported / f"{NAME}_01.tlog").read_bytes()
+    assert found["cut", ()].startswith(found["cut", ("--to=10",)])
+    assert len(found["cut", ("--to=10",)]) < len(found["cut", ()]) == len(found["anonymised", ()])
+    assert found["texts", ("--system=3",)].startswith(b"time,system,component")
 
 
 @pytest.mark.slow
@@ -53,13 +72,13 @@ async def test_failed_export_reports_the_reason_and_leaves_no_file(
     (exported / "broken_01.tlog").write_bytes(b"no recording at all\n" * 10)
     jobs = RecordingJobs()
     with pytest.raises(ExportError, match="broken_01"):
-        await jobs.export(exported, "broken", "kml")
+        await jobs.export(Order(exported, "broken", "kml"))
     with pytest.raises(RecordingError):
-        await jobs.export(exported, "../../etc/passwd", "kml")
+        await jobs.export(Order(exported, "../../etc/passwd", "kml"))
     monkeypatch.setattr(recording_jobs, "EXPORT_S", 0.05)
     with pytest.raises(ExportError, match=r"not finished after .* another format"):
-        await jobs.export(exported, NAME, "report")
-    cancelled = asyncio.create_task(jobs.export(exported, NAME, "page"))
+        await jobs.export(Order(exported, NAME, "report"))
+    cancelled = asyncio.create_task(jobs.export(Order(exported, NAME, "page")))
     # Its command runs as soon as its folder holds the settings.
     async with asyncio.timeout(60.0):
         while not list(tmp_path.glob("mavgate-export-*/*/settings.toml")):
@@ -80,7 +99,7 @@ async def test_export_that_writes_too_much_is_stopped_and_deleted(
     monkeypatch.setattr(recording_jobs, "own_command", lambda _: ["sh", "-c", endless])
     jobs = RecordingJobs()
     with pytest.raises(ExportError, match="larger than 1 MB, and stopped: choose a shorter"):
-        await jobs.export(exported, NAME, "csv")
+        await jobs.export(Order(exported, NAME, "csv"))
     assert list(tmp_path.glob("mavgate-export-*/*")) == []
     jobs.close()
 
@@ -90,9 +109,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Exports are made at once, and listed."""
     names: list[str] = []
 
-    async def make(folder: Path, work: Path, name: str, kind: str) -> Path:
-        names.append(kind)
-        target = work / f"{name}.{kind}"
+    async def make(work: Path, order: Order) -> Path:
+        names.append(order.kind)
+        target = work / f"{order.name}.{order.kind}"
         target.write_bytes(bytes(1000))
         return target
 
@@ -109,13 +128,13 @@ async def test_exports_of_a_viewer_keep_no_operator_waiting(
     jobs = RecordingJobs()
     async with asyncio.timeout(60.0), jobs._exporting[Role.VIEWER]:
         waiting = [
-            asyncio.create_task(jobs.export(exported, NAME, kind, VIEWER))
+            asyncio.create_task(jobs.export(Order(exported, NAME, kind), VIEWER))
             for kind in ("kml", "gpx")
         ]
         await asyncio.sleep(0)
         with pytest.raises(ExportError, match="other exports"):
-            await jobs.export(exported, NAME, "csv", VIEWER)
-        await jobs.export(exported, NAME, "csv")
+            await jobs.export(Order(exported, NAME, "csv"), VIEWER)
+        await jobs.export(Order(exported, NAME, "csv"))
     await asyncio.gather(*waiting)
     assert made == ["csv", "kml", "gpx"]
     jobs.close()
@@ -127,7 +146,7 @@ async def test_equal_export_is_made_once_and_deleted_after_the_last_fetch(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     jobs = RecordingJobs()
     first, second = await asyncio.gather(
-        *(jobs.export(exported, NAME, "kml", VIEWER) for _ in range(2))
+        *(jobs.export(Order(exported, NAME, "kml"), VIEWER) for _ in range(2))
     )
     assert (first, made) == (second, ["kml"])
     async with client_of(jobs.serve) as client:
@@ -143,7 +162,7 @@ async def test_bytes_of_exports_are_bounded(
     monkeypatch.setattr(recording_jobs, "MAX_EXPORTED", 2500)
     jobs = RecordingJobs()
     for kind in ("csv", "kml", "gpx", "page"):
-        await jobs.export(exported, NAME, kind, VIEWER)
+        await jobs.export(Order(exported, NAME, kind), VIEWER)
     kept = sorted(file.suffix for file in tmp_path.glob("mavgate-export-*/*/*"))
     assert kept == [".gpx", ".page"]
     jobs.close()

@@ -1,6 +1,7 @@
 """View 4: recordings."""
 
 import asyncio
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from typing import Final
@@ -11,7 +12,7 @@ from nicegui import ui
 from gateway.batch.catalogue import FlightFigures
 from gateway.panel.access import RECORDINGS
 from gateway.panel.player_bar import open_playback
-from gateway.panel.recording_jobs import FORMATS
+from gateway.panel.recording_jobs import CUTS, EXTRACTS, FORMATS, KINDS, ExportError, Order
 from gateway.panel.recording_search import RecordingFacts
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets import (
@@ -29,12 +30,14 @@ from gateway.panel.widgets import (
 )
 from gateway.printable import figure, printable
 from gateway.recordings.index import Recording, delete_recording, list_recordings
+from gateway.recordings.moment import parse_moment
 from gateway.units import counted
 
 REFRESH_S: Final = 1.0
 IDLE: Final = "idle"
 MUCH_LOST: Final = 0.05
 """A share of lost samples that a pilot should see."""
+ARMED_OPTIONS: Final = ("--while=armed", "--margin=10")
 FACTS: Final = ("Duration", "Distance", "Height", "Loss")
 
 
@@ -71,6 +74,7 @@ class RecordingsView:
         buttons += [RowButton("download", "Download", self._download)]
         buttons += [RowButton("share", "Export", self._ask_export)]
         if self._context.may_change:
+            buttons += [RowButton("content_cut", "Cut or extract", self._ask_part)]
             buttons += [RowButton("delete", "Delete", self._ask_delete)]
         return buttons
 
@@ -122,12 +126,53 @@ class RecordingsView:
                 export = close_and(dialog, partial(self._export, name, kind))
                 ui.button(label, on_click=export).props("no-caps outline")
 
-    async def _export(self, name: str, kind: str) -> None:
+    def _ask_part(self, name: str) -> None:
+        """Ask for a part of a recording: a cut or anonymised tlog, or what is extracted."""
+        with asking(f"Cut or extract {name}") as dialog:
+            with ui.element("div").classes("line"):
+                begin = ui.input("From", placeholder="1:20").props("dense outlined")
+                end = ui.input("To", placeholder="2026-06-11T14:25:30Z").props("dense outlined")
+            armed = ui.checkbox("Only while armed, and 10 s around")
+
+            def cut_options() -> tuple[str, ...]:
+                limits = (("--from", begin.value), ("--to", end.value))
+                given = [(option, text) for option, text in limits if text]
+                try:
+                    for _, text in given:
+                        parse_moment(text)
+                except ValueError as error:
+                    raise ExportError(str(error)) from error
+                found = tuple(f"{option}={text}" for option, text in given)
+                return found + (ARMED_OPTIONS if armed.value else ())
+
+            for kind, (label, *_) in CUTS.items():
+                make = close_and(dialog, partial(self._make_part, name, kind, cut_options))
+                ui.button(label, on_click=make).props("no-caps outline")
+            number = ui.number("Vehicle", min=1, max=255, precision=0)
+            number.props("dense outlined")
+
+            def extract_options() -> tuple[str, ...]:
+                return () if number.value is None else (f"--system={int(number.value)}",)
+
+            for kind, (label, *_) in EXTRACTS.items():
+                make = close_and(dialog, partial(self._make_part, name, kind, extract_options))
+                ui.button(label, on_click=make).props("no-caps outline")
+
+    async def _make_part(
+        self, name: str, kind: str, options: Callable[[], tuple[str, ...]]
+    ) -> None:
+        with notify_failure(self._context):
+            self._context.check_may_change()
+            await self._export(name, kind, options())
+
+    async def _export(self, name: str, kind: str, options: tuple[str, ...] = ()) -> None:
         parts = self._context.parts
-        text = f"{name}: making {FORMATS[kind][0]} …"
+        text = f"{name}: making {KINDS[kind][0]} …"
         with notify_failure(self._context), progress_shown(text):
             holder = parts.pages.holder(self._context.page)
-            url = await parts.jobs.export(parts.recordings_folder, name, kind, holder)
+            url = await parts.jobs.export(
+                Order(parts.recordings_folder, name, kind, options), holder
+            )
             ui.download.from_url(url)
 
     async def _open(self, name: str) -> None:
