@@ -11,6 +11,7 @@ import logging
 import os
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -20,7 +21,7 @@ from gateway.live.part import TLOG
 from gateway.live.part_files import free_bytes_near
 from gateway.output import sync_folder
 from gateway.recordings.table import HEADER_PREFIX, TableHeader, encode_line
-from gateway.recordings.tlog import TlogScanner
+from gateway.recordings.tlog import Batch, TlogScanner
 
 log = logging.getLogger(__name__)
 
@@ -96,8 +97,12 @@ def clear_copies(folder: Path) -> None:
 def _shifted_tlog(file: BinaryIO, shift_us: int) -> Iterator[bytes]:
     scanner = TlogScanner()
     while data := file.read(STEP):
-        yield scanner.feed(data).shifted(shift_us)
-    yield scanner.feed(b"", final=True).shifted(shift_us)
+        yield _shifted_batch(scanner.feed(data), shift_us)
+    yield _shifted_batch(scanner.feed(b"", final=True), shift_us)
+
+
+def _shifted_batch(batch: Batch, shift_us: int) -> bytes:
+    return replace(batch, time_us=batch.time_us + shift_us).encoded()
 
 
 def _shifted_table(file: BinaryIO, shift_us: int) -> Iterator[bytes]:

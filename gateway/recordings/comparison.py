@@ -17,7 +17,7 @@ from gateway.recordings.tlog_scan import TIME_SIZE
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.units import US_PER_S
-from gateway.vehicle.plan import FENCE, MISSION, RALLY, Item
+from gateway.vehicle.plan import KINDS, Item
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import SEQUENCE_V1, SEQUENCE_V2, START_V2
 
@@ -27,7 +27,6 @@ MAX_TEXTS: Final = 10_000
 """Different texts of a recording that are compared."""
 ERROR: Final = 3
 """MAV_SEVERITY of an error; smaller ones are worse."""
-KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally points"}
 VIBRATION: Final = ("vibration_x", "vibration_y", "vibration_z")
 _IDS: Final = {name: MESSAGE_IDS[name] for name in ("BATTERY_STATUS", "VIBRATION", "GPS_RAW_INT")}
 UNKNOWN_U8: Final = 0xFF

@@ -9,6 +9,9 @@ from gateway.units import US_PER_S
 
 MAX_TEXT: Final = 40
 USE: Final = "use 80, 1:20 or 2026-06-11T14:25:30Z"
+FIRST_US: Final = 0
+LAST_US: Final = 253_402_300_799 * US_PER_S
+"""The ends of the calendar that other programs read: 1970 to 9999."""
 _CLOCK: Final = re.compile(r"([+-]?)(?:(\d+):)?(?:(\d+):)?(\d+(?:\.\d*)?|\.\d+)\s*s?")
 
 
@@ -54,3 +57,10 @@ def time_us_of(moment: Moment, first_us: int) -> int:
     if moment.time_us is not None:
         return moment.time_us
     return first_us + round((moment.offset_s or 0.0) * US_PER_S)
+
+
+def iso_time(unix_us: int) -> str:
+    """Write a time as ISO 8601; one beyond the calendar as its nearest end."""
+    seconds, fraction_us = divmod(min(max(unix_us, FIRST_US), LAST_US), US_PER_S)
+    moment = datetime.fromtimestamp(seconds, UTC)
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{fraction_us // 1000:03d}Z"

@@ -4,27 +4,29 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from dataclasses import dataclass
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.newest import mode_name
-from gateway.recordings.positions import GroundDistance
+from gateway.printable import UNKNOWN, figure
+from gateway.recordings.moment import iso_time
+from gateway.recordings.newest import NewestState, mode_name
+from gateway.recordings.positions import GroundDistance, Position
 from gateway.recordings.tlog import HEARTBEAT_ID
 from gateway.recordings.vehicle_reader import VehicleMessage
+from gateway.records import NAN
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES
 
-SYS_STATUS_ID: Final = MESSAGE_IDS["SYS_STATUS"]
 REACHED_ID: Final = MESSAGE_IDS["MISSION_ITEM_REACHED"]
 LANDED_ID: Final = MESSAGE_IDS["EXTENDED_SYS_STATE"]
 CAMERA_FEEDBACK_ID: Final = MESSAGE_IDS["CAMERA_FEEDBACK"]
 CAPTURED_ID: Final = MESSAGE_IDS["CAMERA_IMAGE_CAPTURED"]
 WANTED: Final = (
     HEARTBEAT_ID,
-    SYS_STATUS_ID,
+    MESSAGE_IDS["SYS_STATUS"],
+    MESSAGE_IDS["BATTERY_STATUS"],
     REACHED_ID,
     LANDED_ID,
     CAMERA_FEEDBACK_ID,
@@ -45,12 +47,6 @@ def _mode_of(fields: Any) -> str:
     return mode_name(fields["autopilot"], fields["type"], number) or str(number)
 
 
-def moment_text(time_us: int) -> str:
-    """Return a time as ISO 8601 in UTC with milliseconds."""
-    moment = datetime.fromtimestamp(time_us / US_PER_S, UTC)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
 def rows_of(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
     """Write rows as CSV below the names of their columns."""
     text = io.StringIO()
@@ -63,7 +59,7 @@ def rows_of(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterato
 def texts(messages: Iterable[VehicleMessage]) -> Iterator[str]:
     """Write the texts as CSV, with their time, sender and severity."""
     found = [
-        (moment_text(m.time_us), m.text.origin >> 8, m.text.origin & 0xFF, m.text.severity,
+        (iso_time(m.time_us), m.text.origin >> 8, m.text.origin & 0xFF, m.text.severity,
          m.text.text)
         for m in messages
         if m.text is not None
@@ -79,7 +75,7 @@ def events(messages: Iterable[VehicleMessage]) -> Iterator[str]:
         for kind, value in _event_values(message):
             if kind == "reached" or state.get((message.system_id, kind)) != value:
                 state[message.system_id, kind] = value
-                found.append((moment_text(message.time_us), message.system_id, kind, value))
+                found.append((iso_time(message.time_us), message.system_id, kind, value))
     return rows_of(("time", "system", "event", "value"), found)
 
 
@@ -99,7 +95,7 @@ def images(messages: Iterable[VehicleMessage]) -> Iterator[str]:
     """Write the location of each image as CSV: angles of CAMERA_FEEDBACK, names of the other."""
     found: list[tuple[object, ...]] = []
     for message in messages:
-        fields, at = message.fields, moment_text(message.time_us)
+        fields, at = message.fields, iso_time(message.time_us)
         if message.message_id == CAMERA_FEEDBACK_ID:
             found.append((
                 at, message.system_id, fields["img_idx"], "", fields["lat"] / 1e7,
@@ -117,45 +113,37 @@ def images(messages: Iterable[VehicleMessage]) -> Iterator[str]:
     return rows_of(columns, found)
 
 
-@dataclass(slots=True)
 class _Shown:
     """The newest state of the vehicle for subtitles."""
 
-    mode: str = ""
-    height: str = ""
-    speed: str = ""
-    battery: str = ""
-    coordinates: str = ""
-    newest_us: int = 0
-    ground: GroundDistance = field(default_factory=GroundDistance)
+    def __init__(self) -> None:
+        self.newest_us = 0
+        self._state, self._ground = NewestState(), GroundDistance()
+        self._at: Position | None = None
 
-    @property
-    def distance(self) -> str:
-        """The distance flown."""
-        distance_m = self.ground.distance_m
-        return "" if distance_m is None else f"{distance_m:.0f} m flown"
-
-    def update(self, message: VehicleMessage) -> None:
+    def feed(self, message: VehicleMessage) -> None:
         """Process the next message of the vehicle."""
         self.newest_us = message.time_us
-        fields, at = message.fields, message.position
-        if message.message_id == HEARTBEAT_ID:
-            self.mode = _mode_of(fields)
-        elif message.message_id == SYS_STATUS_ID:
-            volts, percent = fields["voltage_battery"], fields["battery_remaining"]
-            self.battery = f"{volts / 1e3:.1f} V" if volts not in (0, 0xFFFF) else ""
-            self.battery += f" {percent} %" if percent >= 0 else ""
-        if at is not None:
-            self.ground.update(message.time_us, at.lat_deg, at.lon_deg, message.boot_us)
-            self.coordinates = f"{at.lat_deg:.6f}, {at.lon_deg:.6f}"
-            height_m = at.alt_home_m if math.isfinite(at.alt_home_m) else at.alt_amsl_m
-            self.height = f"{height_m:.1f} m" if math.isfinite(height_m) else ""
-            speed_mps = at.groundspeed_mps
-            self.speed = f"{speed_mps:.1f} m/s" if math.isfinite(speed_mps) else ""
+        self._state.update(MESSAGE_NAMES[message.message_id], message.fields, message.time_us)
+        if (at := message.position) is not None:
+            self._at = at
+            self._ground.update(message.time_us, at.lat_deg, at.lon_deg, message.boot_us)
 
     def text(self, names: Sequence[str]) -> str:
         """Return one line of the chosen fields that are known."""
-        return "  ".join(shown for name in names if (shown := getattr(self, name)))
+        beat, at = self._state.fields.get("HEARTBEAT"), self._at or Position(NAN, NAN)
+        volts, percent = self._state.battery()
+        is_above_home = math.isfinite(at.alt_home_m)
+        known = {
+            "mode": [UNKNOWN if beat is None else _mode_of(beat)],
+            "height": [figure(at.alt_home_m if is_above_home else at.alt_amsl_m, ".1f", "m")],
+            "speed": [figure(at.groundspeed_mps, ".1f", "m/s")],
+            "distance": [figure(self._ground.distance_m, ".0f", "m flown")],
+            "battery": [figure(volts or NAN, ".1f", "V"), figure(percent, ".0f", "%")],
+            "coordinates": [f"{at.lat_deg:.6f}, {at.lon_deg:.6f}" if self._at else UNKNOWN],
+        }
+        texts = (" ".join(one for one in known[name] if one != UNKNOWN) for name in names)
+        return "  ".join(filter(None, texts))
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +177,7 @@ def subtitles(
             if (text := shown.text(names)) and now_us >= shown.newest_us:
                 yield Subtitle(number / rate_hz, (number + 1) / rate_hz, text)
             number += 1
-        shown.update(message)
+        shown.feed(message)
 
 
 def srt(found: Iterable[Subtitle]) -> Iterator[str]:

@@ -153,18 +153,6 @@ class Batch:
         begin = int(self.starts[index]) + TIME_SIZE
         return self.data[begin : begin + int(self.sizes[index])]
 
-    def shifted(self, shift_us: int) -> bytes:
-        """Return the bytes from the first record to the last, with all times moved."""
-        if not len(self):
-            return b""
-        begin = int(self.starts[0])
-        end = int(self.starts[-1]) + TIME_SIZE + int(self.sizes[-1])
-        shifted = np.frombuffer(self.data, np.uint8)[begin:end].copy()
-        times = np.maximum(self.time_us + shift_us, 0).astype(">u8")
-        indices = (self.starts - begin)[:, None] + np.arange(TIME_SIZE)
-        shifted[indices] = times.view(np.uint8).reshape(-1, TIME_SIZE)
-        return shifted.tobytes()
-
     def chosen(self, wanted: NDArray[np.bool_]) -> "Batch":
         """Return the batch with some of its records only; its damage is still listed."""
         if wanted.all():

@@ -7,12 +7,12 @@ not edited stays byte for byte.
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.recordings.anonymising import Anonymity
+from gateway.recordings.anonymising import Anonymiser, Anonymity
 from gateway.recordings.files import FlightError, Progress, TlogSource
 from gateway.recordings.merging import WINDOW_US, Alignment, Copies, batched, by_time
 from gateway.recordings.selection import FrameChoice, StateChoice, while_in_state, within
@@ -41,31 +41,11 @@ def first_position(sources: Sequence[TlogSource]) -> tuple[float, float] | None:
     return None
 
 
-class FrameEdit(Protocol):
-    """A change of single frames."""
-
-    def shift_us(self, batch: Batch) -> int:
-        """Return what is added to the recorded times of a batch; called before the others."""
-        ...
-
-    def affects(self, batch: Batch) -> BoolArray:
-        """Return which records of a batch may change."""
-        ...
-
-    def edit(self, frame: bytes) -> bytes | None:
-        """Return a frame after the change; None if it must be left out."""
-        ...
-
-
 class Renumbering:
     """Other system ids, in headers and in all fields that hold one."""
 
     def __init__(self, system_ids: Mapping[int, int]) -> None:
         self._system_ids = system_ids
-
-    def shift_us(self, batch: Batch) -> int:  # noqa: ARG002
-        """Return 0: times stay."""
-        return 0
 
     def affects(self, batch: Batch) -> BoolArray:
         """Return which records may hold a system id that changes."""
@@ -92,7 +72,7 @@ class TlogEdits:
     """Keep only the time while a vehicle is in a state."""
     merge: bool | None = None
     """Leave out copies of frames that several files hold; by default if the files overlap."""
-    frames: tuple[FrameEdit, ...] = ()
+    frames: tuple[Renumbering | Anonymiser, ...] = ()
     anonymity: Anonymity | None = None
     """Where and when to an anonymised recording is moved."""
 
@@ -171,9 +151,9 @@ class TlogEditor:
             self._remark(f"kept {kept} of {counted(total, 'record')}")
 
     def _edited(self, batch: Batch) -> bytes:
-        shift_us = sum(edit.shift_us(batch) for edit in self._edits.frames)
-        if shift_us:
-            batch = replace(batch, time_us=batch.time_us + shift_us)
+        for edit in self._edits.frames:
+            if isinstance(edit, Anonymiser):
+                batch = replace(batch, time_us=batch.time_us + edit.shift_us(batch))
         affected = [edit.affects(batch) for edit in self._edits.frames]
         if not len(batch) or not np.any(affected):
             return batch.encoded()

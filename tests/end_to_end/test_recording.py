@@ -11,8 +11,9 @@ import pytest
 from gateway.aircraft import Outputs
 from gateway.cli.live.demo import calibrated_aircraft
 from gateway.config import GatewaySettings
+from gateway.live import recorder as recorder_module
 from gateway.live.recorder import Recorder
-from gateway.live.session import RecordingSettings
+from gateway.live.session import Mode, RecordingSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.opening import TlogFile
@@ -79,11 +80,13 @@ class Flight:
 class Recording:
     """A recorder that is turned by hand."""
 
-    def __init__(self, folder: Path, clock: ManualClock, flight: Flight | None = None) -> None:
+    def __init__(
+        self, folder: Path, clock: ManualClock, flight: Flight | None = None, mode: Mode = "always"
+    ) -> None:
         self._clock = clock
         self._turned_us = clock()
         self.recorder = Recorder(
-            RecordingSettings(folder=str(folder), mode="always", free_floor_mb=0, rotate_mb=1),
+            RecordingSettings(folder=str(folder), mode=mode, free_floor_mb=0, rotate_mb=1),
             clock,
             lambda: START_UNIX_US + clock(),
             lambda vehicle_id: header_for(flight.aircraft[vehicle_id], vehicle_id),
@@ -182,3 +185,34 @@ async def test_table_alone_gives_recorded_states_bit_for_bit(
     done = invoke("fuse", paths[-1], "-o", out)
     assert done.exit_code == 0, done.output
     assert out.read_bytes() == paths[-1].read_bytes()
+
+
+async def test_table_that_begins_before_arming_is_fused_again_bit_for_bit(
+    tmp_path: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "HELD_US", 5_000_000)
+    flight = Flight("eskf", clock)
+    recording = Recording(tmp_path / "armed", clock, flight, mode="armed")
+    async with recording as recorder:
+        for out in flight.outputs():
+            for sent in out.frames:
+                recorder.frame(sent.frame)
+            for record in out.records:
+                if isinstance(record, FusedSample | BaroRaw | GpsFix):
+                    recorder.flight(record)
+            recorder.set_in_flight(in_flight=False, operates=clock() > 17_000_000)
+            await recording.turn()
+    (path,) = (tmp_path / "armed").glob("*.csv")
+    reader = TableReader()
+    times_us = [
+        event.time_us
+        for event in reader.feed(path.read_bytes(), final=True)
+        if isinstance(event, TableRow)
+    ]
+    assert 7_000_000 <= times_us[0] <= 12_000_000
+    assert times_us[-1] > 19_000_000
+    assert reader.header is not None
+    assert not reader.header.cold_start
+    done = invoke("fuse", path, "-o", path.with_name("again.csv"))
+    assert done.exit_code == 0, done.output
+    assert path.with_name("again.csv").read_bytes() == path.read_bytes()

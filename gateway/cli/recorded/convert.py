@@ -139,10 +139,14 @@ def convert(
     log or ULog holds the estimates and messages of its autopilot: `mavgate fuse` makes the same
     files of states that it computes from the samples.
     """
-    edits = _read_edits(
-        system, component, message, without, merge=merge, rename=rename,
-        state=_read_state(while_state, modes or [], margin_s),
-        anonymity=_read_anonymity(place, day, keep_unknown=keep_unknown, wanted=anonymise),
+    choice = FrameChoice(
+        frozenset(system or ()), frozenset(component or ()),
+        message_ids_of(message or ()), message_ids_of(without or ()),
+    )  # fmt: skip
+    edits = TlogEdits(
+        choice, _read_state(while_state, modes or [], margin_s), merge,
+        (Renumbering(_read_renames(rename)),) if rename else (),
+        _read_anonymity(place, day, keep_unknown=keep_unknown, wanted=anonymise),
     )  # fmt: skip
     _check_edits(edits, output, message or [], system or [])
     of_tlogs = output.suffix in FROM_TLOGS or message
@@ -181,28 +185,6 @@ def _write(
     by = "".join(f"; {fusion.summary}" for fusion in flight.fusions)
     console_of().print(f"{output}: {size / 1e6:.3f} MB{by}")
     return flight
-
-
-def _read_edits(
-    system: Sequence[int] | None,
-    component: Sequence[int] | None,
-    message: Sequence[str] | None,
-    without: Sequence[str] | None,
-    *,
-    merge: bool | None,
-    rename: Sequence[str] | None,
-    state: StateChoice | None,
-    anonymity: Anonymity | None,
-) -> TlogEdits:
-    """Read the options of a tlog that is made of tlogs; raises FlightError if one is invalid."""
-    choice = FrameChoice(
-        frozenset(system or ()),
-        frozenset(component or ()),
-        message_ids_of(message or ()),
-        message_ids_of(without or ()),
-    )
-    frames = (Renumbering(_read_renames(rename)),) if rename else ()
-    return TlogEdits(choice, state, merge, frames, anonymity)
 
 
 def _read_state(state: str | None, modes: Sequence[str], margin_s: float) -> StateChoice | None:

@@ -20,7 +20,7 @@ from gateway.cli.support.terminal import console_of, refuse
 from gateway.output import check_output, write_new
 from gateway.recordings.extracts import RecordedPlan, param_file, qgc_params, qgc_plan, waypoints
 from gateway.recordings.files import FlightError
-from gateway.recordings.moment import Moment, parse_moment, time_us_of
+from gateway.recordings.moment import Moment, iso_time, parse_moment, time_us_of
 from gateway.recordings.timed_extracts import (
     MAX_RATE_HZ,
     SUBTITLE_FIELDS,
@@ -28,21 +28,19 @@ from gateway.recordings.timed_extracts import (
     ass,
     events,
     images,
-    moment_text,
     srt,
     subtitles,
     texts,
 )
 from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.units import US_PER_S
-from gateway.vehicle.plan import FENCE, MISSION, RALLY
+from gateway.vehicle.plan import KINDS
 
 app = typer.Typer()
 
 ITEMS: Final = (".waypoints", ".plan")
 VIDEO_TIME: Final = re.compile(r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)")
 """A time of begin in the name of a video, as cameras write it."""
-NAMES: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally points"}
 
 
 def _out(name: str, text: str, endings: tuple[str, ...]) -> Any:
@@ -131,7 +129,7 @@ def _plans(
     plan, (params, *items) = recording.plan(), paths
     if params is not None:
         yield params, _params(params, plan)
-    for kind, path in zip((MISSION, FENCE, RALLY), items, strict=True):
+    for kind, path in zip(KINDS, items, strict=True):
         if path is not None:
             yield path, _items(path, plan, kind)
 
@@ -148,7 +146,7 @@ def _params(path: Path, plan: RecordedPlan) -> Iterable[str]:
 def _items(path: Path, plan: RecordedPlan, kind: int) -> Iterable[str]:
     items = plan.items(kind)
     if not items:
-        raise FlightError(f"the recording has no {NAMES[kind]} of this vehicle")
+        raise FlightError(f"the recording has no {KINDS[kind]} of this vehicle")
     return [qgc_plan(plan)] if path.suffix == ".plan" else waypoints(items)
 
 
@@ -168,7 +166,7 @@ def _video_begin(offset: str | None, video: Path | None) -> Moment:
     if video is None or begin.time_us is not None:
         return begin
     video_us = _video_time_us(video)
-    print_remarks([f"{video}: begins at {moment_text(video_us)}"])
+    print_remarks([f"{video}: begins at {iso_time(video_us)}"])
     return Moment(time_us=time_us_of(begin, video_us))
 
 

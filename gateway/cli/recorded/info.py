@@ -36,7 +36,6 @@ from gateway.recordings.index import Recording, list_recordings
 from gateway.recordings.moment import civil_time
 from gateway.recordings.summary import DAMAGED_TIME, FileInfo, VehicleInfo, describe
 from gateway.recordings.table import TableFault, TableHeader, TableReader, encode_block, encode_head
-from gateway.recordings.tlog import encode_record
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
@@ -153,7 +152,7 @@ def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[by
             report(f"at the end: {counted(batch.unfinished, 'byte')} of an incomplete record")
         if batch.mended:
             console_of().print(DAMAGED_TIME.format(counted(batch.mended, "record")))
-        yield b"".join(encode_record(record.time_us, record.frame) for record in batch.records())
+        yield batch.encoded()
         found = found or len(batch.starts) > 0
     if not found:
         raise FlightError(f"{file}: {NO_RECORDING}")

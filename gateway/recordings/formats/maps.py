@@ -6,7 +6,6 @@ import re
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from enum import StrEnum
 from itertools import chain, groupby
 from typing import Any, Final
@@ -16,6 +15,7 @@ from gateway.aircraft import AircraftSettings
 from gateway.geometry.quaternion import to_euler
 from gateway.recordings.answers import HOME_POSITION_ID
 from gateway.recordings.columns import TableRow
+from gateway.recordings.moment import iso_time
 from gateway.recordings.positions import Continuity, TrackPoint, named_position
 from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import NOTE, TableNote
@@ -27,9 +27,6 @@ from gateway.vehicle.plan import is_good_enough
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
 """Of the vehicles' lines: alpha, blue, green, red."""
 _NOT_IN_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-FIRST_US: Final = 0
-LAST_US: Final = 253_402_300_799 * US_PER_S
-"""The ends of the calendar that other programs read: 1970 to 9999."""
 HALF_TURN_DEG = 180.0
 INFO: Final = 6
 """MAV_SEVERITY_INFO; texts that are less severe are for programmers."""
@@ -198,13 +195,6 @@ def _gpx_attitude(point: TrackPoint) -> str:
         f'<extensions><mavgate:attitude roll="{roll:.1f}" pitch="{pitch:.1f}" '
         f'yaw="{yaw % 360.0:.1f}"/></extensions>'
     )
-
-
-def iso_time(unix_us: int) -> str:
-    """Write a time as ISO 8601; one beyond the calendar as its nearest end."""
-    seconds, fraction_us = divmod(min(max(unix_us, FIRST_US), LAST_US), US_PER_S)
-    moment = datetime.fromtimestamp(seconds, UTC)
-    return f"{moment:%Y-%m-%dT%H:%M:%S}.{fraction_us // 1000:03d}Z"
 
 
 def to_geojson(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
