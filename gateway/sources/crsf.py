@@ -38,7 +38,13 @@ from gateway.records import (
     Vec3,
     VehicleReport,
 )
-from gateway.sources.flight_modes import FIXED_WING, QUADROTOR, ardupilot_mode, mode_of_text
+from gateway.sources.flight_modes import (
+    FIXED_WING,
+    QUADROTOR,
+    ardupilot_mode,
+    mode_of_text,
+    wanted_type,
+)
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import SourceUrl
 from gateway.sources.source import CheckedFrames
@@ -94,12 +100,8 @@ class CrsfDecoder(CheckedFrames):
         self._is_datagram = url.transport == "udp"
         self._nose_down = url.options.get("pitch") == "down"
         self._fixed_sign = "pitch" in url.options
-        wanted = url.options.get("type")
-        kind = None if wanted is None else getattr(mavlink, f"MAV_TYPE_{wanted.upper()}", None)
-        if wanted is not None and kind is None:
-            raise ValueError(f"source {url.url!r}: no MAV_TYPE {wanted!r}")
-        self._type: int | None = kind
-        self._type_is_set = kind is not None
+        self._type = wanted_type(url)
+        self._type_is_set = self._type is not None
         self._has_passthrough = False
         self._velocity: tuple[int, tuple[Any, ...]] | None = None
         self._utc: tuple[int, int] | None = None

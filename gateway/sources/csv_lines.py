@@ -7,7 +7,6 @@ are taken for uncalibrated and in sensor axes, as of every source.
 
 import math
 import tomllib
-from typing import Final
 
 import msgspec
 
@@ -15,11 +14,9 @@ from gateway.recordings.columns import TableRow, row_of_cells
 from gateway.recordings.formats.csv import DELIMITERS, ColumnMap, CsvReader
 from gateway.records import NodeId
 from gateway.sources.sampling import SampleClock, imu_raw
-from gateway.sources.source import SourceRecord
+from gateway.sources.source import SourceRecord, unusable
 from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
-
-SHOWN: Final = 60
 
 
 def read_column_map(text: str) -> ColumnMap:
@@ -47,18 +44,18 @@ class CsvLines:
             self._header = line
             return []
         if not self._header:
-            return [self._fault(line, "comes before the line with the names of the columns")]
+            return [unusable("csv", line, "comes before the line with the names of the columns")]
         reader = CsvReader(self._map, lenient=True)
         try:
             blocks = [*reader.blocks([self._header, line])]
         except ValueError as error:
-            return [self._fault(line, str(error))]
+            return [unusable("csv", line, str(error))]
         rows = [
             row_of_cells(cells, self._node.vehicle_id) for b in blocks for cells in b.cells.tolist()
         ]
         found = [record for row in rows for record in self._records(row, arrival_us)]
         if not found:
-            return [self._fault(line, reader.first_fault or "has no value of the map")]
+            return [unusable("csv", line, reader.first_fault or "has no value of the map")]
         return [*found]
 
     def _is_header(self, line: str) -> bool:
@@ -78,6 +75,3 @@ class CsvLines:
             values = (row.imu.accel_b_mps2, (x, y, z), row.imu.mag_b_ut, row.imu.temperature_degc)
             found.append(imu_raw(time_us, self._node, *values))
         return [record for record in found if record is not None]
-
-    def _fault(self, line: str, why: str) -> Fault:
-        return Fault("csv", len(line), f"{line[:SHOWN]!r}: {why}")

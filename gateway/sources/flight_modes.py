@@ -9,6 +9,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.sources.settings import SourceUrl
+
 FIXED_WING: Final[int] = mavlink.MAV_TYPE_FIXED_WING
 QUADROTOR: Final[int] = mavlink.MAV_TYPE_QUADROTOR
 
@@ -36,6 +38,15 @@ _CLASSES: Final = (
     ("SUB_MODE", {mavlink.MAV_TYPE_SUBMARINE}),
     ("TRACKER_MODE", {mavlink.MAV_TYPE_ANTENNA_TRACKER}),
 )
+
+
+def wanted_type(url: SourceUrl) -> int | None:
+    """Return the MAV_TYPE of the option `type`; raises ValueError for an unknown one."""
+    name = url.options.get("type")
+    found: int | None = getattr(mavlink, f"MAV_TYPE_{name.upper()}", None) if name else None
+    if name is not None and found is None:
+        raise ValueError(f"source {url.url!r}: no MAV_TYPE {name!r}")
+    return found
 
 
 @dataclass(frozen=True, slots=True)

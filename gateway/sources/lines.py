@@ -27,14 +27,13 @@ from gateway.sources.csv_lines import CsvLines, read_column_map
 from gateway.sources.nmea import NmeaReader
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import SourceUrl
-from gateway.sources.source import SourceRecord
+from gateway.sources.source import SourceRecord, unusable
 from gateway.units import STANDARD_GRAVITY_MPS2
 from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
 
 MAX_LINE: Final = 4096
 MAX_VEHICLE: Final = 31
-SHOWN: Final = 60
 
 DEG_PER_RAD: Final = math.degrees(1.0)
 VECTORS: Final = {
@@ -151,20 +150,20 @@ class LinesDecoder:
             return []
         if self._csv is not None:
             return self._csv.line(line, arrival_us)
-        return [_fault("text", line, "neither JSON, NMEA nor CSV of a map (?columns=FILE)")]
+        return [unusable("text", line, "neither JSON, NMEA nor CSV of a map (?columns=FILE)")]
 
     def _json(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:
         try:
             content = json.loads(line)
         except (ValueError, RecursionError):
-            return [_fault("json", line, "no JSON object")]
+            return [unusable("json", line, "no JSON object")]
         values = read_keys(content)
         unknown = [key for key in content if key not in KEYS]
         vehicle = values.get("id")
         node = self._node
         if isinstance(vehicle, float) and not self._has_own_id:
             if not (vehicle.is_integer() and 1 <= vehicle <= MAX_VEHICLE):
-                return [_fault("id", line, f"id must be 1 to {MAX_VEHICLE}")]
+                return [unusable("id", line, f"id must be 1 to {MAX_VEHICLE}")]
             node = NodeId(int(vehicle), node.node_id)
         clock = self._clocks.setdefault(node.vehicle_id, SampleClock())
         stamp = values.get("t_ms")
@@ -175,9 +174,9 @@ class LinesDecoder:
         records = records_of(values, node, time_us)
         faults: list[SourceRecord | Fault] = []
         if unknown:
-            faults.append(_fault("json key", str(unknown[0]), "unknown key, not used"))
+            faults.append(unusable("json key", str(unknown[0]), "unknown key, not used"))
         elif not records:
-            faults.append(_fault("json", line, "has no key with a valid value"))
+            faults.append(unusable("json", line, "has no key with a valid value"))
         return [*records, *faults]
 
 
@@ -272,7 +271,3 @@ def _report(values: Mapping[str, Any], node: NodeId, time_us: int) -> VehicleRep
         link_quality_percent=get("link", NAN),
         signal=None if rssi is None else RadioSignal(round(rssi), get("snr", NAN)),
     )
-
-
-def _fault(kind: str, line: str, why: str) -> Fault:
-    return Fault(kind, len(line), f"{line[:SHOWN]!r}: {why}")

@@ -9,7 +9,7 @@ from operator import xor
 from typing import Any, Final
 
 from gateway.records import BatteryReport, GpsFixType, NodeId, VehicleReport
-from gateway.sources.flight_modes import FIXED_WING, QUADROTOR
+from gateway.sources.flight_modes import FIXED_WING, QUADROTOR, wanted_type
 from gateway.sources.sampling import fix_at, velocity
 from gateway.sources.settings import SourceUrl
 from gateway.sources.source import CheckedFrames
@@ -39,7 +39,7 @@ class LtmDecoder(CheckedFrames):
         self._node = node
         self._home_alt_m = 0.0
         self._course_deg = 0.0
-        self._type = FIXED_WING if url.options.get("type") == "fixed_wing" else QUADROTOR
+        self._type = wanted_type(url) or QUADROTOR
 
     def size_at(self, data: bytes, at: int) -> int:
         """Return the size of the frame that begins there, complete or not; 0 if none does."""

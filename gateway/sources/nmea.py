@@ -14,6 +14,7 @@ from typing import Final
 
 from gateway.records import NAN, GpsFix, GpsFixType, NodeId, VehicleReport
 from gateway.sources.sampling import fix_at, velocity
+from gateway.sources.source import unusable
 from gateway.units import US_PER_S
 from gateway.wire.framing import Fault
 
@@ -52,14 +53,14 @@ class NmeaReader:
         """Process one sentence."""
         found = SENTENCE.fullmatch(line)
         if found is None:
-            return [_fault("nmea", line, "no NMEA sentence")]
+            return [unusable("nmea", line, "no NMEA sentence")]
         _, kind, fields, check = found.groups()
         if check is not None and int(check, 16) != checksum(line[1:].partition("*")[0]):
-            return [_fault("nmea checksum", line, "wrong checksum")]
+            return [unusable("nmea checksum", line, "wrong checksum")]
         try:
             return self._sentence(kind, fields.split(",")[1:], arrival_us)
         except (ValueError, IndexError):
-            return [_fault("nmea", line, f"{kind} has a field that cannot be read")]
+            return [unusable("nmea", line, f"{kind} has a field that cannot be read")]
 
     def _sentence(
         self, kind: str, fields: list[str], arrival_us: int
@@ -75,7 +76,7 @@ class NmeaReader:
             return [VehicleReport(time_us=arrival_us, node=self._node, heading_rad=heading)]
         if kind in IGNORED or kind == "HDT":
             return []
-        return [_fault("nmea unknown", kind, "sentence is not used")]
+        return [unusable("nmea unknown", kind, "sentence is not used")]
 
     def _collect(self, kind: str, fields: list[str], arrival_us: int) -> GpsFix | None:
         if fields[0] != self._time or kind in self._epoch:
@@ -133,10 +134,6 @@ class NmeaReader:
                 return math.hypot(lat_m, lon_m), alt_m
         v_sq = pdop * pdop - hdop * hdop
         return hdop * UERE_M, math.sqrt(v_sq) * UERE_M if v_sq > 0.0 else NAN
-
-
-def _fault(kind: str, line: str, why: str) -> Fault:
-    return Fault(kind, len(line), f"{line[:60]!r}: {why}")
 
 
 def _number(text: str) -> float:

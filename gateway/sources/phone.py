@@ -30,7 +30,7 @@ from gateway.records import NAN, BaroRaw, BatteryReport, NodeId, Vec3, VehicleRe
 from gateway.sources.lines import LineSplitter, is_number
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import SourceUrl
-from gateway.sources.source import SourceRecord
+from gateway.sources.source import SourceRecord, unusable
 from gateway.units import US_PER_S
 from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
@@ -140,7 +140,7 @@ class PhoneDecoder:
                     found += self._records(self._readings(line), arrival_us)
                 except UNREADABLE as error:
                     why = str(error) if isinstance(error, ValueError) else "is of no known app"
-                    found.append(Fault("phone", len(line), f"{line[:60]!r}: {why}"))
+                    found.append(unusable("phone", line, why))
         return found
 
     def _readings(self, line: str) -> list[Reading]:

@@ -34,6 +34,8 @@ MAX_ARRIVALS: Final = 2048
 MAX_KINDS: Final = 32
 """Kinds of faults that are counted by name."""
 MAX_DETAIL: Final = 200
+SHOWN: Final = 60
+"""Characters of a line that cannot be used."""
 
 
 class SourceDecoder(Protocol):
@@ -46,6 +48,11 @@ class SourceDecoder(Protocol):
     def reset(self) -> None:
         """Discard a part of a frame or line, as the transport was opened again."""
         ...
+
+
+def unusable(kind: str, line: str, why: str) -> Fault:
+    """Return the fault of a line, with its beginning and the reason."""
+    return Fault(kind, len(line), f"{line[:SHOWN]!r}: {why}")
 
 
 class CheckedFrames(ABC):

@@ -314,6 +314,15 @@ def test_ltm_is_read_behind_the_same_interface() -> None:
     assert state.airspeed_mps == 18.0
 
 
+def test_wanted_type_is_that_of_crsf_and_ltm_and_must_exist() -> None:
+    stream = make_decoder(parse_source("ltm:/dev/ttyUSB0?type=fixed_wing"), NODE)
+    (state,) = stream.feed(ltm(b"S", struct.pack("<HHBBB", 0, 0, 0, 0, 2 << 2)), 0)
+    assert (state.vehicle_type, state.custom_mode) == (mavlink.MAV_TYPE_FIXED_WING, 5)
+    for kind in ("ltm", "crsf"):
+        with pytest.raises(ValueError, match="no MAV_TYPE 'plane'"):
+            make_decoder(parse_source(f"{kind}:/dev/ttyUSB0?type=plane"), NODE)
+
+
 def test_ltm_noise_is_counted_and_the_next_frame_is_read() -> None:
     stream = make_decoder(parse_source("ltm:/dev/ttyUSB0"), NODE)
     good = ltm(b"A", struct.pack("<hhh", 0, 0, 90))
