@@ -115,8 +115,7 @@ class Hub:
         self.now_us = now_us
         burst = UNTRUSTED_READ_BURST
         self.untrusted_reads = TokenBucket(UNTRUSTED_READ_RATE, burst, burst)
-        self._on_gone, self._on_foreign = on_gone, on_foreign
-        self._on_alert = on_alert
+        self._on_gone, self._on_foreign, self._on_alert = on_gone, on_foreign, on_alert
         self._alerts = ClientAlerts()
         self._connections = LogRateLimiter(CONNECTIONS_IN_FULL, CONNECTIONS_NOT_LOGGED)
         self._clients: dict[int, Client] = {}
@@ -125,9 +124,10 @@ class Hub:
         self.forwarding = _new_forwarding()
         self._share_reads()
         self._fanout = Fanout(signer, self.forwarding, on_foreign, is_recording=keeps_order)
-        self.finish_run = self._fanout.finish_run
+        self.finish_run, self.update_buffer = self._fanout.finish_run, self._fanout.update_buffer
         self._round_trip = RoundTrip(signer)
         self._vehicles = OwnVehicles()
+        self.greet = self._vehicles.await_greeting
         self._router = Router(
             self,
             self._clients,
@@ -367,10 +367,6 @@ class Hub:
         self._fanout.add(client)
         self._log_connection(client, f"client {client.client_id}: {client.remote}")
 
-    def greet(self, client: Client) -> None:
-        """Send the vehicles' greetings, heartbeat and home, to a new peer."""
-        self._vehicles.await_greeting(client.client_id)
-
     def reconfigure(self, client: Client) -> None:
         """Apply a client's changed options from the next frame on."""
         self._fanout.reconfigure(client)
@@ -395,10 +391,6 @@ class Hub:
     def _flush(self, wait_s: float) -> None:
         for flush in self._gathering.pop(wait_s, ()):
             flush()
-
-    def update_buffer(self, client: Client, free_percent: int) -> None:
-        """Adapt the rate to a radio to the free part of its buffer."""
-        self._fanout.update_buffer(client.client_id, free_percent)
 
     def vanish(self, client: Client) -> None:
         """Close a client and remove it."""

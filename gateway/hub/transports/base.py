@@ -105,7 +105,7 @@ class HubContext(Protocol):
     def appear(self, client: "Client") -> None:
         """Add a client."""
 
-    def greet(self, client: "Client") -> None:
+    def greet(self, client_id: int) -> None:
         """Send the vehicles' greetings to a new peer."""
 
     def reconfigure(self, client: "Client") -> None:
@@ -114,7 +114,7 @@ class HubContext(Protocol):
     def flush_soon(self, wait_s: float, flush: Callable[[], None]) -> None:
         """Call back after the present events are handled, or after a wait."""
 
-    def update_buffer(self, client: "Client", free_percent: int) -> None:
+    def update_buffer(self, client_id: int, free_percent: int) -> None:
         """Adapt the rate to a client to the free part of its radio's buffer."""
 
     def vanish(self, client: "Client") -> None:

@@ -71,12 +71,12 @@ class SerialClient(QueuedClient):
         self._splitter.reset()
         self.become("open")
         self.loop.add_reader(port.fileno(), self._on_readable, port)
-        self.context.greet(self)
+        self.context.greet(self.client_id)
 
     def receive_frame(self, frame: MavFrame, now_us: int) -> None:
         """Route one frame; those of the radio report the room in its buffer."""
         if frame.message_id == RADIO_STATUS:
-            self.context.update_buffer(self, frame.free_percent)
+            self.context.update_buffer(self.client_id, frame.free_percent)
         super().receive_frame(frame, now_us)
 
     def close(self) -> None:

@@ -216,7 +216,7 @@ class StreamClient(QueuedClient):
     def _begin(self) -> None:
         """Start the protocol on a new connection."""
         self.become("open")
-        self.context.greet(self)
+        self.context.greet(self.client_id)
 
     def close(self) -> None:
         """Close the connection; waiting frames are lost."""

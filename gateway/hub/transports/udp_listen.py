@@ -127,7 +127,7 @@ class UdpListener(Listener[DatagramPeer]):
         self._clients[client_id] = self._by_address[client.address] = client
         client.adopt(sock)
         self._context.appear(client)
-        self._context.greet(client)
+        self._context.greet(client_id)
         self._pass_on_others(sock, address, local_host)
         return client
 

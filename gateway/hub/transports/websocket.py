@@ -68,7 +68,7 @@ class WebStream(StreamClient):
     def _opened(self) -> None:
         """Add the client: the handshake is done."""
         self.become("open")
-        self.context.greet(self)
+        self.context.greet(self.client_id)
 
     def give_up(self, reason: str) -> None:
         """Close the connection and record the reason."""

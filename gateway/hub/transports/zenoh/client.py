@@ -110,7 +110,7 @@ class ZenohClient(Client):
         is_linked = self._connection.has_router
         if is_linked and self.state != "open":
             self.become("open")
-            self.context.greet(self)
+            self.context.greet(self.client_id)
         elif not is_linked and self.state == "open":
             self.become("connecting")
             self._packers.clear()
