@@ -77,29 +77,20 @@ def test_machine_code_gives_results_of_python(
     assert [*tmp_path.iterdir()] == [path]
 
 
-def test_cached_machine_code_is_not_compiled_again(
-    scaling: EntryPoint[[int, int, float]], tmp_path: Path
-) -> None:
-    cached = tmp_path / "cache" / "code.o"
-    build_library(tmp_path / "first.so", [scaling], cached=cached)
-    build_library(path := tmp_path / "second.so", [], cached=cached)
-    scaling.load(path)
-    assert use(scaling) == [12.25, 30.25]
-    assert [*cached.parent.iterdir()] == [cached]
-
-
-def test_cache_keeps_the_newest_of_each_source(
+def test_cached_machine_code_is_not_compiled_again_and_oldest_is_removed(
     scaling: EntryPoint[[int, int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    cached = [cached_object(f"gateway/units.py 1 {k}") for k in range(MAX_CACHED + 1)]
-    assert len({*cached}) == len(cached)
-    cached[0].parent.mkdir(parents=True)
-    for age, path in enumerate(cached[:-1]):
+    *others, cached = (cached_object(f"gateway/units.py 1 {k}") for k in range(MAX_CACHED + 1))
+    cached.parent.mkdir(parents=True)
+    for age, path in enumerate(others):
         path.touch()
         os.utime(path, ns=(age, age))
-    build_library(tmp_path / "kernels.so", [scaling], cached=cached[-1])
-    assert {*cached[0].parent.iterdir()} == {*cached[1:]}
+    build_library(tmp_path / "first.so", [scaling], cached=cached)
+    assert {*cached.parent.iterdir()} == {*others[1:], cached}
+    build_library(path := tmp_path / "second.so", [], cached=cached)
+    scaling.load(path)
+    assert use(scaling) == [12.25, 30.25]
 
 
 def test_experiment_compiles_patched_constants_until_its_end(
