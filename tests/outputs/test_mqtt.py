@@ -53,15 +53,18 @@ class Mosquitto:
         self.process = subprocess.Popen(["mosquitto", "-c", settings], stderr=subprocess.DEVNULL)
 
     async def subscriber(self) -> aiomqtt.Client:
-        while True:
-            client = aiomqtt.Client("127.0.0.1", self.port, username="pilot", password="top secret")
-            try:
-                await client.__aenter__()
-            except aiomqtt.MqttError:
-                await asyncio.sleep(0.01)
-                continue
-            await client.subscribe("#")
-            return client
+        async with asyncio.timeout(LIMIT_S):
+            while True:
+                client = aiomqtt.Client(
+                    "127.0.0.1", self.port, username="pilot", password="top secret"
+                )
+                try:
+                    await client.__aenter__()
+                except aiomqtt.MqttError:
+                    await asyncio.sleep(0.01)
+                    continue
+                await client.subscribe("#")
+                return client
 
 
 @pytest.fixture
