@@ -76,13 +76,6 @@ async def test_datagrams_of_unusual_sizes_are_counted(rig: Any) -> None:
     assert hub.clients()[0].bytes_garbage == MAX_DATAGRAM
 
 
-async def test_client_without_frames_is_removed_after_the_timeout(rig: Any) -> None:
-    hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=10.0)
-    await rig.call(hub)
-    rig.clock.now_us = 11_000_000
-    await rig.until(lambda: not hub.clients())
-
-
 async def test_client_is_removed_after_its_host_refuses(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=1000.0)
     station = await rig.call(hub)
@@ -91,16 +84,6 @@ async def test_client_is_removed_after_its_host_refuses(rig: Any) -> None:
     await rig.until(lambda: hub.clients()[0].state == "refused")
     rig.clock.now_us = 4_000_000
     await rig.until(lambda: not hub.clients())
-
-
-async def test_client_of_a_named_port_has_its_name(rig: Any) -> None:
-    hub = rig.hub("udp-listen:127.0.0.1:0?name=tablets", "tcp-listen:127.0.0.1:0?name=bench")
-    station = rig.station(hub.listening_ports()[0])
-    station.send(station.sender.heartbeat())
-    with socket.create_connection(("127.0.0.1", hub.listening_ports()[1])):
-        await rig.until(lambda: len(hub.clients()) == 2)
-        names = sorted(client.name.partition(" ")[0] for client in hub.clients())
-    assert names == ["bench", "tablets"]
 
 
 async def test_refusing_client_gets_nothing_until_it_sends_again(rig: Any) -> None:
@@ -136,19 +119,6 @@ async def test_client_that_returns_on_another_port_replaces_its_old_entry(rig: A
     await rig.until(lambda: len(rig.incoming) == 2)
     await rig.until(lambda: len(hub.clients()) == 1)
     assert hub.clients()[0].remote == f"127.0.0.1:{after.port}"
-
-
-async def test_refused_port_is_counted_without_loss_at_others(rig: Any) -> None:
-    gone, station = rig.station(), rig.station()
-    gone.socket.close()
-    hub = await rig.open(f"udp:127.0.0.1:{gone.port}", f"udp:127.0.0.1:{station.port}")
-    for _ in range(10):
-        await rig.check_passes(hub, station)
-    refused, fine = hub.clients()
-    assert refused.state == "refused"
-    assert (refused.sent + refused.unheard, refused.dropped) == (10, 0)
-    assert refused.reason == "nobody listens there"
-    assert (fine.sent, fine.dropped) == (10, 0)
 
 
 async def test_station_that_starts_late_loses_nothing_after_its_start(rig: Any) -> None:
@@ -213,16 +183,14 @@ async def test_changed_address_of_a_name_is_followed(rig: Any, names: Any) -> No
     old, new = rig.station(), rig.station()
     names["observer.example"] = [("127.0.0.1", old.port)]
     hub = await rig.open("udp:observer.example:14550")
-    source = hub._clients[1]._socket.getsockname()
-    for station, moved_at_us in ((old, 61_000_000), (new, 122_000_000)):
-        rig.clock.now_us = moved_at_us
-        await rig.until(lambda at_us=moved_at_us: hub._clients[1]._resolve_us > at_us)
-        await rig.until(lambda: hub._clients[1]._task is None)
-        frame = rig.vehicle.attitude()
-        hub.send(rig.out(frame))
-        assert await station.receive() == frame
-        assert hub._clients[1]._socket.getsockname() == source
-        names["observer.example"] = [("127.0.0.1", new.port)]
+    hub.send(rig.out(rig.vehicle.attitude()))
+    _, source = await asyncio.get_running_loop().sock_recvfrom(old.socket, 100)
+    names["observer.example"] = [("127.0.0.1", new.port)]
+    rig.clock.now_us = 61_000_000
+    rig.tick(hub)
+    await rig.until(lambda: hub.clients()[0].remote == f"127.0.0.1:{new.port}")
+    hub.send(rig.out(rig.vehicle.attitude()))
+    assert (await asyncio.get_running_loop().sock_recvfrom(new.socket, 100))[1] == source
 
 
 async def test_answer_and_requested_interval_concern_one_client(rig: Any) -> None:
@@ -237,32 +205,6 @@ async def test_answer_and_requested_interval_concern_one_client(rig: Any) -> Non
     assert (await second.receive())[4] == 0
     assert first.is_empty()
     assert second.is_empty()
-
-
-async def test_burst_is_read_by_one_call(rig: Any) -> None:
-    hub = rig.hub("udp-listen:127.0.0.1:0")
-    station = await rig.call(hub)
-    (client,) = hub._clients.values()
-    client.loop.remove_reader(client._socket)
-    for expected in (2, 20):
-        for _ in range(expected - client.counters.received):
-            station.send(station.sender.heartbeat())
-        client._read()
-        assert client.counters.received == expected
-    client._read()
-    assert client.state == "open"
-
-
-async def test_packed_frames_share_a_datagram(rig: Any) -> None:
-    station = rig.station()
-    hub = await rig.open(f"udp:127.0.0.1:{station.port}?pack=30")
-    frames = [rig.vehicle.attitude() for _ in range(5)]
-    for frame in frames:
-        hub.send(rig.out(frame))
-    first, second = await station.receive(), await station.receive()
-    assert (first, second) == (b"".join(frames[:2]), b"".join(frames[2:4]))
-    assert await station.receive() == frames[4]
-    assert hub.clients()[0].sent == 5
 
 
 async def test_packing_without_a_wait_joins_only_frames_of_one_wake_up(
