@@ -1,9 +1,10 @@
 """The simulated flight, recorded, replayed and fused again, is the same flight."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -13,15 +14,14 @@ from gateway.cli.live.demo import calibrated_aircraft
 from gateway.config import GatewaySettings
 from gateway.live import recorder as recorder_module
 from gateway.live.recorder import Recorder
-from gateway.live.session import Mode, RecordingSettings
+from gateway.live.session import Mode
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.opening import TlogFile
 from gateway.recordings.play import Player, Track
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions, header_for
-from gateway.recordings.table import TableReader
-from gateway.recordings.tlog import TlogScanner
+from gateway.recordings.table import TableHeader, TableReader
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState
 from gateway.simulator.receiver import simulate
 from gateway.simulator.source_bytes import SOURCE_BYTES
@@ -29,10 +29,10 @@ from gateway.sources.kinds import make_sources
 from gateway.sources.settings import SourceSettings
 from tests.conftest import ManualClock
 from tests.kit.cli import invoke
+from tests.kit.recorder import UNIX_US, RecorderBench, frames_of
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
-START_UNIX_US = 1_781_187_930_000_000
 FLIGHT_S = 20.0
 TURN_US = 500_000
 
@@ -54,7 +54,7 @@ class Flight:
             PipelineSettings(
                 self.settings.default_aircraft,
                 self.aircraft,
-                START_UNIX_US,
+                UNIX_US,
                 sources=make_sources(urls, str),
             )
         )
@@ -63,48 +63,48 @@ class Flight:
         pipeline, settings = self.pipeline, self.settings.simulator
         if self.kind:
             (source,) = pipeline.sources
-            frames = SOURCE_BYTES[self.kind](settings, START_UNIX_US)
+            frames = SOURCE_BYTES[self.kind](settings, UNIX_US)
             feed = partial(pipeline.feed_source, source)
         else:
-            frames, feed = simulate(settings, START_UNIX_US).frames(), pipeline.feed
+            frames, feed = simulate(settings, UNIX_US).frames(), pipeline.feed
         for frame in takewhile(lambda frame: frame.time_s < FLIGHT_S, frames):
             self.clock.now_us = round(frame.time_s * 1e6)
             yield feed(frame.data, self.clock.now_us)
             if self.pipeline.next_due_us() <= self.clock.now_us:
                 yield self.pipeline.poll(self.clock.now_us)
 
+    def header(self, vehicle_id: int) -> TableHeader:
+        return header_for(self.aircraft[vehicle_id], vehicle_id)
+
     def fusion_state(self, vehicle_id: int) -> FusionState:
         return self.pipeline.aircraft[vehicle_id].fusion_state
 
 
 class Recording:
-    """A recorder that is turned by hand."""
+    """A recorder that is turned while a flight goes on."""
 
     def __init__(
-        self, folder: Path, clock: ManualClock, flight: Flight | None = None, mode: Mode = "always"
+        self,
+        folder: Path,
+        clock: ManualClock,
+        *of_flight: Callable[[int], Any],
+        mode: Mode = "always",
     ) -> None:
         self._clock = clock
         self._turned_us = clock()
-        self.recorder = Recorder(
-            RecordingSettings(folder=str(folder), mode=mode, free_floor_mb=0, rotate_mb=1),
-            clock,
-            lambda: START_UNIX_US + clock(),
-            lambda vehicle_id: header_for(flight.aircraft[vehicle_id], vehicle_id),
-            lambda _, __: None,
-            (lambda _: None) if flight is None else flight.fusion_state,
-        )
+        self._bench = RecorderBench(folder, clock, *of_flight, mode=mode, rotate_mb=1)
 
     async def turn(self) -> None:
         if self._clock() - self._turned_us >= TURN_US:
             self._turned_us = self._clock()
-            await self.recorder._turn()
+            await self._bench.turn(0.0)
 
     async def __aenter__(self) -> Recorder:
-        await self.recorder._turn()
-        return self.recorder
+        await self._bench.turn(0.0)
+        return self._bench.recorder
 
     async def __aexit__(self, *_: object) -> None:
-        self.recorder.close()
+        self._bench.recorder.close()
 
 
 @pytest.fixture(params=["eskf", "paper", "lines", "phone", "crsf"])
@@ -112,7 +112,7 @@ async def recorded(
     request: pytest.FixtureRequest, tmp_path: Path, clock: ManualClock
 ) -> tuple[Path, list[bytes], list[NavState], Flight]:
     flight = Flight(request.param, clock)
-    recording = Recording(tmp_path / "first", clock, flight)
+    recording = Recording(tmp_path / "first", clock, flight.header, flight.fusion_state)
     frames: list[bytes] = []
     states: list[NavState] = []
     async with recording as recorder:
@@ -131,21 +131,12 @@ async def recorded(
     return tmp_path / "first", frames, states, flight
 
 
-def frames_in(folder: Path) -> list[bytes]:
-    frames = []
-    for path in sorted(folder.glob("*.tlog")):
-        batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
-        assert batch.damage == ()
-        frames += [record.frame for record in batch.records()]
-    return frames
-
-
 async def test_recorded_replayed_and_recorded_again_is_equal_message_for_message(
     recorded: tuple[Path, list[bytes], list[NavState], Flight], tmp_path: Path, clock: ManualClock
 ) -> None:
     folder, frames, _, _ = recorded
     assert len(frames) > 80 * FLIGHT_S
-    assert frames_in(folder) == frames
+    assert frames_of(folder) == frames
     sources = [TlogFile(path) for path in sorted(folder.glob("*.tlog"))]
     player = Player([Track(source, with_commands=True) for source in sources], clock(), speed=10.0)
     recording = Recording(tmp_path / "second", clock)
@@ -157,7 +148,7 @@ async def test_recorded_replayed_and_recorded_again_is_equal_message_for_message
             await recording.turn()
     for source in sources:
         source.close()
-    assert frames_in(tmp_path / "second") == frames
+    assert frames_of(tmp_path / "second") == frames
 
 
 async def test_table_alone_gives_recorded_states_bit_for_bit(
@@ -192,7 +183,9 @@ async def test_table_that_begins_before_arming_is_fused_again_bit_for_bit(
 ) -> None:
     monkeypatch.setattr(recorder_module, "HELD_US", 5_000_000)
     flight = Flight("eskf", clock)
-    recording = Recording(tmp_path / "armed", clock, flight, mode="armed")
+    recording = Recording(
+        tmp_path / "armed", clock, flight.header, flight.fusion_state, mode="armed"
+    )
     async with recording as recorder:
         for out in flight.outputs():
             for sent in out.frames:

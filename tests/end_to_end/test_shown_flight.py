@@ -68,12 +68,11 @@ class Shown:
 async def folder(tmp_path: Path, clock: ManualClock) -> Path:
     """Record as the daemon does: with the head of every part, without HIGH_LATENCY2."""
     flight = Flight("eskf", clock)
-    recording = Recording(tmp_path, clock, flight)
 
     def introduction(vehicle_id: int) -> list[bytes]:
         return [sent.frame for sent in flight.pipeline.aircraft[vehicle_id].vehicle.introduction()]
 
-    recording.recorder._introduction_of = introduction
+    recording = Recording(tmp_path, clock, flight.header, flight.fusion_state, introduction)
     async with recording as recorder:
         for out in flight.outputs():
             for sent in out.frames:

@@ -16,8 +16,8 @@ from gateway.live.control_verbs import RecorderVerbs, client_verbs, mark_verbs
 from gateway.recordings.index import Recording
 from gateway.vehicle.plan import Location
 from tests.conftest import ManualClock
+from tests.kit.recorder import RecorderBench
 from tests.live.test_player_edge import Played
-from tests.live.test_recorder import Bench
 from tests.recordings.frames import START_US, make_frames, make_records, make_tlog
 
 pytestmark = pytest.mark.io
@@ -30,15 +30,15 @@ async def ask(server: ControlServer, verb: str, **params: object) -> dict[str, A
 
 
 @pytest.fixture
-async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[Bench]:
-    made = Bench(tmp_path / "recordings", clock, mode="manual")
+async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[RecorderBench]:
+    made = RecorderBench(tmp_path / "recordings", clock, mode="manual")
     made.recorder.start()
     yield made
     made.recorder.close()
 
 
 async def test_recording_is_started_renamed_stopped_listed_and_deleted(
-    bench: Bench, tmp_path: Path
+    bench: RecorderBench, tmp_path: Path
 ) -> None:
     server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder).verbs())
     started = (await ask(server, "record.start"))["result"]
@@ -62,14 +62,16 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(
     assert bench.announced[1] == (False, "Note: here")
 
 
-async def test_note_that_no_vehicle_could_get_is_refused(bench: Bench, tmp_path: Path) -> None:
+async def test_note_that_no_vehicle_could_get_is_refused(
+    bench: RecorderBench, tmp_path: Path
+) -> None:
     server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder, lambda: False).verbs())
     refused = await ask(server, "record.note", text="here")
     assert "no vehicle is received" in refused["error"]
 
 
 async def test_recordings_are_listed_off_the_event_loop(
-    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bench: RecorderBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder).verbs())
     looked: list[threading.Thread] = []

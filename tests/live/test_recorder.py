@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.live.part import PENDING_LIMIT
 from gateway.live.part_files import PartFiles
-from gateway.live.recorder import HELD_BYTES, Recorder
-from gateway.live.session import RETRY_US, RecordingSettings, session_name
+from gateway.live.recorder import HELD_BYTES
+from gateway.live.session import RETRY_US, session_name
 from gateway.recordings.columns import TableRow
 from gateway.recordings.index import RecordingError, list_recordings
 from gateway.recordings.table import TableHeader, TableNote, TableReader
@@ -21,63 +21,21 @@ from gateway.records import FusedSample, FusionState
 from gateway.wire.timesync import ENOUGH
 from tests.conftest import ManualClock
 from tests.kit.mavlink import Sender
-from tests.recordings.frames import make_frames, read_tlog
+from tests.kit.recorder import FRAMES, HEADER, NAME, UNIX_US, RecorderBench, frames_of
+from tests.recordings.frames import read_tlog
 from tests.recordings.samples import make_baro, make_flight, make_fused
 
 pytestmark = pytest.mark.io
 
-UNIX_US = 1_781_187_930_000_000
-NAME = "20260611-142530"
-FRAMES = make_frames(40)
-HEADER = TableHeader(mavgate_version="1.2", settings={"a": {"b": 1}}, calibration={"c": [0.5]})
-
-
-class Bench:
-    """A recorder in a folder of its own, and what it announced."""
-
-    def __init__(self, folder: Path, clock: ManualClock, **settings: object) -> None:
-        self.clock = clock
-        self.unix_at_zero_us = UNIX_US
-        self.announced: list[tuple[bool, str]] = []
-        options = {"folder": str(folder), "mode": "always", "free_floor_mb": 0.0, **settings}
-        self.recorder = Recorder(
-            RecordingSettings(**options),
-            clock,
-            lambda: self.unix_at_zero_us + clock(),
-            lambda vehicle_id: HEADER,
-            lambda is_trouble, text: self.announced.append((is_trouble, text)),
-        )
-
-    async def turn(self, seconds: float = 0.5) -> None:
-        self.clock.advance(seconds)
-        await self.recorder._turn()
-
-    def send(self, frames: list[bytes]) -> None:
-        for frame in frames:
-            self.clock.advance(0.001)
-            self.recorder.frame(frame)
-
-    async def record(self, frames: list[bytes], seconds: float = 0.5) -> None:
-        self.send(frames)
-        await self.turn(seconds)
-
-    @property
-    def troubles(self) -> list[str]:
-        return [text for is_trouble, text in self.announced if is_trouble]
-
 
 @pytest.fixture
-async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[Bench]:
-    made = Bench(tmp_path / "recordings", clock)
+async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[RecorderBench]:
+    made = RecorderBench(tmp_path / "recordings", clock)
     yield made
     made.recorder.close()
 
 
-def frames_of(folder: Path) -> list[bytes]:
-    return [r.frame for path in sorted(folder.glob("*.tlog")) for r in read_tlog(path)]
-
-
-async def test_every_frame_is_in_the_tlog_at_its_time(bench: Bench) -> None:
+async def test_every_frame_is_in_the_tlog_at_its_time(bench: RecorderBench) -> None:
     await bench.turn()
     begin_us = bench.clock()
     await bench.record(FRAMES)
@@ -96,7 +54,10 @@ def heartbeat(sender: Sender, *, armed: bool) -> bytes:
 async def test_armed_mode_records_from_memory_before_arming_to_ten_seconds_after_disarming(
     tmp_path: Path, clock: ManualClock
 ) -> None:
-    bench, sender = Bench(tmp_path / "recordings", clock, mode="armed", name="place"), Sender(7, 1)
+    bench, sender = (
+        RecorderBench(tmp_path / "recordings", clock, mode="armed", name="place"),
+        Sender(7, 1),
+    )
     recorder, files = bench.recorder, []
     try:
         for second in range(230):
@@ -129,7 +90,7 @@ async def test_armed_mode_records_from_memory_before_arming_to_ten_seconds_after
 async def test_armed_bit_of_own_aircraft_and_its_memory_are_bounded(
     tmp_path: Path, clock: ManualClock, rng: np.random.Generator
 ) -> None:
-    bench = Bench(tmp_path / "recordings", clock, mode="armed")
+    bench = RecorderBench(tmp_path / "recordings", clock, mode="armed")
     try:
         await bench.turn()
         for record in make_flight(rng, 5):
@@ -153,7 +114,7 @@ async def test_armed_bit_of_own_aircraft_and_its_memory_are_bounded(
 
 
 async def test_table_contains_the_flight_and_its_header(
-    bench: Bench, rng: np.random.Generator
+    bench: RecorderBench, rng: np.random.Generator
 ) -> None:
     await bench.turn()
     flight = make_flight(rng, 50)
@@ -184,7 +145,7 @@ async def test_table_contains_the_flight_and_its_header(
 
 
 async def test_changed_settings_write_a_new_header_after_the_samples_before(
-    bench: Bench, rng: np.random.Generator
+    bench: RecorderBench, rng: np.random.Generator
 ) -> None:
     await bench.turn()
     bench.recorder.settings_changed(3)
@@ -199,7 +160,7 @@ async def test_changed_settings_write_a_new_header_after_the_samples_before(
 
 
 async def test_header_of_a_recording_begun_in_flight_reports_no_cold_start(
-    bench: Bench, rng: np.random.Generator
+    bench: RecorderBench, rng: np.random.Generator
 ) -> None:
     flight = make_flight(rng, 10)
     bench.recorder.flight(flight[0])
@@ -215,7 +176,7 @@ async def test_header_of_a_recording_begun_in_flight_reports_no_cold_start(
 async def test_part_begins_with_the_state_of_the_fusion(
     tmp_path: Path, clock: ManualClock, rng: np.random.Generator
 ) -> None:
-    bench = Bench(tmp_path, clock, rotate_min=1)
+    bench = RecorderBench(tmp_path, clock, rotate_min=1)
     seen = 0
     bench.recorder._state_of = lambda vehicle_id: FusionState(vehicle_id, str(seen), b"")
     await bench.turn()
@@ -240,7 +201,7 @@ async def test_part_begins_with_the_state_of_the_fusion(
 
 
 async def test_rotation_loses_nothing(tmp_path: Path, clock: ManualClock) -> None:
-    bench = Bench(tmp_path, clock, rotate_min=1)
+    bench = RecorderBench(tmp_path, clock, rotate_min=1)
     await bench.turn()
     for frame in FRAMES:
         await bench.record([frame], 10)
@@ -249,7 +210,7 @@ async def test_rotation_loses_nothing(tmp_path: Path, clock: ManualClock) -> Non
     assert frames_of(tmp_path) == FRAMES
 
 
-async def test_stop_and_start_make_two_recordings(bench: Bench) -> None:
+async def test_stop_and_start_make_two_recordings(bench: RecorderBench) -> None:
     await bench.turn()
     bench.send(FRAMES[:5])
     bench.recorder.stop()
@@ -266,7 +227,7 @@ async def test_stop_and_start_make_two_recordings(bench: Bench) -> None:
     ("number", "text"), [(errno.ENOSPC, "disk is full"), (errno.EROFS, "disk is read-only")]
 )
 async def test_failing_disk_stops_recording_until_it_recovers(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, number: int, text: str
+    bench: RecorderBench, monkeypatch: pytest.MonkeyPatch, number: int, text: str
 ) -> None:
     await bench.turn()
     await bench.record(FRAMES[:5])
@@ -285,7 +246,7 @@ async def test_failing_disk_stops_recording_until_it_recovers(
     assert bench.announced[-1] == (False, f"Recording {NAME}")
 
 
-async def test_deleted_folder_is_created_again(bench: Bench) -> None:
+async def test_deleted_folder_is_created_again(bench: RecorderBench) -> None:
     await bench.turn()
     await bench.record(FRAMES[:5])
     shutil.rmtree(bench.recorder.folder)
@@ -296,7 +257,7 @@ async def test_deleted_folder_is_created_again(bench: Bench) -> None:
     assert frames_of(bench.recorder.folder) == FRAMES[6:]
 
 
-async def test_hanging_disk_stops_recording_and_bounds_the_buffer(bench: Bench) -> None:
+async def test_hanging_disk_stops_recording_and_bounds_the_buffer(bench: RecorderBench) -> None:
     await bench.turn()
     part = bench.recorder._part
     assert part is not None
@@ -311,7 +272,7 @@ async def test_hanging_disk_stops_recording_and_bounds_the_buffer(bench: Bench) 
 async def test_gps_time_corrects_the_times_of_a_recording_and_its_name_stays(
     tmp_path: Path, clock: ManualClock, rng: np.random.Generator
 ) -> None:
-    bench = Bench(tmp_path / "recordings", clock, rotate_min=1)
+    bench = RecorderBench(tmp_path / "recordings", clock, rotate_min=1)
     bench.unix_at_zero_us = 1_000_000
     await bench.turn()
     await bench.record(FRAMES[:3], 100)
@@ -342,7 +303,7 @@ async def test_gps_time_corrects_the_times_of_a_recording_and_its_name_stays(
 async def test_differing_times_of_two_aircraft_split_a_session_once_at_most(
     tmp_path: Path, clock: ManualClock
 ) -> None:
-    bench = Bench(tmp_path / "recordings", clock)
+    bench = RecorderBench(tmp_path / "recordings", clock)
     await bench.turn()
     for n in range(60):
         bench.send(FRAMES[:2])
@@ -355,7 +316,7 @@ async def test_differing_times_of_two_aircraft_split_a_session_once_at_most(
 
 
 async def test_save_renames_a_running_recording(tmp_path: Path, clock: ManualClock) -> None:
-    bench = Bench(tmp_path, clock, rotate_min=1)
+    bench = RecorderBench(tmp_path, clock, rotate_min=1)
     await bench.turn()
     await bench.record(FRAMES[:5])
     await bench.recorder.save("first flight")
@@ -371,7 +332,7 @@ async def test_save_renames_a_running_recording(tmp_path: Path, clock: ManualClo
     assert frames_of(tmp_path) == FRAMES
 
 
-async def test_save_needs_a_recording_and_a_good_name(bench: Bench) -> None:
+async def test_save_needs_a_recording_and_a_good_name(bench: RecorderBench) -> None:
     with pytest.raises(RecordingError, match="nothing was recorded"):
         await bench.recorder.save("x")
     await bench.turn()
@@ -380,7 +341,7 @@ async def test_save_needs_a_recording_and_a_good_name(bench: Bench) -> None:
         await bench.recorder.save("../x")
 
 
-async def test_recording_wanted_at_start_misses_no_frame(bench: Bench) -> None:
+async def test_recording_wanted_at_start_misses_no_frame(bench: RecorderBench) -> None:
     bench.recorder.start()
     assert bench.recorder.status().state == "recording"
     bench.send(FRAMES)
@@ -389,7 +350,7 @@ async def test_recording_wanted_at_start_misses_no_frame(bench: Bench) -> None:
 
 
 async def test_failed_start_is_reported_and_retried(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: RecorderBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.recorder.folder.write_text("a file where the folder should be")
     bench.recorder.start()
@@ -400,7 +361,7 @@ async def test_failed_start_is_reported_and_retried(
 
 
 async def test_recording_begins_on_request(tmp_path: Path, clock: ManualClock) -> None:
-    bench = Bench(tmp_path, clock, mode="manual")
+    bench = RecorderBench(tmp_path, clock, mode="manual")
     bench.recorder.start()
     await bench.recorder.settle()
     assert not bench.recorder.recording
@@ -440,7 +401,7 @@ async def test_two_gateways_that_record_in_one_folder_lose_nothing(
     tmp_path: Path, clock: ManualClock, is_later: bool
 ) -> None:
     """Also where the second one begins once the first one has written."""
-    benches = [Bench(tmp_path, clock), Bench(tmp_path, clock)]
+    benches = [RecorderBench(tmp_path, clock), RecorderBench(tmp_path, clock)]
     for together in [[bench] for bench in benches] if is_later else [benches]:
         for bench in together:
             await bench.turn(0.0)
@@ -459,7 +420,7 @@ async def test_two_gateways_that_record_in_one_folder_lose_nothing(
 
 
 async def test_recording_is_reported_once_the_disk_has_written_something(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: RecorderBench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def outcome() -> tuple[bool, str]:
         status = bench.recorder.status()

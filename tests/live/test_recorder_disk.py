@@ -11,7 +11,7 @@ import pytest
 from gateway.live.session import RETRY_US
 from gateway.recordings.index import list_recordings
 from tests.conftest import ManualClock
-from tests.live.test_recorder import FRAMES, NAME, Bench, frames_of
+from tests.kit.recorder import FRAMES, NAME, RecorderBench, frames_of
 
 pytestmark = pytest.mark.io
 
@@ -37,8 +37,8 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.fixture
-async def bench(disk: Path, clock: ManualClock) -> AsyncIterator[Bench]:
-    made = Bench(disk / "recordings", clock)
+async def bench(disk: Path, clock: ManualClock) -> AsyncIterator[RecorderBench]:
+    made = RecorderBench(disk / "recordings", clock)
     await made.turn()
     await made.record(FRAMES[:5])
     assert made.troubles == []
@@ -46,7 +46,9 @@ async def bench(disk: Path, clock: ManualClock) -> AsyncIterator[Bench]:
     made.recorder.close()
 
 
-async def test_full_disk_stops_recording_until_there_is_space(bench: Bench, disk: Path) -> None:
+async def test_full_disk_stops_recording_until_there_is_space(
+    bench: RecorderBench, disk: Path
+) -> None:
     ballast = disk / "ballast"
     with pytest.raises(OSError, match="No space left"):
         ballast.write_bytes(bytes(2 * SIZE))
@@ -66,7 +68,7 @@ async def test_full_disk_stops_recording_until_there_is_space(bench: Bench, disk
 
 
 async def test_read_only_disk_stops_recording_until_it_is_writable(
-    bench: Bench, disk: Path
+    bench: RecorderBench, disk: Path
 ) -> None:
     # With a file open for writing the kernel would refuse.
     bench.recorder.stop()

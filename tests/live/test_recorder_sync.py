@@ -13,7 +13,7 @@ import pytest
 from gateway.live.part_files import PartFiles
 from gateway.live.session import RETRY_US, ClosePart, CorrectTimes, OpenPart, SessionAction
 from tests.conftest import ManualClock
-from tests.live.test_recorder import FRAMES, NAME, Bench, frames_of
+from tests.kit.recorder import FRAMES, NAME, RecorderBench, frames_of
 
 pytestmark = pytest.mark.io
 
@@ -54,8 +54,8 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[SlowDisk]:
 
 
 @pytest.fixture
-async def bench(tmp_path: Path, clock: ManualClock, disk: SlowDisk) -> AsyncIterator[Bench]:
-    made = Bench(tmp_path / "recordings", clock)
+async def bench(tmp_path: Path, clock: ManualClock, disk: SlowDisk) -> AsyncIterator[RecorderBench]:
+    made = RecorderBench(tmp_path / "recordings", clock)
     await made.turn()
     await made.record(FRAMES[:5])
     await disk.await_sync()
@@ -64,27 +64,29 @@ async def bench(tmp_path: Path, clock: ManualClock, disk: SlowDisk) -> AsyncIter
     made.recorder.close()
 
 
-async def await_closing(bench: Bench) -> None:
+async def await_closing(bench: RecorderBench) -> None:
     async with asyncio.timeout(FAR_S):
         while bench.recorder._files is not None:
             await asyncio.sleep(0)
 
 
-async def record_each(bench: Bench, frames: list[bytes]) -> None:
+async def record_each(bench: RecorderBench, frames: list[bytes]) -> None:
     """Record the last frames one by one, while a sync may run."""
     for frame in frames:
         await asyncio.wait_for(bench.record([frame]), FAR_S)
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-async def test_writes_do_not_wait_for_a_sync(bench: Bench, disk: SlowDisk) -> None:
+async def test_writes_do_not_wait_for_a_sync(bench: RecorderBench, disk: SlowDisk) -> None:
     syncing = bench.recorder._syncing
     await record_each(bench, FRAMES[5:])
     assert bench.troubles == []
     assert bench.recorder._syncing is syncing
 
 
-async def test_next_sync_begins_once_the_last_has_ended(bench: Bench, disk: SlowDisk) -> None:
+async def test_next_sync_begins_once_the_last_has_ended(
+    bench: RecorderBench, disk: SlowDisk
+) -> None:
     await bench.turn()
     disk.may_end.set()
     assert bench.recorder._syncing is not None
@@ -97,7 +99,7 @@ async def test_next_sync_begins_once_the_last_has_ended(bench: Bench, disk: Slow
 
 
 async def test_failed_sync_stops_recording_until_the_disk_recovers(
-    bench: Bench, disk: SlowDisk
+    bench: RecorderBench, disk: SlowDisk
 ) -> None:
     disk.fails = True
     disk.may_end.set()
@@ -114,7 +116,7 @@ async def test_failed_sync_stops_recording_until_the_disk_recovers(
 
 
 async def test_recording_ends_after_the_running_sync(
-    bench: Bench, disk: SlowDisk, monkeypatch: pytest.MonkeyPatch
+    bench: RecorderBench, disk: SlowDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     closed: list[int] = []
     close_all = PartFiles._close_all
@@ -140,7 +142,7 @@ async def test_recording_ends_after_the_running_sync(
 
 @pytest.mark.parametrize("by", ["stop", "end"])
 async def test_failed_last_sync_is_reported(
-    bench: Bench, disk: SlowDisk, caplog: pytest.LogCaptureFixture, by: str
+    bench: RecorderBench, disk: SlowDisk, caplog: pytest.LogCaptureFixture, by: str
 ) -> None:
     disk.fails = True
     disk.may_end.set()
@@ -154,7 +156,7 @@ async def test_failed_last_sync_is_reported(
 
 
 async def test_recorder_closed_during_the_end_of_a_part_closes_its_files(
-    bench: Bench, disk: SlowDisk
+    bench: RecorderBench, disk: SlowDisk
 ) -> None:
     files = bench.recorder._files
     assert files is not None
@@ -172,7 +174,7 @@ async def test_recorder_closed_during_the_end_of_a_part_closes_its_files(
 
 @pytest.mark.parametrize("between", [[], [CorrectTimes()]])
 async def test_next_part_does_not_wait_for_the_sync_of_the_last(
-    bench: Bench, disk: SlowDisk, between: list[SessionAction]
+    bench: RecorderBench, disk: SlowDisk, between: list[SessionAction]
 ) -> None:
     """Also where the recording gets its true time."""
     part = bench.recorder._part
@@ -188,7 +190,9 @@ async def test_next_part_does_not_wait_for_the_sync_of_the_last(
     assert disk.most == 1
 
 
-async def test_recording_is_renamed_during_a_slow_sync(bench: Bench, disk: SlowDisk) -> None:
+async def test_recording_is_renamed_during_a_slow_sync(
+    bench: RecorderBench, disk: SlowDisk
+) -> None:
     saving = asyncio.create_task(bench.recorder.save("first flight"))
     await record_each(bench, FRAMES[5:])
     assert {path.name for path in bench.recorder.folder.glob("*.tlog")} == {"first flight_01.tlog"}

@@ -12,7 +12,7 @@ from gateway.live.control_socket import ControlServer, socket_path
 from gateway.live.control_verbs import RecorderVerbs
 from tests.conftest import ManualClock
 from tests.kit.cli import invoke
-from tests.live.test_recorder import Bench
+from tests.kit.recorder import RecorderBench
 from tests.recordings.frames import make_frames
 
 pytestmark = pytest.mark.io
@@ -23,10 +23,10 @@ Run = Callable[..., Awaitable[str]]
 @pytest.fixture
 async def gateway(
     tmp_path: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
-) -> AsyncIterator[Bench]:
+) -> AsyncIterator[RecorderBench]:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    bench = Bench(tmp_path / "elsewhere", clock, mode="manual")
+    bench = RecorderBench(tmp_path / "elsewhere", clock, mode="manual")
     bench.recorder.start()
     server = ControlServer(socket_path("run"), RecorderVerbs(bench.recorder).verbs())
     await server.start()
@@ -42,7 +42,9 @@ async def run(*args: str, code: int = 0) -> str:
     return result.output
 
 
-async def test_recording_is_started_renamed_stopped_listed_and_deleted(gateway: Bench) -> None:
+async def test_recording_is_started_renamed_stopped_listed_and_deleted(
+    gateway: RecorderBench,
+) -> None:
     assert "recording" in await run("start")
     gateway.send(make_frames(9))
     assert "recording" in await run("note", "over the wood")
@@ -63,7 +65,7 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(gateway: 
     assert [path.name for path in gateway.recorder.folder.iterdir()] == [CATALOGUE_NAME]
 
 
-async def test_start_without_a_recording_has_a_distinct_exit_code(gateway: Bench) -> None:
+async def test_start_without_a_recording_has_a_distinct_exit_code(gateway: RecorderBench) -> None:
     gateway.recorder.folder.write_text("a file in its place")
     assert "blocked" in await run("start", code=1)
     assert "exists" in await run("status")

@@ -1,0 +1,65 @@
+"""The recorder on a manual clock."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from gateway.live.recorder import Recorder
+from gateway.live.session import RecordingSettings
+from gateway.recordings.table import TableHeader
+from gateway.records import FusionState
+from tests.conftest import ManualClock
+from tests.recordings.frames import make_frames, read_tlog
+
+UNIX_US = 1_781_187_930_000_000
+NAME = "20260611-142530"
+FRAMES = make_frames(40)
+HEADER = TableHeader(mavgate_version="1.2", settings={"a": {"b": 1}}, calibration={"c": [0.5]})
+
+
+def frames_of(folder: Path) -> list[bytes]:
+    """Return the frames of all tlogs of a folder, none of which is damaged."""
+    return [r.frame for path in sorted(folder.glob("*.tlog")) for r in read_tlog(path)]
+
+
+class RecorderBench:
+    """A recorder in a folder of its own that is turned by hand, and what it announced."""
+
+    def __init__(
+        self,
+        folder: Path,
+        clock: ManualClock,
+        header_of: Callable[[int], TableHeader] = lambda _: HEADER,
+        fusion_of: Callable[[int], FusionState | None] = lambda _: None,
+        introduction_of: Callable[[int], list[bytes]] = lambda _: [],
+        **settings: object,
+    ) -> None:
+        self.clock = clock
+        self.unix_at_zero_us = UNIX_US
+        self.announced: list[tuple[bool, str]] = []
+        options = {"folder": str(folder), "mode": "always", "free_floor_mb": 0.0, **settings}
+        self.recorder = Recorder(
+            RecordingSettings(**options),
+            clock,
+            lambda: self.unix_at_zero_us + clock(),
+            header_of,
+            lambda is_trouble, text: self.announced.append((is_trouble, text)),
+            fusion_of,
+            introduction_of,
+        )
+
+    async def turn(self, seconds: float = 0.5) -> None:
+        self.clock.advance(seconds)
+        await self.recorder._turn()
+
+    def send(self, frames: list[bytes]) -> None:
+        for frame in frames:
+            self.clock.advance(0.001)
+            self.recorder.frame(frame)
+
+    async def record(self, frames: list[bytes], seconds: float = 0.5) -> None:
+        self.send(frames)
+        await self.turn(seconds)
+
+    @property
+    def troubles(self) -> list[str]:
+        return [text for is_trouble, text in self.announced if is_trouble]
