@@ -383,12 +383,6 @@ def test_info_lists_rows_without_counterpart(tmp_path: Path) -> None:
     assert "without a counterpart in MAVLink: ODD 40" in output
 
 
-def test_convert_lists_rows_without_counterpart(tmp_path: Path) -> None:
-    path = write(tmp_path / "flight.bin")
-    output = run("convert", path, "-o", tmp_path / "out.tlog")
-    assert "without a counterpart in MAVLink: ODD 40" in output
-
-
 def test_tlog_has_own_estimates_fused_ones_or_both(tmp_path: Path) -> None:
     path = flown.write(tmp_path / "flight.bin", flown.make_dataflash(20.0))
     origins = {}
@@ -420,11 +414,6 @@ def test_log_without_rows_is_refused(tmp_path: Path) -> None:
     path = flown.write(tmp_path / "empty.bin", flown.dataflash_of(FORMATS, []))
     with pytest.raises(FlightError, match="nothing to play"):
         open_record(path, OPTIONS)
-
-
-def test_rows_without_counterpart_are_counted(tmp_path: Path) -> None:
-    log = open_record(write(tmp_path / "flight.bin"), OPTIONS)
-    assert log.without_counterpart == {"ODD": 40}
 
 
 @pytest.mark.parametrize("name", ["dataflash", "ulog"])

@@ -7,7 +7,7 @@ import pytest
 from gateway.recordings.play import Player, PlayState
 from gateway.recordings.tlog import TlogRecord
 from gateway.wire.mavlink_splitter import origin_of
-from tests.recordings.frames import START_US, STEP_US, make_frames, make_records, make_tlog
+from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 from tests.recordings.test_track import make_track
 
 MANY = 10_000
@@ -194,7 +194,3 @@ def test_empty_recording_ends_at_once() -> None:
     player = make_player([])
     assert play_to_end(player) == []
     assert player.state is PlayState.ENDED
-
-
-def test_frames_of_the_recording_are_distinct() -> None:
-    assert len(set(make_frames(100))) == 100

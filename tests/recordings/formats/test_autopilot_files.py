@@ -33,20 +33,31 @@ pytestmark = pytest.mark.io
 
 TODAY = GatewaySettings()
 
-MAKERS: dict[str, tuple[Callable[[], bytes], int]] = {
-    "new.ulg": (flown.make_ulog, 7),
-    "old.ulg": (lambda: flown.make_ulog(old=True), 7),
+MAKERS: dict[str, tuple[Callable[[float], bytes], int]] = {
+    "new.ulg": (lambda seconds: flown.make_ulog(seconds=seconds), 7),
+    "old.ulg": (lambda seconds: flown.make_ulog(old=True, seconds=seconds), 7),
     "flight.bin": (flown.make_dataflash, 9),
     "flight.log": (flown.make_dataflash_text, 9),
 }
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def make_logs(tmp_path_factory: pytest.TempPathFactory, seconds: float) -> Path:
     folder = tmp_path_factory.mktemp("logs")
     for name, (make, _) in MAKERS.items():
-        flown.write(folder / name, make())
+        flown.write(folder / name, make(seconds))
     return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs of the whole flight."""
+    return make_logs(tmp_path_factory, flown.DURATION_S)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs of its first third, which are read many times."""
+    return make_logs(tmp_path_factory, flown.DURATION_S / 3)
 
 
 @cache
@@ -183,21 +194,21 @@ def test_info_convert_and_play_accept_autopilot_logs(folder: Path, tmp_path: Pat
 
 
 def test_missing_package_is_named(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delitem(sys.modules, "gateway.recordings.formats.ulog", raising=False)
     monkeypatch.setitem(sys.modules, "pyulog", None)
-    text = run("convert", folder / "new.ulg", "-o", tmp_path / "x.csv", code=2)
+    text = run("convert", short / "new.ulg", "-o", tmp_path / "x.csv", code=2)
     assert "needs the extra formats" in text
 
 
 @pytest.mark.parametrize("name", ["new.ulg", "flight.bin"])
-def test_damage_is_counted_and_reported(folder: Path, tmp_path: Path, name: str) -> None:
-    data = (folder / name).read_bytes()
-    _, all_rows = whole(folder / name)
+def test_damage_is_counted_and_reported(short: Path, tmp_path: Path, name: str) -> None:
+    data = (short / name).read_bytes()
+    _, all_rows = whole(short / name)
     middle = len(data) // 2
     spoilt = flown.write(
-        tmp_path / name, data[:middle] + b"\x00\xff" * 300 + data[middle + 77 : -11]
+        tmp_path / name, data[:middle] + b"\x00\xff" * 300 + data[middle + 777 : -11]
     )
     table, rows = rows_of(spoilt)
     assert len(all_rows) > len(rows) > 0.9 * len(all_rows)
@@ -216,11 +227,11 @@ CONSOLE = b"INFO  [blackbox] log file opened, free space 14 GB\r\n"
     ids=["zeros", "erased", "text", "zeros and text"],
 )
 def test_bytes_before_a_log_are_left_out_and_reported(
-    folder: Path, tmp_path: Path, name: str, before: bytes
+    short: Path, tmp_path: Path, name: str, before: bytes
 ) -> None:
-    path = flown.write(tmp_path / name, before + (folder / name).read_bytes())
+    path = flown.write(tmp_path / name, before + (short / name).read_bytes())
     table, rows = rows_of(path)
-    assert repr(rows) == repr(whole(folder / name)[1])
+    assert repr(rows) == repr(whole(short / name)[1])
     # Text before a log of text is a title.
     size = len(before.rstrip(CONSOLE)) if name == "flight.log" else len(before)
     said = [f"{path}: left out {size} bytes before its first message"] if size else []
@@ -228,26 +239,26 @@ def test_bytes_before_a_log_are_left_out_and_reported(
 
 
 @pytest.mark.parametrize("name", ["new.ulg", "old.ulg", "flight.bin"])
-def test_samples_behind_a_lost_header_are_read(folder: Path, tmp_path: Path, name: str) -> None:
-    data = bytes(90) + (folder / name).read_bytes()[90:]
+def test_samples_behind_a_lost_header_are_read(short: Path, tmp_path: Path, name: str) -> None:
+    data = bytes(90) + (short / name).read_bytes()[90:]
     table, rows = rows_of(flown.write(tmp_path / name, data))
-    assert len(rows) == len(whole(folder / name)[1])
+    assert len(rows) == len(whole(short / name)[1])
     assert any("before its first message" in remark for remark in table.remarks)
 
 
-def test_download_of_a_log_in_a_tlog_is_a_tlog(folder: Path, tmp_path: Path) -> None:
+def test_download_of_a_log_in_a_tlog_is_a_tlog(short: Path, tmp_path: Path) -> None:
     frame = b"\xfd\x09\0\0\0\x01\x01\0\0\0" + bytes(11)
     for name in ("new.ulg", "flight.bin"):
-        data = bytes(8) + frame + bytes(8) + frame[:12] + (folder / name).read_bytes()[:500]
+        data = bytes(8) + frame + bytes(8) + frame[:12] + (short / name).read_bytes()[:500]
         assert format_of(flown.write(tmp_path / "download.tlog", data)) == TLOG
 
 
 @pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.01])
 def test_log_cut_before_its_samples_is_refused(
-    folder: Path, tmp_path: Path, name: str, share: float
+    short: Path, tmp_path: Path, name: str, share: float
 ) -> None:
-    data = (folder / name).read_bytes()
+    data = (short / name).read_bytes()
     stub = flown.write(tmp_path / name, data[: 100 + int(share * 8000)])
     with pytest.raises(FlightError, match=name):
         list(open_rows(stub, OPTIONS).rows)
@@ -288,13 +299,13 @@ def test_ulog_with_endless_formats_is_refused(tmp_path: Path, formats: list[str]
     ],
 )
 def test_unreadable_end_of_a_ulog_is_reported(
-    folder: Path, tmp_path: Path, odd: bytes, is_read: bool
+    short: Path, tmp_path: Path, odd: bytes, is_read: bool
 ) -> None:
-    data = (folder / "new.ulg").read_bytes()
+    data = (short / "new.ulg").read_bytes()
     middle = data.index(flown.SYNC, len(data) - 40_000) - 3
     spoilt = flown.write(tmp_path / "odd.ulg", data[:middle] + odd + data[middle:])
     table, rows = rows_of(spoilt)
-    assert len(rows) > 0.4 * len(whole(folder / "new.ulg")[1])
+    assert len(rows) > 0.4 * len(whole(short / "new.ulg")[1])
     lost = len(data) - middle + (0 if is_read else len(odd))
     assert f"left out {lost} bytes at its end" in " ".join(table.remarks)
 
@@ -304,34 +315,34 @@ def test_dataflash_log_with_an_unknown_value_type_is_refused(
     tmp_path: Path, letters: bytes
 ) -> None:
     layout = flown.packed("FMT", (200, 12, b"NEW", letters, b"TimeUS,X"))
-    data = flown.make_dataflash()
+    data = flown.make_dataflash(1.0)
     path = flown.write(tmp_path / "odd.bin", data[:89] + layout + data[89:])
     with pytest.raises(FlightError, match=r"odd.bin: its list of formats is damaged"):
         rows_of(path)
 
 
-def test_invalid_lines_of_a_text_log_are_counted(folder: Path, tmp_path: Path) -> None:
-    lines = (folder / "flight.log").read_bytes().splitlines(keepends=True)
-    _, all_rows = whole(folder / "flight.log")
+def test_invalid_lines_of_a_text_log_are_counted(short: Path, tmp_path: Path) -> None:
+    lines = (short / "flight.log").read_bytes().splitlines(keepends=True)
+    _, all_rows = whole(short / "flight.log")
     numbers = [k for k, line in enumerate(lines) if line.startswith(b"IMU, ")]
-    short, wrong, nameless = numbers[50], numbers[70], numbers[90]
-    lines[short] = lines[short][:20] + b"\n"
+    cut, wrong, nameless = numbers[50], numbers[70], numbers[90]
+    lines[cut] = lines[cut][:20] + b"\n"
     lines[wrong] = lines[wrong].replace(b".", b"x")
     lines[nameless] = lines[nameless].replace(b"IMU", b"I%U")
     table, rows = rows_of(flown.write(tmp_path / "odd.log", b"".join(lines)))
     times_us = [row.time_us for row in rows if row.imu is not None]
     assert len(times_us) == len(set(times_us)) == sum(r.imu is not None for r in all_rows) - 3
     assert [r for r in table.remarks if "left out 3 messages that cannot be understood" in r]
-    assert not any("cannot be understood" in r for r in whole(folder / "flight.log")[0].remarks)
+    assert not any("cannot be understood" in r for r in whole(short / "flight.log")[0].remarks)
 
 
 @pytest.mark.parametrize("name", ["flight.bin", "flight.log"])
 def test_log_truncated_while_read_is_still_read_whole(
-    folder: Path, tmp_path: Path, name: str
+    short: Path, tmp_path: Path, name: str
 ) -> None:
-    log = flown.write(tmp_path / name, (folder / name).read_bytes())
+    log = flown.write(tmp_path / name, (short / name).read_bytes())
     table = open_rows(log, OPTIONS)
     rows = table.plain_rows
     first = next(rows)
     os.truncate(log, 0)
-    assert repr([first, *rows]) == repr(whole(folder / name)[1])
+    assert repr([first, *rows]) == repr(whole(short / name)[1])
