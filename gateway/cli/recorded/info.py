@@ -70,6 +70,8 @@ def info(
     if not files:
         _list_all(json=json)
         return
+    if (folder := next(filter(Path.is_dir, files), None)) is not None:
+        refuse(f"{folder}: is a folder; `mavgate catalogue {folder}` indexes it")
     # A file needs no settings, which would import every stage.
     files = recorded_files(files, "all")
     with progress_of(files) as advance:

@@ -109,6 +109,10 @@ def test_demo_flies_the_named_recording(config: Path) -> None:
     assert next(frames).data
 
 
+def test_folder_is_refused_with_the_command_for_folders(tmp_path: Path) -> None:
+    assert f"`mavgate catalogue {tmp_path}` indexes it" in run("info", tmp_path, code=2)
+
+
 def test_unknown_name_is_refused(config: Path) -> None:
     result = invoke("info", "sea", "--config", config, code=2)
     assert "`mavgate info` lists them" in result.output
