@@ -61,7 +61,7 @@ class RecordedParameter:
 
 def parameter_text(value: float) -> str:
     """Return a value with the fewest digits that give the same single-precision float."""
-    if value.is_integer() and abs(value) < 1 << 53:
+    if float(value).is_integer() and abs(value) < 1 << 53:
         return str(int(value))
     return str(np.float32(value))
 

@@ -247,6 +247,17 @@ def test_diff_shows_the_defaults_that_a_log_states(tmp_path: Path) -> None:
     assert found["known"] == {"FRAME_CLASS": ["8", ""]}
 
 
+def test_diff_shows_the_defaults_that_a_ulog_states(tmp_path: Path) -> None:
+    key = b"int32_t MAV_SYS_ID"
+    default = flown.ulog_message(b"Q", bytes([1, len(key)]) + key + struct.pack("<i", 1))
+    path, other = tmp_path / "flight.ulg", tmp_path / "other.param"
+    path.write_bytes(px4_log() + default)
+    other.write_text("MAV_SYS_ID,9\n")
+    found = json.loads(run("diff", path, other, "--json"))
+    assert found["parameters"] == {"MAV_SYS_ID": ["7", "9"]}
+    assert found["known"] == {"MAV_SYS_ID": ["1", ""]}
+
+
 def test_map_shows_the_autopilots_own_positions_or_fused_ones(tmp_path: Path) -> None:
     path = write(tmp_path / "flight.bin")
     out = tmp_path / "flight.geojson"
