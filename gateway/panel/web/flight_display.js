@@ -4,11 +4,6 @@
 // moves at the screen's own rate. Nothing is drawn while nothing moves.
 
 const RAD = 180 / Math.PI;
-const UNITS = {
-  metric: { speed: [1, "m/s"], height: [1, "m"], climb: [1, "m/s"] },
-  imperial: { speed: [2.236936, "mph"], height: [3.28084, "ft"], climb: [3.28084, "ft/s"] },
-  aviation: { speed: [1.943844, "kt"], height: [3.28084, "ft"], climb: [196.8504, "ft/min"] },
-};
 const FULL_CLIMB = { metric: 6, imperial: 20, aviation: 1200 };
 const TAU_S = 0.04; // of the glide: below two frames of a slow screen
 const FORESEE_S = 0.12; // longest extrapolation by the newest rates
@@ -20,7 +15,6 @@ const BOX = "#0b1016";
 const TAPE = "rgba(9,15,22,0.55)";
 
 const known = (v) => typeof v === "number" && Number.isFinite(v);
-const wrap = (deg) => ((((deg + 180) % 360) + 360) % 360) - 180;
 
 function product(a, b) {
   return [
@@ -38,21 +32,6 @@ function turned(q, rates, seconds) {
   return product(q, [Math.cos(angle / 2), rates[0] * s, rates[1] * s, rates[2] * s]);
 }
 
-function between(a, b, share) {
-  const sign = a.reduce((sum, v, n) => sum + v * b[n], 0) < 0 ? -1 : 1;
-  const mixed = a.map((v, n) => v + (sign * b[n] - v) * share);
-  const norm = Math.hypot(...mixed);
-  return mixed.map((v) => v / norm);
-}
-
-function euler([w, x, y, z]) {
-  return {
-    roll: Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) * RAD,
-    pitch: Math.asin(Math.max(-1, Math.min(1, 2 * (w * y - z * x)))) * RAD,
-    yaw: (Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) * RAD + 360) % 360,
-  };
-}
-
 export default {
   template: `<div class="flight-display" role="img" :aria-label="spoken"
     style="overflow: hidden; border-radius: 10px; background: #0b1016">
@@ -67,7 +46,7 @@ export default {
     this.watcher = new ResizeObserver(() => this.fit());
     this.watcher.observe(this.$el);
     this.fit();
-    this.leave = window.mavgate?.subscribe((state) => this.show(state));
+    this.leave = mavgate.subscribe((state) => this.show(state));
   },
   unmounted() {
     this.leave?.();
@@ -78,8 +57,8 @@ export default {
   methods: {
     show(instant) {
       const news = instant?.time_us !== this.goal?.time_us;
-      if (!news && this.units === window.mavgate?.units) return;
-      this.units = window.mavgate?.units ?? "metric";
+      if (!news && this.units === mavgate.units) return;
+      this.units = mavgate.units;
       this.goal = instant;
       if (news) this.cameAt = performance.now();
       clearTimeout(this.staleTimer);
@@ -121,7 +100,7 @@ export default {
       if (goal.q_nb && goal.q_nb.every(known)) {
         const rates = goal.rate_b_radps && goal.rate_b_radps.every(known) ? goal.rate_b_radps : null;
         const ahead = rates ? turned(goal.q_nb, rates, Math.min(age, FORESEE_S)) : goal.q_nb;
-        shown.q = this.shown.q ? between(this.shown.q, ahead, share) : ahead;
+        shown.q = this.shown.q ? mavgate.mixed(this.shown.q, ahead, share) : ahead;
         const dot = shown.q.reduce((sum, v, n) => sum + v * ahead[n], 0);
         if (age < FORESEE_S || Math.abs(dot) < 1 - 1e-9) this.moving = true;
       }
@@ -144,28 +123,29 @@ export default {
       if (w < 40 || h < 40) return;
       const s = this.shown;
       // A moment of the past, which somebody chose, is never old.
-      const chosen = window.mavgate?.past_us != null;
+      const chosen = mavgate.past_us !== null;
       const stale = !this.goal || (!chosen && ((now - this.cameAt) / 1000 > STALE_S || this.goal.silent_s > 5));
-      const angles = s.q ? euler(s.q) : null;
+      const [roll, pitch, yaw] = s.q ? mavgate.euler_deg(s.q) : [];
+      const angles = s.q ? { roll, pitch, yaw } : null;
       const u = Math.min(w / 100, h / 75); // the unit of everything: 1 % of a 4:3 screen
       const font = (size) => `600 ${Math.max(size * u, 9).toFixed(1)}px "Roboto Condensed", Roboto, sans-serif`;
       const box = { g, u, w, h, font };
       this.horizon(box, angles);
       this.rollArc(box, angles);
-      const unit = UNITS[this.units] || UNITS.metric;
+      const [of_speed, of_height, of_climb] = ["speed", "altitude", "climb"].map(mavgate.scale);
       // What glides to zero never is it.
       const has_airspeed = known(s.airspeed_mps) && this.goal?.airspeed_mps > 0;
       const speed = has_airspeed ? s.airspeed_mps : s.groundspeed_mps;
       const speedName = has_airspeed ? "AS" : "GS";
-      this.tape(box, true, speed, unit.speed, speedName, s.groundspeed_mps);
+      this.tape(box, true, speed, of_speed, speedName, s.groundspeed_mps);
       const height = known(s.alt_home_m) ? s.alt_home_m : s.alt_amsl_m;
       const heightName = known(s.alt_home_m) ? "HOME" : "AMSL";
-      this.tape(box, false, height, unit.height, heightName, s.alt_amsl_m);
-      this.climb(box, s.climb_mps, unit.climb);
+      this.tape(box, false, height, of_height, heightName, s.alt_amsl_m);
+      this.climb(box, s.climb_mps, of_climb);
       this.ribbon(box, angles);
       if (stale) this.cross(box, this.goal ? "NO ATTITUDE" : "NO AIRCRAFT");
       else if (!angles) this.cross(box, "NO ATTITUDE");
-      this.say(now, angles, speed, height, s.climb_mps, stale, unit);
+      this.say(now, angles, stale, [speed, of_speed], [height, of_height], [s.climb_mps, of_climb]);
     },
     horizon({ g, u, w, h, font }, angles) {
       const pitch = angles ? angles.pitch : 0;
@@ -188,10 +168,7 @@ export default {
       g.fillRect(-far, 0, 2 * far, far + 90 * step);
       g.strokeStyle = INK;
       g.lineWidth = Math.max(1.5, 0.35 * u);
-      g.beginPath();
-      g.moveTo(-far, 0);
-      g.lineTo(far, 0);
-      g.stroke();
+      mavgate.line(g, [-far, 0], [far, 0]);
       this.ladder({ g, u, font }, pitch, step);
       g.restore();
       this.wings({ g, u, w, h });
@@ -259,10 +236,7 @@ export default {
         for (const side of [-1, 1]) {
           g.save();
           g.rotate((side * deg) / RAD);
-          g.beginPath();
-          g.moveTo(0, -radius);
-          g.lineTo(0, -radius - (deg % 30 === 0 ? 2.4 : 1.4) * u);
-          g.stroke();
+          mavgate.line(g, [0, -radius], [0, -radius - (deg % 30 === 0 ? 2.4 : 1.4) * u]);
           g.restore();
         }
       }
@@ -305,10 +279,7 @@ export default {
           const major = n % span.each === 0;
           const edge = left ? x + width : x;
           const inward = (left ? -1 : 1) * (major ? 2.2 : 1.2) * u;
-          g.beginPath();
-          g.moveTo(edge, y);
-          g.lineTo(edge + inward, y);
-          g.stroke();
+          mavgate.line(g, [edge, y], [edge + inward, y]);
           if (major) g.fillText(Math.round(tick), edge + (left ? -3.2 : 3.2) * u, y);
         }
       }
@@ -356,7 +327,7 @@ export default {
       const bottom = h - 9 * u;
       const top = 5 * u;
       const middle = h / 2;
-      const full = FULL_CLIMB[this.units] || FULL_CLIMB.metric;
+      const full = FULL_CLIMB[this.units];
       const reach = Math.min(middle - top, bottom - middle) - Math.max(5.2 * u, 12);
       // A root scale: small rates are those that are flown by.
       const at = (v) => -Math.sign(v) * Math.sqrt(Math.min(Math.abs(v) / full, 1)) * reach;
@@ -370,10 +341,7 @@ export default {
       g.textBaseline = "middle";
       for (const share of [-1, -0.5, -1 / 6, 0, 1 / 6, 0.5, 1]) {
         const y = middle + at(share * full);
-        g.beginPath();
-        g.moveTo(x, y);
-        g.lineTo(x + (share === 0 ? 2 : 1.1) * u, y);
-        g.stroke();
+        mavgate.line(g, [x, y], [x + (share === 0 ? 2 : 1.1) * u, y]);
         if (share) g.fillText(Math.abs(share * full).toFixed(0), x + 1.6 * u, y);
       }
       g.textAlign = "center";
@@ -410,10 +378,7 @@ export default {
         for (let deg = first; deg < heading + 60; deg += 5) {
           const x = w / 2 + (deg - heading) * pixels;
           const round = ((deg % 360) + 360) % 360;
-          g.beginPath();
-          g.moveTo(x, y);
-          g.lineTo(x, y + (round % 10 === 0 ? 1.9 : 1.1) * u);
-          g.stroke();
+          mavgate.line(g, [x, y], [x, y + (round % 10 === 0 ? 1.9 : 1.1) * u]);
           if (round % 30) continue;
           g.font = font(round % 90 ? 2.7 : 3.4);
           g.fillText(names[round] ?? String(round).padStart(3, "0"), x, y + 4.4 * u);
@@ -439,7 +404,7 @@ export default {
       const bearing = this.goal?.mark_bearing_deg;
       if (!known(bearing)) return;
       const half = w / 2 - 1.5 * u;
-      const off = Math.max(-half, Math.min(half, wrap(bearing - heading) * pixels));
+      const off = Math.max(-half, Math.min(half, mavgate.wrap_deg(bearing - heading) * pixels));
       g.fillStyle = MARK;
       triangle(g, w / 2 + off, y + 6.2 * u, 1.5 * u, 2.4 * u);
     },
@@ -466,7 +431,7 @@ export default {
       g.fillText(text, w / 2, h / 2);
       g.restore();
     },
-    say(now, angles, speed, height, climb, stale, unit) {
+    say(now, angles, stale, speed, height, climb) {
       this.$el.dataset.timeUs = this.goal?.time_us ?? "";
       if (now - this.spokenAt < 200 && this.moving) return;
       this.spokenAt = now;
@@ -474,11 +439,11 @@ export default {
         this.spoken = this.goal ? "Flight display: no attitude" : "Flight display: no aircraft";
         return;
       }
-      const in_ = (v, [factor, name]) => (known(v) ? `${plain(v * factor, 1)} ${name}` : "unknown");
+      const in_ = ([v, [factor, name]]) => (known(v) ? `${plain(v * factor, 1)} ${name}` : "unknown");
       this.spoken =
         `Roll ${plain(angles.roll, 1)}°, pitch ${plain(angles.pitch, 1)}°, ` +
-        `heading ${angles.yaw.toFixed(1)}°, speed ${in_(speed, unit.speed)}, ` +
-        `altitude ${in_(height, unit.height)}, climb ${in_(climb, unit.climb)}`;
+        `heading ${angles.yaw.toFixed(1)}°, speed ${in_(speed)}, ` +
+        `altitude ${in_(height)}, climb ${in_(climb)}`;
     },
   },
 };

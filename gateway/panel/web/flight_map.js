@@ -81,12 +81,7 @@ const MetricGrid = CanvasLayer.extend({
         draw(origin + n * pixels, `${Math.round(n * step * 1000) / 1000} ${unit}`);
       }
     };
-    const stroke = (x1, y1, x2, y2) => {
-      pen.beginPath();
-      pen.moveTo(x1, y1);
-      pen.lineTo(x2, y2);
-      pen.stroke();
-    };
+    const stroke = (x1, y1, x2, y2) => mavgate.line(pen, [x1, y1], [x2, y2]);
     lines(0, size.x, here.x, (x, text) => {
       stroke(x, 0, x, size.y);
       pen.fillText(text, x + 3, size.y - 5);

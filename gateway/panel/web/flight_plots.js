@@ -66,20 +66,14 @@ export default {
       pen.textAlign = "right";
       for (const tick of group.is_heading ? [0, 90, 180, 270, 360] : ticks(low, high, 4)) {
         pen.strokeStyle = line;
-        pen.beginPath();
-        pen.moveTo(LEFT, y(tick));
-        pen.lineTo(width - RIGHT, y(tick));
-        pen.stroke();
+        mavgate.line(pen, [LEFT, y(tick)], [width - RIGHT, y(tick)]);
         pen.fillStyle = soft;
         pen.fillText(Number(tick.toPrecision(6)), LEFT - 6, y(tick));
       }
       pen.textAlign = "center";
       for (const tick of ticks(from, to, Math.max(LEAST_MARKS, width / 110), [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600])) {
         pen.strokeStyle = line;
-        pen.beginPath();
-        pen.moveTo(x(tick), top);
-        pen.lineTo(x(tick), height - BOTTOM);
-        pen.stroke();
+        mavgate.line(pen, [x(tick), top], [x(tick), height - BOTTOM]);
         pen.fillStyle = soft;
         pen.fillText(mavgate.clock(tick), x(tick), height - 8);
       }
@@ -97,10 +91,7 @@ export default {
         pen.strokeStyle = pen.fillStyle = colours[n % colours.length];
         pen.setLineDash(DASHES[n % DASHES.length]);
         pen.lineWidth = 2;
-        pen.beginPath();
-        pen.moveTo(label_x, label_y);
-        pen.lineTo(label_x + 20, label_y);
-        pen.stroke();
+        mavgate.line(pen, [label_x, label_y], [label_x + 20, label_y]);
         pen.fillText(name, label_x + 25, label_y);
         label_x += 41 + pen.measureText(name).width;
       });

@@ -32,7 +32,7 @@ function items_of(state) {
   const past = mavgate.past_us !== null;
   const age = (name) => (past ? 0 : (state[name] ?? 0));
   const q = state.q_nb;
-  const angles = q && q[0] !== null ? euler(q) : [null, null, null];
+  const angles = q && q[0] !== null ? mavgate.euler_deg(q) : [null, null, null];
   const angle = (value, digits = 1) => (Number.isFinite(value) ? value.toFixed(digits) : "—");
   const heading = Number.isFinite(angles[2]) ? angles[2] : state.heading_deg;
   const here = [state.lat_deg, state.lon_deg];
@@ -71,13 +71,5 @@ function items_of(state) {
     ...(state.mark ? [position("Mark at", state.mark.lat_deg, state.mark.lon_deg)] : []),
     item("Satellites", state.fix_type ? angle(state.satellites, 0) : "—", "", "gps_s"),
     ...(Number.isFinite(state.battery_v) ? [item("Battery", state.battery_v.toFixed(2), Number.isFinite(state.battery_percent) ? `V ${Math.round(state.battery_percent)} %` : "V", "battery_s")] : []),
-  ];
-}
-
-function euler([w, x, y, z]) {
-  return [
-    Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) / rad,
-    Math.asin(Math.max(-1, Math.min(1, 2 * (w * y - z * x)))) / rad,
-    (Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / rad + 360) % 360,
   ];
 }

@@ -46,6 +46,23 @@
       return [(value / factor).toFixed(digits), unit];
     },
     factor: (quantity) => FACTORS[bus.units][quantity][0],
+    // The page's unit of a quantity: how many of it one of SI is, and its name.
+    scale: (quantity) => [1 / FACTORS[bus.units][quantity][0], FACTORS[bus.units][quantity][1]],
+    wrap_deg,
+    mixed,
+    // Roll, pitch and yaw of a quaternion in degrees.
+    euler_deg: ([w, x, y, z]) => [
+      Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) / rad,
+      Math.asin(Math.max(-1, Math.min(1, 2 * (w * y - z * x)))) / rad,
+      (Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / rad + 360) % 360,
+    ],
+    // Draws a line through points.
+    line(pen, begin, ...points) {
+      pen.beginPath();
+      pen.moveTo(...begin);
+      for (const point of points) pen.lineTo(...point);
+      pen.stroke();
+    },
     // A moment of a flight: 3:12, 1:03:12.
     clock(seconds) {
       const [h, m, s] = parts_of(seconds);
@@ -110,7 +127,7 @@
     },
     distance_m(a, b) {
       const north = (b[0] - a[0]) * rad * EARTH_M;
-      const east = ((((b[1] - a[1] + 540) % 360) + 360) % 360 - 180) * rad * EARTH_M * Math.cos(a[0] * rad);
+      const east = wrap_deg(b[1] - a[1]) * rad * EARTH_M * Math.cos(a[0] * rad);
       return Math.hypot(north, east);
     },
     bearing_deg([lat, lon], [to_lat, to_lon]) {
@@ -137,6 +154,18 @@
     },
   };
   window.mavgate = bus;
+
+  function wrap_deg(angle) {
+    return ((((angle + 180) % 360) + 360) % 360) - 180;
+  }
+
+  // A quaternion between two, by a share of the way.
+  function mixed(p, q, share) {
+    const sign = p.reduce((sum, v, n) => sum + v * q[n], 0) < 0 ? -1 : 1;
+    const sum = p.map((v, n) => v + (sign * q[n] - v) * share);
+    const norm = Math.hypot(...sum);
+    return sum.map((v) => v / norm);
+  }
 
   function parts_of(seconds) {
     const whole = Math.max(0, Math.floor(seconds));
@@ -178,17 +207,12 @@
       const [field, index] = name.split(".");
       const [a, b] = [column[low], column[next]];
       let value = a === null || b === null ? a : a + (b - a) * share;
-      if (field === "heading_deg" && a !== null && b !== null) value = (a + ((((b - a + 540) % 360) + 360) % 360 - 180) * share + 360) % 360;
+      if (field === "heading_deg" && a !== null && b !== null) value = (a + wrap_deg(b - a) * share + 360) % 360;
       if (index === undefined) state[field] = value;
       else (state[field] = index === "0" ? [] : state[field])[index] = value;
     }
     const [p, q] = [low, next].map((row) => [0, 1, 2, 3].map((n) => history[`q_nb.${n}`][row]));
-    if (p[0] !== null && q[0] !== null) {
-      const sign = p.reduce((sum, v, n) => sum + v * q[n], 0) < 0 ? -1 : 1;
-      const mixed = p.map((v, n) => v + (sign * q[n] - v) * share);
-      const norm = Math.hypot(...mixed);
-      state.q_nb = mixed.map((v) => v / norm);
-    }
+    if (p[0] !== null && q[0] !== null) state.q_nb = mixed(p, q, share);
     return state;
   }
   bus.state_at = state_at;
