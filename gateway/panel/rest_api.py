@@ -16,7 +16,7 @@ import json
 import time
 from collections import Counter, deque
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Set
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
@@ -185,7 +185,7 @@ def _iso_time(time_s: float) -> str:
 class Subscriber:
     """A client that receives some kinds of message of some systems."""
 
-    def __init__(self, names: Set[str], systems: SystemFilter = NO_FILTER) -> None:
+    def __init__(self, names: Set[str], systems: SystemFilter) -> None:
         self.names = names
         self.systems = systems
         self.dropped = 0
@@ -210,37 +210,6 @@ class Subscriber:
         data = self._waiting.popleft()
         self._bytes -= len(data)
         return data
-
-
-class MessageStream:
-    """Pass messages to subscribers."""
-
-    def __init__(self) -> None:
-        self._subscribers: list[Subscriber] = []
-
-    @contextmanager
-    def subscribe(self, names: Set[str], systems: SystemFilter = NO_FILTER) -> Iterator[Subscriber]:
-        """Receive some kinds of message of some systems for a while."""
-        subscriber = Subscriber(names, systems)
-        self._subscribers.append(subscriber)
-        try:
-            yield subscriber
-        finally:
-            self._subscribers.remove(subscriber)
-
-    def send(self, message: Any) -> None:
-        """Pass on one decoded message."""
-        origin = message.get_srcSystem(), message.get_srcComponent()
-        subscribers = [
-            each
-            for each in self._subscribers
-            if message.msgname in each.names and each.systems.has(origin)
-        ]
-        if not subscribers:
-            return
-        text = pretty(with_header(message))
-        for subscriber in subscribers:
-            subscriber.push(text)
 
 
 def names_matching(pattern: str) -> frozenset[str]:
@@ -296,7 +265,7 @@ class RestApi:
     def __init__(self, uplink: Uplink) -> None:
         self._uplink = uplink
         self._book = MessageBook(time.time)
-        self._stream = MessageStream()
+        self._subscribers: list[Subscriber] = []
         self._encoding = asyncio.Lock()
         uplink.listen(self._on_message)
 
@@ -386,12 +355,14 @@ class RestApi:
             await socket.send_text(pretty({"error": str(error)}))
             await socket.close(WS_INVALID)
             return
-        with self._stream.subscribe(names, systems) as subscriber:
-            sending = asyncio.create_task(_send_all(socket, subscriber))
-            try:
-                await self._read_all(socket, subscriber)
-            finally:
-                sending.cancel()
+        subscriber = Subscriber(names, systems)
+        self._subscribers.append(subscriber)
+        sending = asyncio.create_task(_send_all(socket, subscriber))
+        try:
+            await self._read_all(socket, subscriber)
+        finally:
+            sending.cancel()
+            self._subscribers.remove(subscriber)
 
     def _router(self, prefix: str, *, shown: bool) -> APIRouter:
         router = APIRouter(prefix=prefix, tags=["mavlink"])
@@ -445,7 +416,16 @@ class RestApi:
 
     def _on_message(self, message: Any) -> None:
         self._book.add(message)
-        self._stream.send(message)
+        origin = message.get_srcSystem(), message.get_srcComponent()
+        subscribers = [
+            each
+            for each in self._subscribers
+            if message.msgname in each.names and each.systems.has(origin)
+        ]
+        if subscribers:
+            text = pretty(with_header(message))
+            for subscriber in subscribers:
+                subscriber.push(text)
 
 
 async def _send_all(socket: WebSocket, subscriber: Subscriber) -> None:

@@ -22,6 +22,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
+from gateway.hub.systems import NO_FILTER
 from gateway.panel.access import COOKIE, AccessControl
 from gateway.panel.logins import Logins, hash_password
 from gateway.panel.panel_settings import PanelSettings
@@ -371,7 +372,7 @@ class TestFollowing:
         assert names_matching("^(ATTITUDE|HEARTBEAT)$") == {"ATTITUDE", "HEARTBEAT"}
 
     async def test_queue_of_a_subscriber_is_bounded_in_bytes(self) -> None:
-        slow = Subscriber(set())
+        slow = Subscriber(set(), NO_FILTER)
         for size in (MAX_WAITING_BYTES, MAX_WAITING_BYTES // 2, 10, MAX_WAITING_BYTES + 1, 20):
             slow.push(bytes(size))
         assert slow.dropped == 4
