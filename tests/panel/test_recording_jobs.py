@@ -95,7 +95,7 @@ async def test_export_that_writes_too_much_is_stopped_and_deleted(
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(recording_jobs, "MAX_EXPORT", 1_000_000)
-    endless = 'head -c 1100000 /dev/zero > "$TMPDIR/part"; exec sleep 600'
+    endless = 'head -c 1100000 /dev/zero > "$TMPDIR/part"; exec sleep 5'
     monkeypatch.setattr(recording_jobs, "own_command", lambda _: ["sh", "-c", endless])
     jobs = RecordingJobs()
     with pytest.raises(ExportError, match="larger than 1 MB, and stopped: choose a shorter"):
