@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.fields import MAX_ROWS, SPAN_US, FieldHistory, fields_csv
+from gateway.panel.state.fields import MAX_KINDS, MAX_ROWS, SPAN_US, FieldHistory, fields_csv
 from gateway.units import US_PER_S
 
 
@@ -26,13 +26,23 @@ def test_numeric_fields_are_stored_with_time_and_unit() -> None:
 def test_array_elements_and_instances_are_separate_fields() -> None:
     history = FieldHistory()
     for instance, volt in ((0, 4000), (1, 3000)):
-        cells = [volt, *[65535] * 9]
+        cells = [volt, volt + 5, *[65535] * 8]
         message = mavlink.MAVLink_battery_status_message(
             instance, 0, 0, 0, cells, 100, 0, 0, 50, 0, 0, [0] * 4, 0, 0
         )
         history.add(1, message, 5)
     assert history.series(1, "BATTERY_STATUS[1].voltages[0]")[1].tolist() == [3000.0]
+    assert history.series(1, "BATTERY_STATUS[1].voltages[1]")[1].tolist() == [3005.0]
     assert history.unit(1, "BATTERY_STATUS[0].voltages[0]") == "mV"
+
+
+def test_number_of_messages_of_an_aircraft_is_bounded() -> None:
+    history = FieldHistory()
+    for instance in range(MAX_KINDS + 9):
+        history.add(
+            1, mavlink.MAVLink_battery_status_message(instance, *[0] * 3, [0] * 10, *[0] * 4), 0
+        )
+    assert len(history.fields(1)) == MAX_KINDS
 
 
 def test_texts_and_file_transfers_are_not_stored() -> None:

@@ -51,6 +51,7 @@ def test_path_has_a_few_points_a_second_and_fixes_apart(vehicle: VehicleState) -
         vehicle.update(fix(HERE[0] + step * 1e-4, HERE[1]), step)
     assert len(vehicle.history) == len(vehicle.history.track()) == 5
     assert vehicle.history.columns["alt_amsl_m"][0] == pytest.approx(100.0)
+    assert len(vehicle.fixes) == 2, "one that is repeated counts once"
     vehicle.restart_path()
     assert len(vehicle.history) == 0
     vehicle.update(fix(HERE[0], HERE[1]), 2)
