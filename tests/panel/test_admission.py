@@ -9,7 +9,7 @@ import pytest
 
 from gateway.panel.access import HOLDER
 from gateway.panel.admission import Holder, Places, Role
-from gateway.panel.logins import SESSIONS_OF_ROLE, BusyError, Logins, hash_password
+from gateway.panel.logins import SESSIONS_OF_ROLE, BusyError, FairTurns, Logins, hash_password
 from gateway.panel.open_pages import PENDING_OF_SESSION, OpenPages
 
 OPERATOR, VIEWER = Role.OPERATOR, Role.VIEWER
@@ -111,6 +111,25 @@ async def test_cancelled_login_passes_its_turn_on() -> None:
     for task in tasks[:2]:
         task.cancel()
     assert await tasks[2] is None
+
+
+async def test_turn_of_a_caller_cancelled_at_once_is_passed_on() -> None:
+    turns, may_end, done = FairTurns(), asyncio.Event(), []
+
+    async def call(number: int) -> None:
+        async with turns.turn("network", is_known=True):
+            await may_end.wait()
+            done.append(number)
+
+    tasks = [asyncio.create_task(call(number)) for number in range(3)]
+    await asyncio.sleep(0)
+    may_end.set()
+    # The first one ends, and gives its turn to the second, which is not run yet.
+    await asyncio.sleep(0)
+    tasks[1].cancel()
+    async with asyncio.timeout(60.0):
+        await tasks[2]
+    assert done == [0, 2]
 
 
 class Page:
