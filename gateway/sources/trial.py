@@ -102,13 +102,19 @@ class SourceTrial:
         """Sum up: rates, what is missing, and the map that would read CSV."""
         lines = [f"{kind}: {n}, {n / seconds:.1f} a second" for kind, n in self.counts.items()]
         attitude = "yes" if self._has_attitude or self.counts["ImuRaw"] else "no"
-        why = "" if attitude == "yes" else "; it needs accel_mps2 and gyro_dps in one object"
+        why = (
+            ""
+            if attitude == "yes"
+            else "; it needs accelerometer and gyroscope (lines: in one object)"
+        )
         lines.append(f"attitude: {attitude}{why}")
         if self.counts["ImuRaw"] and not self._has_mag:
-            lines.append("heading: only in flight, by GPS; it needs mag_ut")
+            lines.append("heading: only in flight, by GPS; it needs a compass (lines: mag_ut)")
         place = "yes" if self._has_height else "no"
         missing = (
-            "a height (alt_m or GGA)" if self._has_fix else "a fix: lat, lon and alt_m, or NMEA"
+            "a height (lines: alt_m or GGA)"
+            if self._has_fix
+            else "a fix (lines: lat, lon and alt_m, or NMEA)"
         )
         lines.append(f"position: {place}" + ("" if self._has_height else f"; it needs {missing}"))
         if self._header and not self.counts["ImuRaw"]:

@@ -85,7 +85,7 @@ def test_trial_names_rates_what_is_missing_and_a_map() -> None:
     assert shown[0].startswith("not used (text): 'time,acc_x,acc_y,acc_z'")
     summary = trial.summary(2.0)
     assert "fault text: 2, 1.0 a second" in summary
-    assert "attitude: no; it needs accel_mps2 and gyro_dps in one object" in summary
+    assert "attitude: no; it needs accelerometer and gyroscope (lines: in one object)" in summary
     assert "position: yes" in summary
     assert 'accel_y_b_mps2 = { column = "acc_y", scale = 1 }' in summary
 
