@@ -1,29 +1,23 @@
-"""Carriers of an output's bytes: UDP, TCP, TLS, a listening port, or a serial line.
+"""Carriers of an output's bytes: the transports of the hub, and TLS."""
 
-Outputs are slow and periodic, so the transports of asyncio serve: a peer that does not keep up
-loses whole messages, and the next ones are newer.
-"""
-
-import asyncio
-import os
 import ssl
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
-import serial
+from gateway.hub.endpoint import Endpoint, parse_endpoint
+from gateway.hub.transports.base import Client, HubContext, Listener
+from gateway.hub.transports.registry import CLIENTS, LISTENERS
+from gateway.hub.transports.tcp import TcpClient
+from gateway.hub.transports.ws_protocol import TlsLayer
+from gateway.records import EVERYBODY
+from gateway.wire.mavlink_splitter import MavFrame
 
-from gateway.hub.endpoint import Endpoint, EndpointKind, parse_endpoint
-from gateway.printable import reason_of
-
-MAX_WAITING_BYTES: Final = 8192
-"""Some seconds of an output; a peer for which more waits is sent no more meanwhile."""
 TLS: Final = "tls"
-LISTEN: Final = EndpointKind.TCP_LISTEN
-DATAGRAMS: Final = frozenset(
-    {EndpointKind.UDP, EndpointKind.UDP_BROADCAST, EndpointKind.UDP_MULTICAST}
-)
-CONNECT_LIMIT_S: Final = 10.0
+NO_MESSAGE: Final = -1
+
+MakeContext = Callable[[], ssl.SSLContext]
+"""Makes the context of TLS, or raises OSError."""
 
 
 def target_of(location: str, kinds: Collection[str]) -> tuple[str, Endpoint]:
@@ -40,157 +34,115 @@ def target_of(location: str, kinds: Collection[str]) -> tuple[str, Endpoint]:
 
 
 class Carrier:
-    """Carry bytes to all present peers of one target, such as `tcp-listen:127.0.0.1:10110`.
+    """Carry the bytes of an output to all present peers of its target.
 
-    It may be one of `kinds`, and a listening port has at most `max_clients`. `on_state` is called
-    with a state and its reason when they change, and `tls` makes the context of TLS.
+    It stands between the hub and a transport: the transport's peers are no clients of the hub, and
+    what they send is dropped. `tls` makes the context of TLS.
     """
 
-    def __init__(
-        self,
-        location: str,
-        kinds: Collection[str],
-        on_state: Callable[[str, Exception | None], None],
-        max_clients: int,
-        tls: Callable[[], ssl.SSLContext] = ssl.create_default_context,
-    ) -> None:
-        self._kind, self._inner = target_of(location, kinds)
-        self._on_state, self._max_clients, self._tls = on_state, max_clients, tls
-        self._peers: set[Any] = set()
-        self._server: asyncio.Server | None = None
-        self._task: asyncio.Task[None] | None = None
+    def __init__(self, output: Client, kinds: Collection[str], tls: MakeContext) -> None:
+        self._output = output
+        self._peers: dict[int, Client] = {}
+        kind, inner = target_of(output.endpoint.host, kinds)
+        context = cast("HubContext", self)
+        self.link: Client | Listener[Any]
+        if kind in LISTENERS:
+            self.link = LISTENERS[kind](context, inner)
+            return
+        make = TlsClient if kind == TLS else CLIENTS[kind]
+        self.link = link = make(context, output.context.new_client_id(), inner)
+        if isinstance(link, TlsClient):
+            link.make_context = tls
+        self.appear(link)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return all else that a transport uses of the hub."""
+        return getattr(self._output.context, name)
 
     @property
-    def is_open(self) -> bool:
-        """Whether it is open, or is being opened."""
-        return bool(self._peers or self._server or self._task)
+    def state(self) -> str:
+        """State of the transport; see `ClientStats.state`."""
+        return self.link.state if isinstance(self.link, Client) else self.link.stats().state
 
     @property
-    def port(self) -> int:
-        """The port that is bound, or 0."""
-        return self._server.sockets[0].getsockname()[1] if self._server else 0
+    def reason(self) -> str:
+        """Why nothing is sent."""
+        return self.link.reason
 
-    def open(self) -> None:
-        """Open it; the state is reported."""
-        self._task = asyncio.get_running_loop().create_task(self._open())
+    def send(self, data: bytes) -> None:
+        """Send to every peer; one that reads too slowly loses whole messages."""
+        frame = MavFrame(data, b"", NO_MESSAGE, EVERYBODY, EVERYBODY, 0, False)
+        for peer in tuple(self._peers.values()):
+            peer.transmit(frame)
 
-    def send(self, data: bytes) -> tuple[int, int]:
-        """Send to every peer that has room; return how many have and have not."""
-        free = [peer for peer in self._peers if peer.get_write_buffer_size() <= MAX_WAITING_BYTES]
-        for peer in free:
-            (peer.sendto if self._kind in DATAGRAMS else peer.write)(data)
-        return len(free), len(self._peers) - len(free)
+    def tick(self, now_us: int) -> None:
+        """Open the transport if it is not open."""
+        self.link.tick(now_us)
 
     def close(self) -> None:
-        """Close all connections."""
-        if self._task is not None:
-            self._task.cancel()
-        if self._server is not None:
-            self._server.close()
-            self._server = None
-        for peer in list(self._peers):
-            self._peers.discard(peer)
-            peer.abort()
+        """Close the transport."""
+        self.link.close()
 
-    async def _open(self) -> None:
+    def appear(self, client: Client) -> None:
+        """Add a peer; it counts for the output."""
+        client.counters = self._output.counters
+        self._peers[client.client_id] = client
+
+    def vanish(self, client: Client) -> None:
+        """Remove a peer and close it."""
+        self._peers.pop(client.client_id, None)
+        client.close()
+
+    def greet(self, client: Client) -> None:
+        """Send nothing to a new peer: the output is periodic."""
+
+    def deliver(self, client: Client, frame: MavFrame, now_us: int) -> None:
+        """Drop a received frame."""
+
+
+class TlsClient(TcpClient):
+    """A TCP connection with TLS."""
+
+    make_context: MakeContext = staticmethod(ssl.create_default_context)
+    _tls: TlsLayer
+
+    async def _connect(self) -> None:
         try:
-            async with asyncio.timeout(CONNECT_LIMIT_S):
-                await self._connect(asyncio.get_running_loop())
-        except ConnectionRefusedError:
-            self._on_state("refused", None)
-        except (OSError, ValueError, ssl.CertificateError) as error:
-            # An invalid name raises a ValueError.
-            self._on_state("unreachable", error)
-        else:
-            self._on_state("open", None)
-        finally:
-            self._task = None
-
-    async def _connect(self, loop: asyncio.AbstractEventLoop) -> None:
-        host, port = self._inner.host, self._inner.port
-        if self._kind == EndpointKind.SERIAL:
-            self.add(SerialLine(host, port, self.lose))
-        elif self._kind == LISTEN:
-            self._server = await loop.create_server(lambda: _Link(self), host, port)
-        elif self._kind in DATAGRAMS:
-            is_broadcast = self._kind == EndpointKind.UDP_BROADCAST
-            await loop.create_datagram_endpoint(
-                lambda: _Link(self), remote_addr=(host, port), allow_broadcast=is_broadcast
-            )
-        else:
-            context = self._tls() if self._kind == TLS else None
-            await loop.create_connection(lambda: _Link(self), host, port, ssl=context)
-
-    def add(self, peer: Any) -> None:
-        """Add a connection, if there is room."""
-        if len(self._peers) >= self._max_clients:
-            peer.abort()
-        else:
-            self._peers.add(peer)
-
-    def lose(self, peer: Any, error: Exception | None) -> None:
-        """Note the end of a connection."""
-        if peer in self._peers:
-            self._peers.discard(peer)
-            if self._server is None:
-                self._on_state("unreachable", error or ConnectionError("the peer hung up"))
-
-    def refuse(self, error: Exception) -> None:
-        """Note that nobody listens where datagrams are sent to."""
-        self._on_state("open", ConnectionError(f"nobody listens there: {reason_of(error)}"))
-
-
-class _Link(asyncio.Protocol, asyncio.DatagramProtocol):
-    """One connection; received bytes are discarded."""
-
-    def __init__(self, carrier: Carrier) -> None:
-        self._carrier = carrier
-        self._transport: Any = None
-
-    def connection_made(self, transport: Any) -> None:
-        self._transport = transport
-        self._carrier.add(transport)
-
-    def connection_lost(self, error: Exception | None) -> None:
-        self._carrier.lose(self._transport, error)
-
-    def error_received(self, error: Exception) -> None:
-        self._carrier.refuse(error)
-
-
-class SerialLine:
-    """A serial port that is only written; bytes that it has no room for wait here.
-
-    Not a pipe of the event loop: uvloop closes its descriptor, which pyserial then closes again.
-
-    Raises OSError or ValueError if it cannot be opened.
-    """
-
-    def __init__(
-        self, device: str, baud: int, lose: Callable[[Any, Exception | None], None]
-    ) -> None:
-        self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
-        self._lose = lose
-        self._waiting = b""
-
-    def get_write_buffer_size(self) -> int:
-        """Return the number of bytes that wait."""
-        return len(self._waiting)
-
-    def write(self, data: bytes) -> None:
-        """Write as much as there is room for."""
-        self._waiting += data
-        try:
-            self._waiting = self._waiting[os.write(self._port.fileno(), self._waiting) :]
-        except BlockingIOError:
-            return
+            self._tls = TlsLayer(self.make_context(), self.endpoint.host)
         except OSError as error:
-            self._lose(self, error)
-            self.abort()
+            self.become("unreachable", error)
+            self._task = None
+        else:
+            await super()._connect()
 
-    def abort(self) -> None:
-        """Close the port."""
-        self._port.close()
+    def _begin(self) -> None:
+        self.accept(b"", self.context.now_us())
+
+    def transmit(self, frame: MavFrame) -> None:
+        """Send one message after the handshake."""
+        if self.state == "open":
+            super().transmit(frame)
+        else:
+            self.counters.dropped += 1
+
+    def _wrap(self, frames: bytes) -> bytes:
+        return self._tls.wrap(frames)
+
+    def accept(self, data: bytes, _now_us: int) -> None:
+        """Process received bytes: those of the handshake; all others are dropped."""
+        assert self._socket is not None
+        try:
+            _, reply = self._tls.feed(data)
+        except ssl.SSLError as error:
+            self._broke()
+            self.become("unreachable", error)
+            return
+        if reply:
+            self._write(self._socket, reply)
+        if self._tls.is_ended:
+            self._broke()
+        elif self._tls.is_open:
+            self.become("open")
 
 
 def client_context(authority: str, certificate: str, key: str) -> ssl.SSLContext:

@@ -7,8 +7,7 @@ sends it. `mavgate/status` is retained: `online`, or `offline` by the last will.
 """
 
 import asyncio
-import ssl
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -17,8 +16,10 @@ from typing import Any, Final
 from gateway.extras import how_to_add
 from gateway.hub.endpoint import Endpoint, EndpointKind
 from gateway.hub.limits import RateLimit
-from gateway.outputs.carrier import CONNECT_LIMIT_S, TLS, target_of
+from gateway.hub.transports.base import RETRY_US
+from gateway.outputs.carrier import TLS, MakeContext, target_of
 from gateway.outputs.output import Output
+from gateway.printable import reason_of
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_json import json_from_frame
 from gateway.wire.mavlink_splitter import MavFrame
@@ -27,6 +28,7 @@ MAX_WAITING: Final = 500
 """Messages; while a broker is slow, further ones are dropped."""
 MAX_KINDS: Final = 4096
 """Kinds of message whose rates are limited; more are forged."""
+CONNECT_LIMIT_S: Final = 10.0
 GOODBYE_LIMIT_S: Final = 1.0
 DEFAULT_TOPIC: Final = "mavgate"
 
@@ -62,7 +64,7 @@ class MqttOutput(Output):
 
     def transmit(self, frame: MavFrame) -> None:
         """Publish a message, unless one of its kind was published just before."""
-        if self.vehicle_id not in (0, frame.origin[0]) or self.state != "open":
+        if self.vehicle_id not in (0, frame.origin[0]) or self.carrier.state != "open":
             return
         if len(self._limits) >= MAX_KINDS:
             self._limits.clear()
@@ -85,37 +87,30 @@ class MqttOutput(Output):
             self.counters.dropped += 1
 
     def _make_carrier(self) -> Any:
-        return Broker(self.endpoint, self.become, self._tls_context)
+        return Broker(self.endpoint, self._tls_context)
 
 
 class Broker:
-    """A connection to a broker."""
+    """A connection to a broker; `tls` makes the context of TLS."""
 
-    port = 0
+    state, reason = "connecting", ""
+    _retry_us = 0
 
-    def __init__(
-        self,
-        endpoint: Endpoint,
-        on_state: Callable[[str, Exception | None], None],
-        tls: Callable[[], ssl.SSLContext],
-    ) -> None:
+    def __init__(self, endpoint: Endpoint, tls: MakeContext) -> None:
         self._kind, self._inner = target_of(endpoint.host, MqttOutput.carriers)
         self._login = endpoint.added.get("login", "")
         self._status = f"{endpoint.added.get('topic', DEFAULT_TOPIC)}/status"
-        self._on_state, self._tls = on_state, tls
+        self._tls = tls
         self._waiting: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue(MAX_WAITING)
         self._task: asyncio.Task[None] | None = None
         self.client: Any = None
         """Of the present or last connection."""
 
-    @property
-    def is_open(self) -> bool:
-        """Whether it is connected, or connects."""
-        return self._task is not None
-
-    def open(self) -> None:
-        """Connect; the state is reported."""
-        self._task = asyncio.get_running_loop().create_task(self._run())
+    def tick(self, now_us: int) -> None:
+        """Connect if there is no connection."""
+        if self._task is None and now_us >= self._retry_us:
+            self._retry_us = now_us + RETRY_US
+            self._task = asyncio.get_running_loop().create_task(self._run())
 
     def send(self, message: tuple[str, bytes]) -> bool:
         """Queue a topic and its text; return whether there was room."""
@@ -133,9 +128,9 @@ class Broker:
         try:
             await self._connect()
         except ModuleNotFoundError:
-            self._on_state("unreachable", OSError(how_to_add("this endpoint", "mqtt")))
+            self.state, self.reason = "unreachable", how_to_add("this endpoint", "mqtt")
         except (OSError, ValueError) as error:
-            self._on_state("unreachable", error)
+            self.state, self.reason = "unreachable", reason_of(error)
         finally:
             self._task = None
 
@@ -156,7 +151,7 @@ class Broker:
         try:
             async with client:
                 await client.publish(self._status, "online", qos=1, retain=True)
-                self._on_state("open", None)
+                self.state, self.reason = "open", ""
                 try:
                     async with asyncio.TaskGroup() as tasks:
                         tasks.create_task(self._publish(client))

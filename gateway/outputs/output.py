@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 from gateway.clock import unix_time_us
 from gateway.hub.endpoint import NO_MESSAGES, Endpoint, number_from
+from gateway.hub.stats import ClientStats
 from gateway.hub.transports.base import Client
 from gateway.outputs.carrier import Carrier, client_context, target_of
 from gateway.recordings.antenna import HOME, AntennaStation, station_from
@@ -64,8 +65,7 @@ class Output(Client):
 
     def tick(self, now_us: int) -> None:
         """Open the carrier if it is not open, and start the timer."""
-        if not self.carrier.is_open and self._is_retry_due(now_us):
-            self.carrier.open()
+        self.carrier.tick(now_us)
         if self._timer is None:
             self._timer = self.loop.call_later(self.interval_s, self._turn)
 
@@ -83,10 +83,12 @@ class Output(Client):
 
     def put(self, data: bytes) -> None:
         """Send one message now."""
-        sent, dropped = self.carrier.send(data)
-        self.counters.sent += sent
-        self.counters.bytes_sent += sent * len(data)
-        self.counters.dropped += dropped
+        self.carrier.send(data)
+
+    def stats(self, *args: Any, **kwargs: Any) -> ClientStats:
+        """Return the present figures, with the state of the carrier."""
+        found = super().stats(*args, **kwargs)
+        return replace(found, state=self.carrier.state, reason=self.carrier.reason)
 
     def heard(self, now_us: int) -> dict[int, NewestState]:
         """Return the chosen vehicle, or all that were heard lately, by their system ids."""
@@ -107,14 +109,8 @@ class Output(Client):
         for data in self.compose(self.context.now_us()):
             self.put(data)
 
-    def _make_carrier(self) -> Carrier:
-        return Carrier(
-            self.endpoint.host,
-            self.carriers,
-            self.become,
-            self.context.settings.max_clients,
-            self._tls_context,
-        )
+    def _make_carrier(self) -> Any:
+        return Carrier(self, self.carriers, self._tls_context)
 
     def _tls_context(self) -> ssl.SSLContext:
         given = self.endpoint.added

@@ -30,7 +30,7 @@ class OutputRig(Rig):
         found.unix_us = lambda: UNIX_US + self.clock()
         assert found._timer is not None
         found._timer.cancel()
-        await self.until(lambda: found.state != "connecting")
+        await self.until(lambda: found.carrier.state not in ("connecting", "resolving"))
         return found
 
     def hear(self, *messages: Any, system: int = 1, component: int = 1) -> None:

@@ -128,14 +128,14 @@ async def test_events_are_streamed_to_a_server(
     kind = "tls" if is_tls else "tcp"
     files = f"?authority={certificate}&certificate={certificate}" if is_tls else ""
     output = await outputs.output(f"cot:{kind}:127.0.0.1:{port}{files}")
-    assert output.state == "open", output.reason
+    assert output.carrier.state == "open", output.carrier.reason
     outputs.hear(beat(), at())
     for _ in range(2):
         outputs.turn(output)
         data, peer = await asyncio.wait_for(received.get(), LIMIT_S)
         assert read(data).lat == pytest.approx(HERE[0])
         assert bool(peer) == is_tls
-    await outputs.until(lambda: not output.carrier._peers)
+    await outputs.until(lambda: output.carrier.state != "open")
     server.close()
     await server.wait_closed()
 
@@ -147,14 +147,16 @@ async def test_server_that_is_not_authentic_is_reported(
     context.load_cert_chain(certificate)
     server = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0, ssl=context)
     output = await outputs.output(f"cot:tls:127.0.0.1:{server.sockets[0].getsockname()[1]}")
-    assert output.state == "unreachable"
-    assert "certificate" in output.reason
+    assert output.carrier.state == "unreachable"
+    assert "certificate" in output.carrier.reason
     server.close()
 
 
 async def test_missing_certificate_is_reported(outputs: OutputRig) -> None:
     output = await outputs.output("cot:tls:127.0.0.1:1?certificate=/no/such.pem")
-    assert (output.state, output.reason) == ("unreachable", "No such file or directory")
+    (shown,) = outputs.of_hub.clients()
+    assert (shown.state, shown.reason) == ("unreachable", "No such file or directory")
+    assert output.carrier.state == shown.state
 
 
 @pytest.mark.parametrize(

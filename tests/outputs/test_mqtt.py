@@ -90,7 +90,7 @@ async def test_messages_of_all_systems_have_topics(
     client = await broker.subscriber()
     where = f"tls:127.0.0.1:{broker.tls_port}" if is_tls else f"tcp:127.0.0.1:{broker.port}"
     output = await outputs.output(f"mqtt:{where}?login={broker.login}&authority={certificate}")
-    assert output.state == "open", output.reason
+    assert output.carrier.state == "open", output.carrier.reason
     assert await next_of(client) == ("mavgate/status", "online", False)
     for seconds in (0.0, 0.5, 1.0):
         outputs.clock.now_us = round(seconds * US_PER_S)
@@ -122,7 +122,7 @@ async def test_presence_is_retained_and_the_last_will_ends_it(
     # As when the gateway is killed: the socket closes without a farewell.
     output.carrier.client._client.socket().shutdown(socket.SHUT_RDWR)
     assert await next_of(client) == ("field/7/status", "offline", False)
-    await outputs.until(lambda: output.state == "unreachable")
+    await outputs.until(lambda: output.carrier.state == "unreachable")
     outputs.clock.now_us += 2 * US_PER_S
     output.tick(outputs.clock.now_us)
     assert await next_of(client) == ("field/7/status", "online", False)
@@ -136,8 +136,8 @@ async def test_wrong_password_is_reported(
     wrong = tmp_path / "wrong"
     wrong.write_text("pilot:guess")
     output = await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?login={wrong}")
-    assert output.state == "unreachable"
-    assert "Not authorized" in output.reason
+    assert output.carrier.state == "unreachable"
+    assert "Not authorized" in output.carrier.reason
 
 
 async def test_messages_are_dropped_while_the_broker_is_slow(
@@ -156,7 +156,7 @@ async def test_missing_extra_is_reported(
 ) -> None:
     monkeypatch.setitem(sys.modules, "aiomqtt", None)
     output = await outputs.output("mqtt:tcp:127.0.0.1:1")
-    assert "needs the extra mqtt" in output.reason
+    assert "needs the extra mqtt" in output.carrier.reason
 
 
 @pytest.mark.parametrize(

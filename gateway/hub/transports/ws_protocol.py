@@ -97,11 +97,10 @@ class TlsLayer:
                 self.is_open = True
             while chunk := self._stream.read(READ_BYTES):
                 plain += chunk
+            self.is_ended = True
         except ssl.SSLWantReadError:
             # All that is complete was read.
             pass
-        except ssl.SSLZeroReturnError:
-            self.is_ended = True
         return plain, self.outgoing()
 
     def wrap(self, plain: bytes) -> bytes:
