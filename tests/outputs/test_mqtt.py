@@ -1,6 +1,7 @@
 """MQTT with a real broker, mosquitto."""
 
 import asyncio
+import getpass
 import json
 import shutil
 import socket
@@ -40,15 +41,11 @@ class Mosquitto:
         )
         own = folder / "certificate.pem"
         own.write_bytes(certificate.read_bytes())
-        for file in (own, passwords, folder):
-            # It gives up the rights of root.
-            file.chmod(0o755)
-        for parent in folder.parents:
-            if parent.owner() == folder.owner() and parent != Path("/tmp"):
-                parent.chmod(0o755)
         settings.write_text(
             f"listener {self.port} 127.0.0.1\nlistener {self.tls_port} 127.0.0.1\n"
             f"certfile {own}\nkeyfile {own}\npassword_file {passwords}\nallow_anonymous false\n"
+            # Another user could not read these files; this one need not be root.
+            f"user {getpass.getuser()}\n"
         )
         self.process = subprocess.Popen(["mosquitto", "-c", settings], stderr=subprocess.DEVNULL)
 
@@ -61,6 +58,7 @@ class Mosquitto:
                 try:
                     await client.__aenter__()
                 except aiomqtt.MqttError:
+                    assert self.process.poll() is None, "mosquitto has ended"
                     await asyncio.sleep(0.01)
                     continue
                 await client.subscribe("#")
