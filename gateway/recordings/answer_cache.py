@@ -10,11 +10,11 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.recordings.cached_vehicle import CachedVehicle
 from gateway.recordings.live_answers import HASH_NAME, NOTED_IDS, PARAMETERS, LiveAnswers
 from gateway.recordings.senders import AUTOPILOT
 from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
-from gateway.vehicle.cached_vehicle import CachedVehicle
 from gateway.vehicle.plan import KINDS
 from gateway.vehicle.service import Request
 from gateway.wire.frame_editing import edit_frame
@@ -38,8 +38,8 @@ class _Entry:
     """Of the next answer."""
     key: bytes | None = b""
     """With which it signs: empty if it does not, None if the gateway does not have it."""
-    checked: tuple[int, MavFrame] | None = None
-    """When a list was answered while its checksum was requested, and the request."""
+    checked: tuple[int, int, MavFrame] | None = None
+    """When a list was answered while its checksum was requested, the client, and its request."""
 
 
 class AnswerCache:
@@ -72,7 +72,8 @@ class AnswerCache:
         had = entry.live.missing
         entry.live.add(frame, now_us)
         if entry.checked is not None and had is not None and entry.live.missing is None:
-            (since_us, request), entry.checked = entry.checked, None
+            (since_us, client_id, request), entry.checked = entry.checked, None
+            entry.vehicle.remove_client(client_id)
             return request if now_us - since_us <= CHECK_US else None
         return None
 
@@ -157,7 +158,7 @@ class AnswerCache:
         is_list = request.message.get_type() == "PARAM_REQUEST_LIST"
         if not is_list or entry.live.hash_frame is None or frame.signed:
             return None
-        entry.checked = now_us, frame
+        entry.checked = now_us, request.client_id, frame
         message = mavlink.MAVLink_param_request_read_message(
             frame.target[0], AUTOPILOT, HASH_NAME.encode(), -1
         )

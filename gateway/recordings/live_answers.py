@@ -47,6 +47,8 @@ CHANGING: Final = frozenset(
     )
 )  # fmt: skip
 """Commands after which any parameter or mission may be another."""
+STORE: Final = (mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1.0)
+"""Writes the parameters as they are; QGroundControl sends it after each change."""
 NO_INDEX: Final = 0xFFFF
 """In the PARAM_VALUE that confirms a setting, of ArduPilot and of the checksum."""
 RESTART_US: Final = 5 * US_PER_S
@@ -180,8 +182,9 @@ class LiveAnswers:
                 self._values.pop(message.param_id, None)
                 self._drop_dependent()
             case "COMMAND_LONG" | "COMMAND_INT" if message.command in CHANGING:
-                self._drop_parameters()
-                self._drop_missions(ALL_KINDS)
+                if (message.command, message.param1) != STORE:
+                    self._drop_parameters()
+                    self._drop_missions(ALL_KINDS)
             case "FILE_TRANSFER_PROTOCOL":
                 self._add_file_request(bytes(message.payload), frame.origin)
             case "MISSION_COUNT" | "MISSION_CLEAR_ALL" | "MISSION_WRITE_PARTIAL_LIST":

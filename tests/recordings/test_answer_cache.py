@@ -219,6 +219,10 @@ def calibrate(link: CachedLink) -> None:
     GroundStation(link, link.clock).send(command(241, 1))
 
 
+def store(link: CachedLink) -> None:
+    GroundStation(link, link.clock).send(command(245, 1))
+
+
 def switch_group_on(link: CachedLink) -> None:
     link.down(mavlink.MAVLink_param_value_message(b"NEW", 1.0, 9, 3, 0))
 
@@ -227,6 +231,7 @@ def switch_group_on(link: CachedLink) -> None:
     ("event", "is_kept"),
     [
         (fly_on, True),
+        (store, True),
         (restart, False),
         (fall_silent, False),
         (report_version, False),

@@ -10,12 +10,12 @@
 | anything that changes something    |                                            | passed on  |
 """
 
-from collections.abc import Mapping
-from typing import Final, Protocol
+from typing import Final
 
+from gateway.recordings.live_answers import LiveAnswers
 from gateway.records import Incoming, Outgoing
 from gateway.vehicle.plan import ACCEPTED
-from gateway.vehicle.recorded_vehicle import PARAM_VALUE, Answers, RecordedVehicle
+from gateway.vehicle.recorded_vehicle import PARAM_VALUE, RecordedVehicle
 from gateway.vehicle.service import Request
 from gateway.vehicle.services.commands import (
     REQUEST_MESSAGE,
@@ -32,26 +32,10 @@ MAX_DOWNLOADS: Final = 64
 IN_SESSION: Final = (Opcode.TERMINATE_SESSION, Opcode.READ_FILE, Opcode.BURST_READ_FILE)
 
 
-class HeldAnswers(Answers, Protocol):
-    """What a vehicle has answered before."""
-
-    @property
-    def files(self) -> Mapping[str, bytes]:
-        """The files by path and query."""
-
-    @property
-    def missing(self) -> int | None:
-        """The number of parameters that are not known; None if none is known."""
-
-    @property
-    def hash_frame(self) -> bytes | None:
-        """PARAM_VALUE of the checksum of the parameters."""
-
-
 class _Files(FtpService):
     """Files whose content depends on the query too."""
 
-    def __init__(self, answers: HeldAnswers) -> None:
+    def __init__(self, answers: LiveAnswers) -> None:
         super().__init__({})
         self._answers = answers
 
@@ -72,7 +56,7 @@ class _Files(FtpService):
 class CachedVehicle(RecordedVehicle):
     """Answers what is held, for one autopilot."""
 
-    def __init__(self, system_id: int, answers: HeldAnswers) -> None:
+    def __init__(self, system_id: int, answers: LiveAnswers) -> None:
         self._held = answers
         self._files = _Files(answers)
         super().__init__(system_id, answers, files=self._files)
