@@ -71,7 +71,8 @@ GROUPS: Final = {
         "or list all.",
         "page": "Make one HTML file of a flight, which opens offline in any browser.",
         "convert": "Convert, trim, join, merge and edit recordings.",
-        "diff": "Compare recordings or parameter files: parameters, missions, figures, texts.",
+        "diff": "Compare recordings, parameter files or running vehicles: parameters, missions, "
+        "texts.",
         "extract": "Extract parameters, missions, texts, subtitles and geotags from a recording.",
         "recover": "Write the intact part of a damaged recording to a new file, and list what was "
         "left out.",
