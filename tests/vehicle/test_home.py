@@ -115,11 +115,6 @@ def test_invalid_coordinates_are_refused(station: GroundStation, name: str, valu
     assert home(station) == before
 
 
-def test_home_set_by_a_command_is_stored_at_once(station: GroundStation) -> None:
-    station.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 47.5, -8.5, 400.0)
-    assert kept(station) == [pytest.approx(Location(47.5, -8.5, 400.0))]
-
-
 def test_home_of_the_gps_can_be_stored(station: GroundStation) -> None:
     station.set_parameter("HOME_SOURCE", OPERATOR)
     assert store(station) == pytest.approx(FIELD)

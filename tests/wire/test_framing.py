@@ -36,15 +36,12 @@ class TestVectors:
         assert encode_frame(bytes.fromhex(vector["content_hex"])).hex() == vector["frame_hex"]
 
     @pytest.mark.parametrize("trailing", [b"", b"\x00\x00", b"\x05half"])
-    def test_decode_whole(self, vector: dict, trailing: bytes) -> None:
-        frame = bytes.fromhex(vector["frame_hex"])
-        assert FrameDecoder().feed(frame + trailing) == [bytes.fromhex(vector["content_hex"])]
-
-    def test_decode_byte_by_byte(self, vector: dict) -> None:
+    def test_decode_whole_and_byte_by_byte(self, vector: dict, trailing: bytes) -> None:
+        content, line = bytes.fromhex(vector["content_hex"]), bytes.fromhex(vector["frame_hex"])
+        line += trailing
         decoder = FrameDecoder()
-        frame = bytes.fromhex(vector["frame_hex"])
-        events = [event for byte in frame for event in decoder.feed(bytes([byte]))]
-        assert events == [bytes.fromhex(vector["content_hex"])]
+        assert FrameDecoder().feed(line) == [content]
+        assert [each for byte in line for each in decoder.feed(bytes([byte]))] == [content]
 
 
 @pytest.mark.parametrize("size", [1, 2, 39, MAX_CONTENT])

@@ -55,10 +55,6 @@ class TestOneFrame:
         assert frames_of(events) == [frame]
         assert len(events) == 1
 
-    def test_next_frame_is_found_directly_behind(self, frame: bytes) -> None:
-        assert frames_in(frame + V2) == [frame, V2]
-        assert frames_of(MavlinkSplitter().feed(frame + V2 + V1[:5])) == [frame, V2]
-
     def test_garbage_before_it_is_one_fault(self, frame: bytes) -> None:
         events = split_datagram(b"hello" + frame)
         assert events[0] == SplitFault(SplitFaultKind.GARBAGE, 5)

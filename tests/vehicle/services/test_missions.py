@@ -23,7 +23,6 @@ from tests.kit.ground_station import (
     item,
     kinds,
     of_kind,
-    request_item,
     upload,
 )
 from tests.kit.records import FIX, STATE
@@ -59,15 +58,6 @@ def set_current(seq: int) -> Any:
 def asked_in(station: GroundStation, seconds: float) -> list[int]:
     """Let time pass; the items that are asked for meanwhile."""
     return [m.seq for m in of_kind(station.wait(seconds), *REQUESTS)]
-
-
-@pytest.mark.parametrize("kind", [MISSION, FENCE, RALLY])
-def test_downloaded_items_equal_the_uploaded_ones(station: GroundStation, kind: int) -> None:
-    items = [item(seq, kind) for seq in range(12)]
-    assert upload(station, items, kind) == ACCEPTED
-    assert [content(m) for m in download(station, kind)] == [content(m) for m in items]
-    for other in {MISSION, FENCE, RALLY} - {kind}:
-        assert download(station, other) == []
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -236,11 +226,6 @@ def test_too_many_items_are_refused(station: GroundStation, kind: int, number: i
     assert kinds(station.send(count(MAX_ITEMS[kind], kind))) == ["MISSION_REQUEST_INT"]
 
 
-def test_unknown_mission_type_is_refused(station: GroundStation) -> None:
-    for message in (count(1, 7), count(9, ALL), request_item(0, 7), item(0, mission_type=7)):
-        assert station.send(message)[0].type != ACCEPTED
-
-
 @pytest.mark.parametrize("kind", [MISSION, ALL])
 def test_clear_removes_the_items_of_one_type_or_all(station: GroundStation, kind: int) -> None:
     upload(station, [item(0)])
@@ -249,12 +234,6 @@ def test_clear_removes_the_items_of_one_type_or_all(station: GroundStation, kind
     assert (end.type, end.mission_type) == (ACCEPTED, kind)
     assert download(station) == []
     assert len(download(station, RALLY)) == (kind == MISSION)
-
-
-def test_empty_upload_clears_the_mission(station: GroundStation) -> None:
-    upload(station, [item(0)])
-    assert station.send(count(0))[0].type == ACCEPTED
-    assert download(station) == []
 
 
 def test_second_upload_is_denied_during_the_first(station: GroundStation) -> None:

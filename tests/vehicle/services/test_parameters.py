@@ -3,7 +3,6 @@ import re
 import struct
 from typing import Annotated
 
-import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -62,25 +61,6 @@ def test_parameter_list_is_paced_and_sent_to_the_requesting_client_only(
     rest = station.wait(0.2)
     assert "PARAM_VALUE" not in station.broadcasts
     assert kinds(rest).count("PARAM_VALUE") == first[0].param_count - 10
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_parameters_are_loaded_over_a_lossy_link(station: GroundStation, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    station.loses = lambda *_: rng.random() < 0.3
-    load_parameters(station)
-
-
-def test_parameter_is_read_by_name_or_index(station: GroundStation) -> None:
-    [named] = station.send(read("TUNING_ORDER"))
-    [indexed] = station.send(read("", named.param_index))
-    assert named.param_id == indexed.param_id == "TUNING_ORDER"
-    assert named.param_type == mavlink.MAV_PARAM_TYPE_REAL32
-    for name, index in (("NO_SUCH", -1), ("", 32_000), ("", -2)):
-        [error] = station.send(read(name, index))
-        assert (error.get_type(), error.error) == ("PARAM_ERROR", UNKNOWN)
-    [error] = station.set_parameter("NO_SUCH_PARAM_16", 1.0)
-    assert (error.get_type(), error.error) == ("PARAM_ERROR", UNKNOWN)
 
 
 @pytest.mark.parametrize(

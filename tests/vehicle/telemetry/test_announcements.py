@@ -183,14 +183,6 @@ def track(announcer: Announcer, good: bool, now_us: int) -> list[str]:
     return [a.message.text for a in announcer.track(finding, now_us)]
 
 
-def test_change_is_announced_once() -> None:
-    announcer = Announcer()
-    assert track(announcer, True, 0) == []
-    assert track(announcer, False, 1) == ["bad"]
-    assert track(announcer, False, 2) == []
-    assert announcer.next_due_us() is None
-
-
 def test_announcements_of_a_flapping_state_are_limited_and_end_with_the_true_one() -> None:
     announcer = Announcer()
     reported = []

@@ -57,10 +57,6 @@ def test_every_fourth_sample_is_sent_despite_clock_skew_and_jitter(
     assert set(np.diff(found[50:])) == {4}
 
 
-def test_first_sample_is_sent_at_once() -> None:
-    assert Stream(1_000_000).offer(123_456)
-
-
 def test_gap_is_not_followed_by_a_burst() -> None:
     stream = Stream(20_000)
     times = [*range(0, 1_000_000, 10_000), *range(60_000_000, 61_000_000, 10_000)]
