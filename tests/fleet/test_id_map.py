@@ -99,8 +99,11 @@ def test_sites_of_one_client_share_the_limit_of_one_site() -> None:
     ids.set_client("forged-4", "its own session")
     assert ids.id_of("forged-4", 1) is not None
     assert ids.id_of("forged-2", 1) is None
+    for system in range(1, 6):
+        ids.set_by_hand("large", system, 10 + system)
     received_us = {vehicle: 1000 for vehicle, _ in ids.items()}
-    assert ids.make_room(received_us | {("field", 1): 0}, 1000) is None
+    for idle in (("field", 1), ("large", 1)):
+        assert ids.make_room(received_us | {idle: 0}, 1000) is None
     done = ids.make_room(received_us | {("forged-0", 1): 0}, 1000)
     assert done is not None
     assert (done.former, done.holder) == (("forged-0", 1), ("forged-2", 1))
