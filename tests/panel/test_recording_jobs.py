@@ -104,29 +104,37 @@ async def test_export_that_writes_too_much_is_stopped_and_deleted(
     jobs.close()
 
 
-@pytest.fixture
-def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Exports are made at once, and listed."""
-    names: list[str] = []
+class Maker:
+    """Makes exports at once and lists their kinds; KML waits until it may end."""
 
-    async def make(work: Path, order: Order) -> Path:
-        names.append(order.kind)
+    def __init__(self) -> None:
+        self.kinds: list[str] = []
+        self.may_end = asyncio.Event()
+        self.may_end.set()
+
+    async def make(self, work: Path, order: Order) -> Path:
+        if order.kind == "kml":
+            await self.may_end.wait()
+        self.kinds.append(order.kind)
         target = work / f"{order.name}.{order.kind}"
         target.write_bytes(bytes(1000))
         return target
 
-    monkeypatch.setattr(recording_jobs, "_make", make)
-    return names
+
+@pytest.fixture
+def maker(monkeypatch: pytest.MonkeyPatch) -> Maker:
+    made = Maker()
+    monkeypatch.setattr(recording_jobs, "_make", made.make)
+    return made
 
 
 VIEWER = Holder(Role.VIEWER, "session", "10.0.0.1")
 
 
-async def test_exports_of_a_viewer_keep_no_operator_waiting(
-    exported: Path, made: list[str]
-) -> None:
+async def test_exports_of_a_viewer_keep_no_operator_waiting(exported: Path, maker: Maker) -> None:
     jobs = RecordingJobs()
-    async with asyncio.timeout(60.0), jobs._exporting[Role.VIEWER]:
+    maker.may_end.clear()
+    async with asyncio.timeout(60.0):
         waiting = [
             asyncio.create_task(jobs.export(Order(exported, NAME, kind), VIEWER))
             for kind in ("kml", "gpx")
@@ -135,20 +143,21 @@ async def test_exports_of_a_viewer_keep_no_operator_waiting(
         with pytest.raises(ExportError, match="other exports"):
             await jobs.export(Order(exported, NAME, "csv"), VIEWER)
         await jobs.export(Order(exported, NAME, "csv"))
-    await asyncio.gather(*waiting)
-    assert made == ["csv", "kml", "gpx"]
+        maker.may_end.set()
+        await asyncio.gather(*waiting)
+    assert maker.kinds == ["csv", "kml", "gpx"]
     jobs.close()
 
 
 async def test_equal_export_is_made_once_and_deleted_after_the_last_fetch(
-    exported: Path, made: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported: Path, maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     jobs = RecordingJobs()
     first, second = await asyncio.gather(
         *(jobs.export(Order(exported, NAME, "kml"), VIEWER) for _ in range(2))
     )
-    assert (first, made) == (second, ["kml"])
+    assert (first, maker.kinds) == (second, ["kml"])
     async with client_of(jobs.serve) as client:
         assert [(await client.get(first)).status_code for _ in range(3)] == [200, 200, 404]
     assert list(tmp_path.glob("mavgate-export-*/*")) == []
@@ -156,7 +165,7 @@ async def test_equal_export_is_made_once_and_deleted_after_the_last_fetch(
 
 
 async def test_bytes_of_exports_are_bounded(
-    exported: Path, made: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported: Path, maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(recording_jobs, "MAX_EXPORTED", 2500)
@@ -172,8 +181,9 @@ async def test_bytes_of_exports_are_bounded(
 async def test_indexed_recording_has_facts_and_a_track(exported: Path) -> None:
     jobs, facts = RecordingJobs(), RecordingFacts()
     jobs.index(exported, list_recordings(exported))
-    assert jobs._indexing is not None
-    await jobs._indexing
+    async with asyncio.timeout(60.0):
+        while jobs.is_indexing:
+            await asyncio.sleep(0.01)
     facts.look(exported)
     figures = facts.of(NAME)
     assert isinstance(figures, FlightFigures)
