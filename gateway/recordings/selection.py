@@ -80,7 +80,7 @@ def within(
 ) -> Iterator[Batch]:
     """Yield the records between two moments, both included."""
     begin, end = limits
-    begin_us, end_us = _LONG_AGO_US, _NEVER_US
+    begin_us, end_us = np.iinfo(np.int64).min, np.iinfo(np.int64).max
     first_us: int | None = None
     for batch in batches:
         if first_us is None and len(batch):

@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 from functools import partial
-from importlib.util import find_spec
 from typing import Any, Final
 
+import segno
 from nicegui import ui
 
 from gateway.live.control_socket import ControlError
@@ -129,10 +129,7 @@ class LinkView:
             for token, name in sources.items():
                 url = f"{self._base}push/{token}"
                 ui.label(printable(f"{name}: {url}"))
-                if find_spec("segno") is not None:
-                    import segno
-
-                    ui.html(segno.make(url).svg_inline(scale=4, light="#fff"), sanitize=False)
+                ui.image(segno.make(url).svg_data_uri(scale=4, light="#fff")).classes("w-48")
 
     async def _refresh_serial(self) -> None:
         try:
