@@ -1,7 +1,5 @@
 """Texts, events, subtitles and geotags of a recorded vehicle, each with its time."""
 
-import csv
-import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -10,6 +8,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.printable import UNKNOWN, figure
+from gateway.recordings.formats.message_csv import csv_lines
 from gateway.recordings.moment import iso_time
 from gateway.recordings.newest import NewestState, mode_name
 from gateway.recordings.positions import GroundDistance, Position
@@ -47,16 +46,7 @@ def _mode_of(fields: Any) -> str:
     return mode_name(fields["autopilot"], fields["type"], number) or str(number)
 
 
-def rows_of(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
-    """Write rows as CSV below the names of their columns."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    for row in (columns, *rows):
-        writer.writerow(row)
-    yield text.getvalue()
-
-
-def texts(messages: Iterable[VehicleMessage]) -> Iterator[str]:
+def texts(messages: Iterable[VehicleMessage]) -> str:
     """Write the texts as CSV, with their time, sender and severity."""
     found = [
         (iso_time(m.time_us), m.text.origin >> 8, m.text.origin & 0xFF, m.text.severity,
@@ -64,10 +54,10 @@ def texts(messages: Iterable[VehicleMessage]) -> Iterator[str]:
         for m in messages
         if m.text is not None
     ]  # fmt: skip
-    return rows_of(("time", "system", "component", "severity", "text"), found)
+    return csv_lines([("time", "system", "component", "severity", "text"), *found])
 
 
-def events(messages: Iterable[VehicleMessage]) -> Iterator[str]:
+def events(messages: Iterable[VehicleMessage]) -> str:
     """Write changes of mode, arming and landing, and reached items of the mission, as CSV."""
     state: dict[tuple[int, str], object] = {}
     found = []
@@ -76,7 +66,7 @@ def events(messages: Iterable[VehicleMessage]) -> Iterator[str]:
             if kind == "reached" or state.get((message.system_id, kind)) != value:
                 state[message.system_id, kind] = value
                 found.append((iso_time(message.time_us), message.system_id, kind, value))
-    return rows_of(("time", "system", "event", "value"), found)
+    return csv_lines([("time", "system", "event", "value"), *found])
 
 
 def _event_values(message: VehicleMessage) -> list[tuple[str, str]]:
@@ -91,7 +81,7 @@ def _event_values(message: VehicleMessage) -> list[tuple[str, str]]:
     return []
 
 
-def images(messages: Iterable[VehicleMessage]) -> Iterator[str]:
+def images(messages: Iterable[VehicleMessage]) -> str:
     """Write the location of each image as CSV: angles of CAMERA_FEEDBACK, names of the other."""
     found: list[tuple[object, ...]] = []
     for message in messages:
@@ -110,7 +100,7 @@ def images(messages: Iterable[VehicleMessage]) -> Iterator[str]:
             ))  # fmt: skip
     columns = ("time", "system", "image", "file", "lat_deg", "lon_deg", "alt_amsl_m",
                "alt_home_m", "roll_deg", "pitch_deg", "yaw_deg")  # fmt: skip
-    return rows_of(columns, found)
+    return csv_lines([columns, *found])
 
 
 class _Shown:

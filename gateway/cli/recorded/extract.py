@@ -101,7 +101,7 @@ def extract(
         recording = VehicleRecording(files, options)
         timed = ((text, texts), (event, events), (image, images))
         made: list[tuple[Path, Iterable[str]]] = [
-            (path, make(recording.messages(WANTED))) for path, make in timed if path is not None
+            (path, [make(recording.messages(WANTED))]) for path, make in timed if path is not None
         ]
         made += _plans(recording, (params, mission, fence, rally), is_read=bool(made))
         if subtitle is not None:

@@ -24,7 +24,7 @@ def write(batches: Iterable[Batch], message_id: int) -> Iterator[bytes]:
     """Write all messages of one type; raises FlightError if there is none."""
     if message_id not in DEFINITIONS:
         raise FlightError(f"the fields of message {message_id} are not known")
-    yield _lines([(*HEAD, *_names(message_id))])
+    yield csv_lines([(*HEAD, *_names(message_id))]).encode()
     count = 0
     met: set[int] = set()
     for batch in batches:
@@ -32,8 +32,8 @@ def write(batches: Iterable[Batch], message_id: int) -> Iterator[bytes]:
         rows = np.flatnonzero(batch.message_ids == message_id)
         if len(rows):
             count += len(rows)
-            yield _lines(zip(*_columns(batch.chosen(batch.message_ids == message_id), message_id),
-                             strict=True))  # fmt: skip
+            columns = _columns(batch.chosen(batch.message_ids == message_id), message_id)
+            yield csv_lines(zip(*columns, strict=True)).encode()
     if not count:
         others = ", ".join(sorted(MESSAGE_NAMES.get(one, f"message {one}") for one in met))
         raise FlightError(f"the flight contains no {MESSAGE_NAMES[message_id]}, but {others}")
@@ -63,7 +63,8 @@ def _columns(batch: Batch, message_id: int) -> Iterator[list[str]]:
             yield column.astype(str).tolist()
 
 
-def _lines(rows: Iterable[Iterable[str]]) -> bytes:
+def csv_lines(rows: Iterable[Iterable[object]]) -> str:
+    """Write rows as CSV."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode()
+    return text.getvalue()

@@ -69,3 +69,19 @@ async def test_start_without_a_recording_has_a_distinct_exit_code(gateway: Recor
     gateway.recorder.folder.write_text("a file in its place")
     assert "blocked" in await run("start", code=1)
     assert "exists" in await run("status")
+
+
+async def test_recorder_that_waits_for_arming_is_shown_with_its_memory(
+    tmp_path: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    bench = RecorderBench(tmp_path / "recordings", clock, mode="armed")
+    server = ControlServer(socket_path("run"), RecorderVerbs(bench.recorder).verbs())
+    await server.start()
+    try:
+        await bench.turn()
+        clock.advance(21.0)
+        assert "waits for arming, with 21 s in memory" in await run("status")
+    finally:
+        server.close()
+        bench.recorder.close()
