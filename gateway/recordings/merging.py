@@ -144,44 +144,34 @@ class Alignment:
         return longest_us
 
 
-@dataclass(slots=True)
-class _Pending:
-    time_us: int
-    seen: set[int]
-    """Files in which it was found."""
-
-
 class Copies:
     """Recognise the frames that another file has brought already."""
 
     def __init__(self) -> None:
         self.count = 0
         """Copies found."""
-        self._pending: dict[bytes, list[_Pending]] = {}
-        self._order: deque[bytes] = deque()
+        self._pending: dict[bytes, list[tuple[int, set[int]]]] = {}
+        """By frame: its times, and the files in which it was found then."""
+        self._order: deque[tuple[int, bytes]] = deque()
 
     def is_copy(self, time_us: int, file: int, frame: bytes) -> bool:
         """Process the next frame of a file, in the order of aligned times."""
-        entries = self._pending.get(frame)
-        for entry in entries or ():
-            if file not in entry.seen and abs(time_us - entry.time_us) <= WINDOW_US:
-                entry.seen.add(file)
+        while self._order and (
+            len(self._order) >= MAX_PENDING or time_us - self._order[0][0] > 2 * WINDOW_US
+        ):
+            _, oldest = self._order.popleft()
+            del self._pending[oldest][0]
+            if not self._pending[oldest]:
+                del self._pending[oldest]
+        entries = self._pending.setdefault(frame, [])
+        for at_us, files in entries:
+            if file not in files and abs(time_us - at_us) <= WINDOW_US:
+                files.add(file)
                 self.count += 1
                 return True
-        self._pending.setdefault(frame, []).append(_Pending(time_us, {file}))
-        self._order.append(frame)
-        while len(self._order) > MAX_PENDING or self._is_old(self._order[0], time_us):
-            self._drop(self._order.popleft())
+        entries.append((time_us, {file}))
+        self._order.append((time_us, frame))
         return False
-
-    def _is_old(self, frame: bytes, time_us: int) -> bool:
-        return time_us - self._pending[frame][0].time_us > 2 * WINDOW_US
-
-    def _drop(self, frame: bytes) -> None:
-        entries = self._pending[frame]
-        del entries[0]
-        if not entries:
-            del self._pending[frame]
 
 
 def by_time(
