@@ -100,11 +100,14 @@ def test_cancelling_and_timeout_end_a_calibration() -> None:
     assert (lonely.state, lonely.trouble) == (RunState.FAILED, "the aircraft does not answer")
 
 
-def test_denied_command_fails_the_calibration() -> None:
+@pytest.mark.parametrize(
+    ("result", "text"), [(mavlink.MAV_RESULT_DENIED, "denied"), (200, "result 200")]
+)
+def test_denied_command_fails_the_calibration(result: int, text: str) -> None:
     run = CalibrationRun(1, CalibrationStep.GYRO, 0)
     command = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
-    run.handle(mavlink.MAVLink_command_ack_message(command, mavlink.MAV_RESULT_DENIED), 0)
-    assert (run.state, run.trouble) == (RunState.FAILED, "denied")
+    run.handle(mavlink.MAVLink_command_ack_message(command, result), 0)
+    assert (run.state, run.trouble) == (RunState.FAILED, text)
 
 
 @pytest.mark.parametrize("name", ORIENTATIONS)
