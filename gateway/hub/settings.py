@@ -23,7 +23,8 @@ class HubSettings(Settings, frozen=True):
             "zenoh:tcp/HOST:7447?site=NAME, "
             "serial:DEVICE:BAUD, or outputs that are not MAVLink, such as nmea:udp:HOST:10110; "
             "with options such as ?name=tablet&deny=RAW_IMU&rate=ATTITUDE:5&pack=1100&trusted=no. "
-            "?systems=1 passes only system 1, ?as=2 gives the vehicle of a link the id 2."
+            "?systems=1 passes only system 1, ?as=2 gives the vehicle of a link the id 2, "
+            "?cache=yes answers further stations for the vehicles of a slow link."
         ),
     ] = ENDPOINTS
     max_clients: Annotated[
