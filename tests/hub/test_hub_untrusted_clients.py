@@ -22,8 +22,8 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 CLIENTS = 4000
 MAX_CLIENTS = 16
-GROWTH_LIMIT_BLOCKS = CLIENTS // 4
-"""Half a block of memory for each of the second half: a client that is kept takes one or more."""
+GROWTH_LIMIT_BLOCKS = 3 * CLIENTS // 8
+"""Three quarters of a block for each of the second half: a kept client takes at least one."""
 FLIGHT_EVERY = 5
 STEP_US = 1_000_000
 
