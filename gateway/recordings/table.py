@@ -44,6 +44,8 @@ FORMAT_LINE: Final = f"{FORMAT_PREFIX}1"
 HEADER_PREFIX: Final = "# header: "
 STATE_PREFIX: Final = "# state: "
 NOTE_PREFIX: Final = "# note: "
+FORMER_NOTE_PREFIX: Final = "# mark: "
+"""Of notes in tables that were recorded when they were called marks."""
 NODE_PREFIX: Final = "# node: "
 
 HEAD_LINES: Final = 3
@@ -57,6 +59,8 @@ TimeUs = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
 IntArray = NDArray[np.int64]
 NOTE: Final = "Note: "
 """Begin of the STATUSTEXT with an operator's remark."""
+FORMER_NOTE: Final = "Mark: "
+"""The same in recordings of that time."""
 NO_ROWS: Final = np.empty((0, len(COLUMNS)))
 BLOCK_ROWS: Final = 1000
 """Of another program's file that are laid out as columns at once."""
@@ -104,6 +108,7 @@ _COMMENTS: Final[dict[str, Any]] = {
     HEADER_PREFIX: TableHeader,
     STATE_PREFIX: FusionState,
     NOTE_PREFIX: TableNote,
+    FORMER_NOTE_PREFIX: TableNote,
     NODE_PREFIX: NodeStatus,
 }
 

@@ -47,11 +47,13 @@ def test_written_file_is_read_in_any_chunks(chunk: int | None) -> None:
     assert repr(events) == repr(rows)
 
 
-def test_marks_are_read_between_rows() -> None:
+@pytest.mark.parametrize("prefix", ["# note: ", "# mark: "])
+def test_notes_are_read_between_rows(prefix: str) -> None:
     rows = make_rows(2, 4)
-    mark = TableNote(1234, 'over the "gate", # 2')
-    data = make_table(rows[:1]) + encode_line(mark).encode() + row_to_line(rows[1]).encode()
-    assert repr(read(data)[1]) == repr([rows[0], mark, rows[1]])
+    note = TableNote(1234, 'over the "gate", # 2')
+    line = encode_line(note).replace("# note: ", prefix)
+    data = make_table(rows[:1]) + line.encode() + row_to_line(rows[1]).encode()
+    assert repr(read(data)[1]) == repr([rows[0], note, rows[1]])
 
 
 def test_reports_of_nodes_are_read_between_rows() -> None:

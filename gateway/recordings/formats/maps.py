@@ -18,7 +18,7 @@ from gateway.recordings.columns import TableRow
 from gateway.recordings.moment import iso_time
 from gateway.recordings.positions import Continuity, TrackPoint, named_position
 from gateway.recordings.recorded_table import RecordedTable
-from gateway.recordings.table import NOTE, TableNote
+from gateway.recordings.table import FORMER_NOTE, NOTE, TableNote
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.records import FusionState, GpsFix, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, US_PER_S
@@ -326,9 +326,10 @@ class _Drawing:
             if marked := _MARKED.fullmatch(text):
                 lat_deg, lon_deg = map(float, marked.groups())
                 at = replace(at, lat_deg=lat_deg, lon_deg=lon_deg)
-            others = MarkerKind.NOTE if text.startswith(NOTE) else MarkerKind.EVENT
+            note = text.removeprefix(NOTE).removeprefix(FORMER_NOTE)
+            others = MarkerKind.NOTE if note != text else MarkerKind.EVENT
             kind = MarkerKind.MARK if marked else others
-            self.track.markers.append(MapMarker(kind, text.removeprefix(NOTE), at))
+            self.track.markers.append(MapMarker(kind, note, at))
         return self.track if points else None
 
 

@@ -268,6 +268,13 @@ def test_points_have_the_attitude_of_their_time() -> None:
     assert [p.attitude_deg for p in two.points] == [None, (0.0, 0.0, 0.0)]
 
 
+@pytest.mark.parametrize("said", ["Note: lake", "Mark: lake"])
+def test_notes_of_former_recordings_are_notes_too(said: str) -> None:
+    frames = [packed(position(1), *ONE), packed(text(said), *ONE)]
+    (track,) = drawn([TlogRecord(START_US, frame) for frame in frames])
+    assert (MarkerKind.NOTE, "lake") in markers(track)
+
+
 def test_tracks_of_frames_have_home_marks_and_events() -> None:
     one, _ = drawn(records())
     assert markers(one) == [
