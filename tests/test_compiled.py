@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +82,8 @@ def test_cached_machine_code_is_not_compiled_again_and_oldest_is_removed(
     scaling: EntryPoint[[int, int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    *others, cached = (cached_object(f"gateway/units.py 1 {k}") for k in range(MAX_CACHED + 1))
+    found = [cached_object(f"gateway/units.py 1 {k}") for k in range(MAX_CACHED + 1)]
+    *others, cached = (path for path in found if path is not None)
     cached.parent.mkdir(parents=True)
     for age, path in enumerate(others):
         path.touch()
@@ -91,6 +93,66 @@ def test_cached_machine_code_is_not_compiled_again_and_oldest_is_removed(
     build_library(path := tmp_path / "second.so", [], cached=cached)
     scaling.load(path)
     assert use(scaling) == [12.25, 30.25]
+
+
+def write_as_other(cached: Path) -> None:
+    cached.chmod(0o666)
+
+
+def damage(cached: Path) -> None:
+    cached.write_bytes(cached.read_bytes()[:-1])
+
+
+def put_folder(cached: Path) -> None:
+    cached.unlink()
+    cached.mkdir()
+
+
+def swap(cached: Path) -> None:
+    other = cached_object("gateway/units.py 2")
+    assert other is not None
+    cached.unlink()
+    build_library(cached.with_suffix(".so"), [], cached=other)
+    cached.symlink_to(other)
+
+
+@pytest.mark.parametrize("change", [write_as_other, damage, put_folder, swap])
+def test_cached_machine_code_that_is_damaged_or_another_users_is_compiled_again(
+    scaling: EntryPoint[[int, int, float]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    change: Callable[[Path], None],
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cached = cached_object("gateway/units.py 1")
+    assert cached is not None
+    build_library(tmp_path / "first.so", [], cached=cached)
+    change(cached)
+    build_library(path := tmp_path / "second.so", [scaling], cached=cached)
+    scaling.load(path)
+    assert use(scaling) == [12.25, 30.25]
+
+
+def test_link_in_the_place_of_the_cache_gets_no_file(
+    scaling: EntryPoint[[int, int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cached, target = cached_object("gateway/units.py 1"), tmp_path / "documents"
+    assert cached is not None
+    target.mkdir()
+    cached.parent.parent.mkdir()
+    cached.parent.symlink_to(target)
+    build_library(tmp_path / "first.so", [scaling], cached=cached)
+    assert [*target.iterdir()] == []
+
+
+def test_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    def home() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", home)
+    assert cached_object("gateway/units.py 1") is None
 
 
 def test_experiment_compiles_patched_constants_until_its_end(

@@ -15,6 +15,7 @@ import importlib
 import os
 import platform
 import shutil
+import stat
 import subprocess
 import sys
 import tempfile
@@ -52,6 +53,7 @@ OLDEST_GLIBC: Final = "2.17"
 NO_KERNELS: Final = ("gateway.compiled", "gateway.settings")
 """Modules that all kernels import, but no constant from."""
 COMPILER: Final = Path(__file__).with_name("kernel_compiler.py")
+OTHERS_WRITE: Final = stat.S_IWGRP | stat.S_IWOTH
 MAX_CACHED: Final = 8
 """Object files that are kept, of 0.2 MB each."""
 SHOW_S: Final = 0.2
@@ -102,12 +104,18 @@ def build_installed(path: Path, architecture: str | None = None, *, afresh: bool
     )
 
 
-def cached_object(stamp: str) -> Path:
-    """Return where the cache has the object file of these sources and this compiler."""
+def cached_object(stamp: str) -> Path | None:
+    """Return where the cache has the object file of these sources and this compiler.
+
+    None without a cache, for a user without a home folder.
+    """
     versions = [f"{name} {version(name)}" for name in ("numba", "llvmlite", "numpy")]
     parts = (stamp, COMPILER.read_text(), platform.machine(), *versions)
     key = hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        return None
     return folder / "mavgate" / "kernels" / f"{key}.o"
 
 
@@ -165,9 +173,8 @@ def build_library(
         If a function needs the run-time library of Python or numba, because it allocates.
     """
     progress = _Progress(len(entry_points)) if show else None
-    if cached is not None and cached.exists():
-        machine_code = cached.read_bytes()
-    else:
+    machine_code = _kept(cached) if cached is not None else b""
+    if not machine_code:
         machine_code = _compiled(entry_points, stamp, architecture, progress)
         if cached is not None:
             _keep(cached, machine_code)
@@ -202,14 +209,34 @@ def _compiled(
             gc.enable()
 
 
+def _kept(cached: Path) -> bytes:
+    """Return an object file of the cache; empty if there is none, or it is damaged or foreign."""
+    with suppress(OSError), cached.open("rb") as file:
+        status, (digest, _, machine_code) = os.fstat(file.fileno()), file.read().partition(b"\n")
+        # In a shared folder another user could have put it there, and would have it run.
+        is_own = status.st_uid == os.geteuid() and not status.st_mode & OTHERS_WRITE
+        if is_own and digest == _digest(cached, machine_code):
+            return machine_code
+    return b""
+
+
+def _digest(cached: Path, machine_code: bytes) -> bytes:
+    return hashlib.blake2b(cached.name.encode() + machine_code).hexdigest().encode()
+
+
 def _keep(cached: Path, machine_code: bytes) -> None:
     """Store an object file, and remove the oldest others; a cache that fails does no harm."""
     with suppress(OSError):
-        cached.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=cached.parent, delete=False) as file:
-            file.write(machine_code)
-        Path(file.name).replace(cached)
-        kept = sorted(cached.parent.iterdir(), key=lambda path: path.stat().st_mtime)
+        cached.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = cached.parent.lstat()
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
+            return
+        with tempfile.TemporaryDirectory(dir=cached.parent) as folder:
+            file = Path(folder, cached.name)
+            file.touch(mode=0o600)
+            file.write_bytes(_digest(cached, machine_code) + b"\n" + machine_code)
+            file.replace(cached)
+        kept = sorted(cached.parent.glob("*.o"), key=lambda path: path.stat().st_mtime)
         for path in kept[:-MAX_CACHED]:
             path.unlink()
 
