@@ -258,6 +258,8 @@ class SourcePort:
         with open(path, "rb") as file:  # noqa: PTH123
             self._opened()
             while block := file.read(READ_SIZE):
+                # It may hold gigabytes of other messages.
+                await asyncio.sleep(0)
                 for record in scanner.feed(block).records():
                     data = tunnelled(record.frame, self._source.node)
                     if not data:

@@ -18,7 +18,7 @@ a real vehicle with the same id on the link that it is played to.
 
 import struct
 from bisect import bisect_right
-from collections.abc import Callable, Set
+from collections.abc import Callable, Iterator, Set
 from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
@@ -202,6 +202,17 @@ class LogAnswers:
                 course.add(time_us, frame)
                 self._kept += 1
 
+    def pending(self) -> Iterator[bytes]:
+        """Yield the items of missions in transfer."""
+        for transfer in self._transfers.values():
+            yield from transfer.items.values()
+
+    def drop_mission(self, vehicle: int, kind: int) -> None:
+        """Drop a mission, and what is in transfer of it."""
+        self.missions.pop((vehicle, kind), None)
+        for is_upload in (False, True):
+            self._transfers.pop((vehicle, kind, is_upload), None)
+
     def _add_mission(self, frame: bytes, time_us: int, is_upload: bool) -> None:
         vehicle = frame_of(frame).target[0] if is_upload else origin_of(frame)[0]
         name, message = MESSAGE_NAMES[message_id_of(frame)], fields_of(frame)
@@ -227,6 +238,8 @@ class LogAnswers:
                         self._store(vehicle, kind, transfer, time_us)
 
     def _begin(self, vehicle: int, kind: int, is_upload: bool, count: int, time_us: int) -> None:
+        if kind not in KINDS:
+            return
         transfer = self._transfers[vehicle, kind, is_upload] = _Transfer(count)
         if not is_upload:
             self._store(vehicle, kind, transfer, time_us)
@@ -235,7 +248,7 @@ class LogAnswers:
         self, vehicle: int, kind: int, transfer: _Transfer, time_us: int, *, is_set: bool = False
     ) -> None:
         """Keep a mission that is complete."""
-        if kind not in KINDS or len(transfer.items) < transfer.count:
+        if len(transfer.items) < transfer.count:
             return
         items = tuple(transfer.items[i] for i in range(transfer.count))
         course = self.missions.setdefault((vehicle, kind), _Course(is_set))

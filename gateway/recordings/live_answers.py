@@ -39,6 +39,8 @@ NOTED_IDS: Final = (
     SHOWN_IDS | BOOT_TIME_OFFSETS.keys() | ids_of("PARAM_VALUE", "MISSION_CURRENT", "HOME_POSITION")
 )
 """Messages to all that are read here."""
+MISSION_IDS: Final = ids_of("MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_ACK")
+"""Messages of a vehicle in transfers of missions."""
 CHANGING: Final = frozenset(
     (
         mavlink.MAV_CMD_PREFLIGHT_STORAGE, mavlink.MAV_CMD_PREFLIGHT_CALIBRATION,
@@ -115,6 +117,8 @@ class LiveAnswers:
         self._home = b""
         self._plan_ids: dict[int, int] = {}
         self._readings: dict[tuple[int, int], _Reading] = {}
+        self._uploader = (0, 0)
+        """System and component of the station that began to upload a mission last."""
         self._drop_parameters()
 
     def is_fresh(self, now_us: int) -> bool:
@@ -126,7 +130,7 @@ class LiveAnswers:
         """The bytes that are held."""
         items = [each for kind in KINDS for each in self.mission(kind) or ()]
         reads = [each for one in self._readings.values() for each in one.chunks.values()]
-        parts = (self._values.values(), self.files.values(), items, reads)
+        parts = (self._values.values(), self.files.values(), items, reads, self._log.pending())
         return sum(len(each) for part in parts for each in part)
 
     def has_message(self, message_id: int) -> bool:
@@ -172,7 +176,10 @@ class LiveAnswers:
                 self._add_file(frame, now_us)
             case shown if shown in SHOWN_IDS:
                 self._add_shown(frame, now_us)
-            case _:
+            case mavlink.MAVLINK_MSG_ID_MISSION_ACK if frame.target != self._uploader:
+                # Of several stations that upload at once, the vehicle takes the items of one.
+                pass
+            case part if part in MISSION_IDS:
                 self._add_mission(frame, now_us, is_upload=False)
 
     def add_request(self, message: Any, frame: MavFrame, now_us: int) -> None:
@@ -189,13 +196,14 @@ class LiveAnswers:
                 self._add_file_request(bytes(message.payload), frame.origin)
             case "MISSION_COUNT" | "MISSION_CLEAR_ALL" | "MISSION_WRITE_PARTIAL_LIST":
                 self._drop_missions(message.mission_type)
+                self._uploader = frame.origin
                 self._add_mission(frame, now_us, is_upload=True)
-            case "MISSION_ITEM" | "MISSION_ITEM_INT":
+            case "MISSION_ITEM" | "MISSION_ITEM_INT" if frame.origin == self._uploader:
                 self._add_mission(frame, now_us, is_upload=True)
 
     def _drop_missions(self, kind: int) -> None:
         for each in KINDS if kind == ALL_KINDS else (kind,):
-            self._log.missions.pop((self.system_id, each), None)
+            self._log.drop_mission(self.system_id, each)
             self._plan_ids.pop(each, None)
             self.since_us.pop(KINDS.get(each, ""), None)
 
@@ -232,6 +240,8 @@ class LiveAnswers:
         self._count = count
         known = self._values.get(name)
         if known is not None and _value_of(known) != (value, kind):
+            # Dropped now, as there may be no room for the new value.
+            del self._values[name]
             self._drop_dependent()
         if index < count and self.size < MAX_BYTES:
             fields = {"param_index": index, "param_count": count}
@@ -297,7 +307,7 @@ class LiveAnswers:
             reading.size = int.from_bytes(packet.data[:4], "little")
         elif packet.session != reading.session or packet.request_opcode not in READING:
             return
-        elif packet.opcode == ACK and self.size < MAX_BYTES:
+        elif packet.opcode == ACK and packet.data and self.size < MAX_BYTES:
             reading.chunks[packet.offset] = packet.data
         elif packet.data[:1] == bytes((FtpError.EOF,)):
             # ArduPilot does not know the size of a file that it makes while it is read.

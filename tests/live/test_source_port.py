@@ -6,6 +6,7 @@ import socket
 from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.live import source_port
 from gateway.live.control_socket import ControlError
@@ -15,6 +16,7 @@ from gateway.records import NodeId
 from gateway.sources.kinds import make_decoder
 from gateway.sources.settings import parse_source
 from gateway.sources.source import SourceInput
+from tests.kit.mavlink import packed
 from tests.kit.process import until
 from tests.ports import free_port
 
@@ -161,3 +163,18 @@ async def test_posted_content_is_taken_with_the_token_and_others_are_counted() -
             with pytest.raises(ControlError, match="no source has this token"):
                 verbs["source.push"](wrong, "abc")
         assert other.source.report().faults == (("token", 3),)
+
+
+async def test_recording_of_other_messages_leaves_the_loop_to_others(tmp_path: Path) -> None:
+    """A turn of the loop for each block that is read."""
+    blocks = 20
+    frame = packed(mavlink.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))
+    record = bytes(8) + frame
+    path = tmp_path / "other.tlog"
+    path.write_bytes(record * (blocks * source_port.READ_SIZE // len(record)))
+    async with Opened(f"lines:file:{path}") as opened:
+        turns = 0
+        while opened.source.reason != "its end was reached":
+            await asyncio.sleep(0)
+            turns += 1
+        assert turns > blocks

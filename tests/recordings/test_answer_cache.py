@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings import answer_cache, live_answers
 from gateway.recordings.answer_cache import AnswerCache
+from gateway.recordings.live_answers import LiveAnswers
 from gateway.records import Incoming, Outgoing
 from gateway.vehicle.services.ftp import Opcode
 from gateway.vehicle.vehicle import Vehicle
@@ -24,11 +25,13 @@ from tests.kit.ground_station import (
     GroundStation,
     command,
     content,
+    count,
     download,
     item,
     kinds,
     load_parameters,
     of_kind,
+    request_item,
     upload,
 )
 from tests.kit.mavlink import KEY, packed
@@ -412,3 +415,53 @@ def test_confirmation_without_index_keeps_the_place_of_a_parameter(link: CachedL
     [answer], passed = link.cache.handle(7, frame, link.clock.now_us, may_answer=True)
     [read] = of_kind([answer], "PARAM_VALUE")
     assert (read.param_id, read.param_index, read.param_value, passed) == ("P1", 1, 8.0, None)
+
+
+def test_upload_is_kept_without_the_items_of_another_station(
+    link: CachedLink, first: GroundStation, second: GroundStation
+) -> None:
+    sent = [item(i) for i in range(3)]
+    first.send(count(3, MISSION))
+    for each in sent[:2]:
+        first.send(each)
+    for i in range(3):
+        second.send(item(i, param1=9.0))
+    assert kinds(first.send(sent[2])) == ["MISSION_ACK"]
+    assert [content(each) for each in download(second)] == [*map(content, sent)]
+
+
+def test_mission_of_a_download_that_an_upload_interrupts_is_not_mixed(
+    link: CachedLink, first: GroundStation, second: GroundStation
+) -> None:
+    upload(first, [item(i) for i in range(3)])
+    link.may_answer = False
+    first.send(mavlink.MAVLink_mission_request_list_message(1, 1, MISSION))
+    for seq in (0, 1):
+        first.send(request_item(seq, MISSION))
+    sent = [item(i, param1=9.0) for i in range(3)]
+    upload(second, sent)
+    first.send(request_item(2, MISSION))
+    link.may_answer = True
+    assert [content(each) for each in download(second)] == [*map(content, sent)]
+
+
+def test_parameter_that_changes_while_no_more_can_be_kept_is_not_answered(
+    link: CachedLink, first: GroundStation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = load_parameters(first)
+    name = next(iter(values)).encode()
+    monkeypatch.setattr(live_answers, "MAX_BYTES", 0)
+    link.down(mavlink.MAVLink_param_value_message(name, 7.5, 9, len(values), 0xFFFF))
+    link.up.clear()
+    first.send(mavlink.MAVLink_param_request_read_message(1, 1, name, -1))
+    assert kinds(link.up) == ["PARAM_REQUEST_READ"]
+
+
+def test_items_of_unfinished_transfers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_answers, "MAX_BYTES", 1000)
+    live = LiveAnswers(1)
+    for kind in (77, MISSION):
+        live.add(frame_of(packed(mavlink.MAVLink_mission_count_message(255, 0, 65535, kind))), 0)
+        for i in range(100):
+            live.add(frame_of(packed(item(i, mission_type=kind))), 0)
+    assert live.size == pytest.approx(1025, abs=25)
