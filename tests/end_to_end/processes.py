@@ -46,6 +46,7 @@ class Gateway(Process):
         terminal: int | None = None,
     ) -> None:
         self.port, self.listen_port = free_ports(2)
+        self.socket = folder / "mavgate" / "run.sock"
         if command == "demo" and "--panel" not in options:
             options = ("--no-panel", *options)
         super().__init__(
@@ -54,7 +55,6 @@ class Gateway(Process):
             stdin=subprocess.DEVNULL if terminal is None else terminal,
             start_new_session=terminal is not None,
             preexec_fn=None if terminal is None else _take_terminal,
-            env=os.environ | {"COLUMNS": "200"},
         )
 
 

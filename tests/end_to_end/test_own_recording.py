@@ -18,6 +18,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
+from gateway.live.control_socket import request
 from gateway.panel.playback import FUSED_AGAIN, RECORDED, Playback
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.uplink import ControlClient, Uplink
@@ -66,8 +67,12 @@ def station_of(port: int, version: int) -> Station | None:
         return None
 
 
-def talk(port: int) -> None:
-    """Be a station that uploads a mission, one of MAVLink 1, and a companion."""
+def record(gateway: Gateway) -> None:
+    """Record a station that uploads a mission, one of MAVLink 1, and a companion.
+
+    It begins at known positions, since the time of GPS may end the part that is written.
+    """
+    port = gateway.listen_port
     stations = [wait_for(lambda v=version: station_of(port, v)) for version in (2, 1)]
     stations[1].mav.srcSystem = 254
     companion = mavlink.MAVLink(None, 1, mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
@@ -80,12 +85,13 @@ def talk(port: int) -> None:
             for chunk, at in enumerate(range(0, len(data), 50))
         ]
         stations[0].until_heard()
+        wait_for(lambda: located(stations[0].wait(0.2)))
+        request(gateway.socket, "record.start")
         for message in (beat, turned, *texts, turned):
             sock.sendall(message.pack(companion))
             companion.seq += 1
         sock.sendall(private_frame(companion))
         assert upload(stations[0], [item(n) for n in range(3)]) == mavlink.MAV_MISSION_ACCEPTED
-        wait_for(lambda: located(stations[1].wait(0.2)))
         stations[1].wait(RECORDED_S)
     for station in stations:
         station.close()
@@ -95,10 +101,9 @@ def talk(port: int) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("own")
     config = CONFIG.replace("FOLDER", json.dumps(str(path / "recordings")))
-    gateway = Gateway(path, "demo", "--record", config=config)
+    gateway = Gateway(path, "demo", config=config)
     try:
-        gateway.until("(?i)recording")
-        talk(gateway.listen_port)
+        record(gateway)
     finally:
         gateway.end(signal.SIGTERM)
     wait_for(lambda: list((path / "recordings").glob("*_v2.csv")) or None)
@@ -116,13 +121,11 @@ def converted(files: list[Path], target: Path, *options: str) -> Path:
     return target
 
 
-def test_recording_holds_what_the_outputs_must_bear(folder: Path) -> None:
+def test_recording_holds_what_the_outputs_must_bear(tlog: Path) -> None:
     found = set()
-    # A second part begins with the time of GPS, which may come before a station's heartbeat.
-    for part in folder.glob("*.tlog"):
-        with closing(mavutil.mavlink_connection(str(part), dialect="all")) as log:
-            while (message := log.recv_msg()) is not None:
-                found.add((message.get_srcSystem(), message.get_srcComponent(), message.get_type()))
+    with closing(mavutil.mavlink_connection(str(tlog), dialect="all")) as log:
+        while (message := log.recv_msg()) is not None:
+            found.add((message.get_srcSystem(), message.get_srcComponent(), message.get_type()))
     assert {(1, 1, "GLOBAL_POSITION_INT"), (2, 1, "GLOBAL_POSITION_INT")} <= found
     assert {(255, 190, "MISSION_COUNT"), (1, 191, "STATUSTEXT")} <= found
     assert {"UNKNOWN_300", f"UNKNOWN_{PRIVATE_ID}"} <= {kind for *_, kind in found}
