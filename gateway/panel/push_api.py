@@ -1,6 +1,8 @@
 """HTTP posts of phones and other devices to a source of the gateway, by a token in the URL."""
 
 import asyncio
+import hmac
+import time
 from http import HTTPStatus
 from typing import Final
 
@@ -11,11 +13,39 @@ from gateway.panel.uplink import ControlClient
 
 PIECE: Final = 10_000
 """Characters of a request to the control socket, of which each becomes six bytes at most."""
+ASK_AGAIN_S: Final = 1.0
+"""A wrong token is compared with those of the gateway again after this time."""
+
+
+class _Tokens:
+    """The tokens of the gateway: a flood of wrong ones must not load its event loop."""
+
+    def __init__(self, control: ControlClient) -> None:
+        self._control = control
+        self._known: list[str] = []
+        self._asked_s = -ASK_AGAIN_S
+        self._asking = asyncio.Lock()
+
+    async def check(self, token: str) -> None:
+        """Raise ControlError for a token that is wrong."""
+        if self._has(token):
+            return
+        async with self._asking:
+            if time.monotonic() - self._asked_s >= ASK_AGAIN_S:
+                self._asked_s = time.monotonic()
+                self._known = [*await self._control.ask("source.tokens")]
+                # The gateway counts a wrong one.
+                await self._control.ask("source.push", token=token, text="")
+        if not self._has(token):
+            raise ControlError("no source has this token")
+
+    def _has(self, token: str) -> bool:
+        return any(hmac.compare_digest(each.encode(), token.encode()) for each in self._known)
 
 
 def push_router(control: ControlClient) -> APIRouter:
     """Return the router with `/push/{token}`; the content of each post becomes one line."""
-    router = APIRouter()
+    router, tokens = APIRouter(), _Tokens(control)
     turn = asyncio.Lock()
     """Pieces of two posts must not be mixed."""
 
@@ -23,7 +53,7 @@ def push_router(control: ControlClient) -> APIRouter:
     async def push(token: str, request: Request) -> str:
         try:
             # An unknown token is refused before the content is read.
-            await control.ask("source.push", token=token, text="")
+            await tokens.check(token)
             content = (await request.body()).replace(b"\n", b" ").decode(errors="replace") + "\n"
             async with turn:
                 for at in range(0, len(content), PIECE):

@@ -1,5 +1,6 @@
 """Posts of a phone through the panel to a source of the gateway, past the login by a token."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from pathlib import Path
 
@@ -69,6 +70,14 @@ async def test_post_without_the_token_is_refused_and_counted(
     assert (await gateway.phone.post(path, content=b"x" * 9)).status_code == status
     assert gateway.lines == []
     assert gateway.source.report().faults == ((("token", 1),) if path == "/push/wrong" else ())
+
+
+async def test_flood_of_wrong_tokens_does_not_reach_the_gateway(gateway: Gateway) -> None:
+    assert (await gateway.phone.post("/push/right", content=b"x")).status_code == 200
+    posts = [gateway.phone.post(f"/push/wrong{n}", content=b"x") for n in range(50)]
+    assert {answer.status_code for answer in await asyncio.gather(*posts)} == {404}
+    assert sum(count for _, count in gateway.source.report().faults) <= 1
+    assert (await gateway.phone.post("/push/right", content=b"x")).status_code == 200
 
 
 @pytest.mark.parametrize(
