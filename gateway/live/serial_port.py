@@ -184,7 +184,7 @@ def open_port(device: str, baud: int, ports: list[Port]) -> serial.Serial:
     try:
         return serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
     except (OSError, ValueError) as error:
-        raise PortNotFoundError(f"receiver {device}: {why_not_open(error, ports)}") from error
+        raise PortNotFoundError(f"serial port {device}: {why_not_open(error, ports)}") from error
 
 
 async def search_receiver(devices: list[str], baud: int) -> tuple[serial.Serial, bytes]:

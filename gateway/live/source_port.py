@@ -17,6 +17,7 @@ import asyncio
 import logging
 import os
 import secrets
+import stat
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -96,9 +97,11 @@ class SourcePort:
                 await read()
             except (OSError, PortNotFoundError) as error:
                 self._lost(str(error) if isinstance(error, PortNotFoundError) else reason_of(error))
-            if url.transport == "stdin" or url.address.endswith(TLOG):
-                self._lost("its end was reached")
-                return
+            else:
+                if url.transport == "stdin" or url.address.endswith(TLOG):
+                    log.info("source %s: its end was reached", url.name)
+                    self._source.lost("its end was reached")
+                    return
             await asyncio.sleep(RETRY_S)
 
     def _opened(self) -> None:
@@ -226,6 +229,15 @@ class SourcePort:
         self._feed(data)
 
     async def _stdin(self) -> None:
+        file = sys.stdin.fileno()
+        kind = os.fstat(file).st_mode
+        if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or os.isatty(file)):
+            # An event loop cannot wait for a file or /dev/null, which never block.
+            self._opened()
+            while data := os.read(file, READ_SIZE):
+                self._feed(data)
+                await asyncio.sleep(0)
+            return
         reader = asyncio.StreamReader(limit=READ_SIZE)
         protocol = asyncio.StreamReaderProtocol(reader)
         await asyncio.get_running_loop().connect_read_pipe(lambda: protocol, sys.stdin)

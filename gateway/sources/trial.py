@@ -25,6 +25,13 @@ GUESSES: Final = (
 """Names that people give their columns, and ours."""
 DEGE7: Final = frozenset({"gps_lat_dege7", "gps_lon_dege7"})
 LEAST_NAMES: Final = 3
+KINDS: Final[dict[type, str]] = {
+    ImuRaw: "accelerometer and gyroscope",
+    BaroRaw: "barometer",
+    GpsFix: "GPS",
+    VehicleReport: "states",
+}
+"""Names of the records of a source."""
 
 
 def describe(event: SourceRecord | Fault) -> str:
@@ -64,6 +71,8 @@ def _fields(report: VehicleReport) -> list[str]:
             found.append(f"roll, pitch, yaw {' '.join(angles)} deg")
         elif name == "battery":
             found.append(f"battery {value.voltage_v:.2f} V")
+        elif name == "signal":
+            found.append(f"signal {value.rssi_dbm} dBm, SNR {value.snr_db:g} dB")
         else:
             found.append(f"{name} {value}")
     return found
@@ -80,7 +89,7 @@ class SourceTrial:
 
     def feed(self, event: SourceRecord | Fault) -> int:
         """Count a record or a fault; return how many of its kind there were."""
-        kind = f"fault {event.kind}" if isinstance(event, Fault) else type(event).__name__
+        kind = f"fault {event.kind}" if isinstance(event, Fault) else KINDS[type(event)]
         self.counts[kind] += 1
         if isinstance(event, ImuRaw):
             self._has_mag |= bool(event.flags & ImuFlags.MAG_NEW)
@@ -101,14 +110,14 @@ class SourceTrial:
     def summary(self, seconds: float) -> list[str]:
         """Sum up: rates, what is missing, and the map that would read CSV."""
         lines = [f"{kind}: {n}, {n / seconds:.1f} a second" for kind, n in self.counts.items()]
-        attitude = "yes" if self._has_attitude or self.counts["ImuRaw"] else "no"
+        attitude = "yes" if self._has_attitude or self.counts[KINDS[ImuRaw]] else "no"
         why = (
             ""
             if attitude == "yes"
             else "; it needs accelerometer and gyroscope (lines: in one object)"
         )
         lines.append(f"attitude: {attitude}{why}")
-        if self.counts["ImuRaw"] and not self._has_mag:
+        if self.counts[KINDS[ImuRaw]] and not self._has_mag:
             lines.append("heading: only in flight, by GPS; it needs a compass (lines: mag_ut)")
         place = "yes" if self._has_height else "no"
         missing = (
@@ -117,7 +126,7 @@ class SourceTrial:
             else "a fix (lines: lat, lon and alt_m, or NMEA)"
         )
         lines.append(f"position: {place}" + ("" if self._has_height else f"; it needs {missing}"))
-        if self._header and not self.counts["ImuRaw"]:
+        if self._header and not self.counts[KINDS[ImuRaw]]:
             lines += ["a map for ?columns=FILE; check its units:", *suggested_map(self._header)]
         return lines
 

@@ -194,7 +194,7 @@ async def test_port_is_opened_again_after_it_was_unplugged(
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(warnings) == len(set(warnings)), "each problem is logged once"
     assert any("is gone" in text for text in warnings)
-    missing = f"receiver {bench.link}: No such file or directory; trying again until it works"
+    missing = f"serial port {bench.link}: No such file or directory; trying again until it works"
     assert missing in warnings
 
 

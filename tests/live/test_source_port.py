@@ -75,6 +75,28 @@ async def test_file_is_followed_from_its_beginning_and_again_after_it_is_replace
         await until(lambda: opened.data == b"one\ntwo\n3\n")
 
 
+@pytest.mark.parametrize("content", [b"one\ntwo\n", None])
+async def test_standard_input_that_is_a_file_is_read_to_its_end(
+    content: bytes | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = Path(os.devnull) if content is None else tmp_path / "input"
+    if content is not None:
+        path.write_bytes(content)
+    with path.open() as file:
+        monkeypatch.setattr("sys.stdin", file)
+        async with Opened("lines:stdin") as opened:
+            await until(lambda: opened.source.reason == "its end was reached")
+            assert opened.data == (content or b"")
+
+
+async def test_recording_that_is_missing_is_opened_once_it_exists(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    async with Opened(f"lines:file:{path}") as opened:
+        await until(lambda: "No such file" in opened.source.reason)
+        path.write_bytes(b"")
+        await until(lambda: opened.source.reason == "its end was reached")
+
+
 async def test_serial_device_is_opened_again_after_it_was_unplugged(tmp_path: Path) -> None:
     link = tmp_path / "tty"
     async with Opened(f"lines:{link}") as opened:

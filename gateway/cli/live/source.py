@@ -15,7 +15,7 @@ from gateway.sources.source import SourceInput
 from gateway.sources.trial import SourceTrial, describe
 
 app = typer.Typer()
-group = typer.Typer(help="Test a tracker that is to be a vehicle.")
+group = typer.Typer(help="Test a tracker that is to be a vehicle.", no_args_is_help=True)
 app.add_typer(group, name="source")
 
 SHOWN = 5
@@ -25,9 +25,14 @@ SHOWN = 5
 @group.command("test")
 def try_source(
     url: Annotated[str, typer.Argument(help="Such as lines:/dev/ttyUSB0 or crsf:/dev/ttyACM0.")],
-    seconds: Annotated[float, typer.Option("--seconds", min=0.1, max=3600)] = 10.0,
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=0.1, max=3600, help="How long it listens, s.")
+    ] = 10.0,
 ) -> None:
-    """Show what a tracker sends, its rates, and what is missing for attitude and position."""
+    """Show what a tracker sends, its rates, and what is missing for attitude and position.
+
+    The exit code is 1 if nothing was received.
+    """
     try:
         (source,) = make_sources((SourceSettings(url=url),), read_map)
     except ValueError as error:
@@ -37,6 +42,8 @@ def try_source(
         print(f"not connected: {source.reason}")
     for line in trial.summary(seconds):
         print(line)
+    if not trial.counts:
+        raise typer.Exit(1)
 
 
 async def _listen(source: SourceInput, seconds: float) -> SourceTrial:

@@ -87,7 +87,10 @@ def extract(
     system: SystemOption = None,
     force: ForceOption = False,
 ) -> None:  # fmt: skip
-    """Extract parameters, missions, texts, subtitles and geotags from a recording."""
+    """Extract parameters, missions, texts, subtitles and geotags from a recording.
+
+    The exit code is 1 if the recording has only some of them.
+    """
     files = recorded_files([file], "tlogs")
     targets = (params, mission, fence, rally, text, event, image, subtitle)
     wanted = [path for path in targets if path is not None]
@@ -103,7 +106,8 @@ def extract(
         made: list[tuple[Path, Iterable[str]]] = [
             (path, [make(recording.messages(WANTED))]) for path, make in timed if path is not None
         ]
-        made += _plans(recording, (params, mission, fence, rally), is_read=bool(made))
+        missing = list[str]()
+        made += _plans(recording, (params, mission, fence, rally), missing, is_read=bool(made))
         if subtitle is not None:
             begin = _video_begin(offset, video)
             shown = subtitles(
@@ -115,29 +119,39 @@ def extract(
             encoded = (piece.encode() for piece in pieces)
             write_new(path, encoded, overwrite=force, inputs=files)
             console_of().print(str(path))
-    print_remarks(dict.fromkeys(recording.flight.remarks))
+    print_remarks(dict.fromkeys([*recording.flight.remarks, *missing]))
+    if missing:
+        raise typer.Exit(1 if made else 2)
 
 
 def _plans(
-    recording: VehicleRecording, paths: Sequence[Path | None], *, is_read: bool
+    recording: VehicleRecording,
+    paths: Sequence[Path | None],
+    missing: list[str],
+    *,
+    is_read: bool,
 ) -> Iterator[tuple[Path, Iterable[str]]]:
-    """Yield the files of parameters, mission, fence and rally points that are wanted."""
+    """Yield the wanted files of parameters, mission, fence and rally points; note missing ones."""
     if not any(paths):
         return
     if not is_read:
         recording.read()
     plan, (params, *items) = recording.plan(), paths
-    if params is not None:
-        yield params, _params(params, plan)
+    found = [("parameters", params, _params(params, plan) if params else ())]
     for kind, path in zip(KINDS, items, strict=True):
-        if path is not None:
-            yield path, _items(path, plan, kind)
+        found.append((KINDS[kind], path, _items(path, plan, kind) if path else ()))
+    for name, path, pieces in found:
+        if path is not None and pieces:
+            yield path, pieces
+        elif path is not None:
+            missing.append(f"the recording has no {name} of this vehicle; {path} is not written")
 
 
 def _params(path: Path, plan: RecordedPlan) -> Iterable[str]:
+    """Return the content of a file of parameters; empty if there are none."""
     parameters = plan.parameters()
     if not parameters:
-        raise FlightError("the recording has no parameters of this vehicle")
+        return ()
     if path.suffix == ".params":
         return qgc_params(parameters, plan)
     return param_file(parameters)
@@ -146,7 +160,7 @@ def _params(path: Path, plan: RecordedPlan) -> Iterable[str]:
 def _items(path: Path, plan: RecordedPlan, kind: int) -> Iterable[str]:
     items = plan.items(kind)
     if not items:
-        raise FlightError(f"the recording has no {KINDS[kind]} of this vehicle")
+        return ()
     return [qgc_plan(plan)] if path.suffix == ".plan" else waypoints(items)
 
 

@@ -15,7 +15,7 @@ from gateway.cli.support.control import recordings_folder
 from gateway.cli.support.options import folder_of
 from gateway.cli.support.terminal import console_of, progress_bar
 from gateway.recordings.files import TABLE, TLOG, FlightError, Position, SettingsChoice, format_of
-from gateway.recordings.index import RecordingError, find_recording, recording_name
+from gateway.recordings.index import NEWEST, RecordingError, find_recording, recording_name
 from gateway.recordings.moment import Moment, parse_moment
 
 if TYPE_CHECKING:
@@ -170,9 +170,9 @@ def _files_of(name: Path, folder: Path, wanted: Wanted) -> list[Path]:
     try:
         files = list(find_recording(folder, str(name)).files)
     except RecordingError as error:
+        lacking = "recording" if str(name) == NEWEST else "recording of that name"
         raise FlightError(
-            f"{name}: no such file, and no recording of that name in {folder}; "
-            "`mavgate info` lists them"
+            f"{name}: no such file, and no {lacking} in {folder}; `mavgate info` lists them"
         ) from error
     if wanted == "all":
         return files

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.extracts import RecordedParameter
 from gateway.recordings.tlog import TlogRecord
-from tests.kit.cli import run
+from tests.kit.cli import invoke, run
 from tests.kit.mavlink import Sender
 from tests.recordings.frames import START_US, make_tlog
 
@@ -247,3 +247,16 @@ def test_recording_without_the_wanted_content_is_refused(tmp_path: Path) -> None
     assert "no parameters" in run("extract", path, "--params", tmp_path / "a.param", code=2)
     assert "no mission" in run("extract", path, "--mission", tmp_path / "a.plan", code=2)
     assert not (tmp_path / "a.plan").exists()
+
+
+@pytest.mark.parametrize(("others", "code"), [(("--params", "a.param"), 1), ((), 2)])
+def test_missing_mission_is_reported_and_other_files_are_written(
+    others: tuple[str, ...], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path, flight()[:2])
+    done = invoke("extract", "flight.tlog", "--mission", "a.plan", *others)
+    assert done.exit_code == code
+    assert "no mission of this vehicle; a.plan is not written" in done.output
+    assert Path("a.param").exists() == bool(others)
+    assert not Path("a.plan").exists()
