@@ -16,6 +16,7 @@ from urllib.parse import SplitResult, parse_qs, urlsplit
 from weakref import WeakValueDictionary
 
 from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, cookie_parser
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.status import WS_1008_POLICY_VIOLATION
@@ -72,8 +73,11 @@ LOGIN_PAGE: Final = """<!doctype html><html lang="en"><meta charset="utf-8">
 </label><button>Open the panel</button></form></body></html>"""
 
 
-class _TooLargeError(Exception):
+class _TooLargeError(HTTPException):
     """A request that is too large."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"too large: at most {limit} bytes")
 
 
 class AccessControl:
@@ -169,9 +173,8 @@ class AccessControl:
             # Answered as GET; the server, which has the scope itself, leaves the body out.
             scope = {**scope, "method": "GET"}
         limit = self._upload_limit if scope["path"].startswith((RECORDINGS, MAPS)) else MAX_BODY
-        answer = PlainTextResponse(
-            f"too large: at most {limit} bytes", HTTPStatus.REQUEST_ENTITY_TOO_LARGE
-        )
+        refusal = _TooLargeError(limit)
+        answer = PlainTextResponse(refusal.detail, refusal.status_code)
         length = Headers(scope=scope).get("content-length", "").lstrip("0")
         if len(length) > MAX_DIGITS or int(length or 0) > limit:
             await answer(scope, receive, with_headers(send))
@@ -183,7 +186,7 @@ class AccessControl:
             message = await receive()
             received += len(message.get("body", b""))
             if received > limit:
-                raise _TooLargeError
+                raise _TooLargeError(limit)
             return message
 
         async def noted(message: Message) -> None:
@@ -353,7 +356,7 @@ async def _small_body(receive: Receive) -> bytes:
             raise ClientDisconnect
         body += message.get("body", b"")
         if len(body) > MAX_LOGIN_BODY:
-            raise _TooLargeError
+            raise _TooLargeError(MAX_LOGIN_BODY)
         if not message.get("more_body"):
             return bytes(body)
 

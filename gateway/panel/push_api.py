@@ -34,8 +34,9 @@ class _Tokens:
             if time.monotonic() - self._asked_s >= ASK_AGAIN_S:
                 self._asked_s = time.monotonic()
                 self._known = [*await self._control.ask("source.tokens")]
-                # The gateway counts a wrong one.
-                await self._control.ask("source.push", token=token, text="")
+                if not self._has(token):
+                    # The gateway counts it.
+                    await self._control.ask("source.push", token=token, text="")
         if not self._has(token):
             raise ControlError("no source has this token")
 

@@ -45,7 +45,7 @@ def wanted_type(url: SourceUrl) -> int | None:
     name = url.options.get("type")
     found: int | None = getattr(mavlink, f"MAV_TYPE_{name.upper()}", None) if name else None
     if name is not None and found is None:
-        raise ValueError(f"source {url.url!r}: no MAV_TYPE {name!r}")
+        raise ValueError(f"source {url.name!r}: no MAV_TYPE {name!r}")
     return found
 
 

@@ -10,7 +10,14 @@ from gateway.sources.crsf import CrsfDecoder
 from gateway.sources.lines import LinesDecoder
 from gateway.sources.ltm import LtmDecoder
 from gateway.sources.phone import PhoneDecoder
-from gateway.sources.settings import OPTIONS, SourceSettings, SourceUrl, nodes_of, parse_source
+from gateway.sources.settings import (
+    MAX_VEHICLE,
+    OPTIONS,
+    SourceSettings,
+    SourceUrl,
+    nodes_of,
+    parse_source,
+)
 from gateway.sources.source import PolledDecoder, SourceDecoder, SourceInput
 
 SourceKind = Callable[[SourceUrl, NodeId], SourceDecoder]
@@ -51,16 +58,18 @@ def add_source_kind(name: str, make: SourceKind, options: tuple[str, ...] = ()) 
 def check_source(url: SourceUrl) -> None:
     """Raise ValueError for an unknown kind or option, or a number that is none."""
     if url.kind not in SOURCE_KINDS:
-        raise ValueError(f"source {url.url!r}: {unknown_choice('kind', url.kind, SOURCE_KINDS)}")
+        raise ValueError(f"source {url.name!r}: {unknown_choice('kind', url.kind, SOURCE_KINDS)}")
     _, own = SOURCE_KINDS[url.kind]
     allowed = (*OPTIONS, *own)
     if unknown := [name for name in url.options if name not in allowed]:
         raise ValueError(
-            f"source {url.url!r}: unknown option {unknown[0]!r}; there are {', '.join(allowed)}"
+            f"source {url.name!r}: unknown option {unknown[0]!r}; there are {', '.join(allowed)}"
         )
     for name in ("baud", "id"):
         if name in url.options and not url.options[name].isdecimal():
-            raise ValueError(f"source {url.url!r}: {name} must be a whole number")
+            raise ValueError(f"source {url.name!r}: {name} must be a whole number")
+    if not 1 <= int(url.options.get("id", 1)) <= MAX_VEHICLE:
+        raise ValueError(f"source {url.name!r}: id must be 1 to {MAX_VEHICLE}")
 
 
 def make_decoder(url: SourceUrl, node: NodeId) -> SourceDecoder:
@@ -69,7 +78,7 @@ def make_decoder(url: SourceUrl, node: NodeId) -> SourceDecoder:
     make, _ = SOURCE_KINDS[url.kind]
     decoder = make(url, node)
     if url.transport == "poll" and not isinstance(decoder, PolledDecoder):
-        raise ValueError(f"source {url.url!r}: {url.kind} cannot be polled")
+        raise ValueError(f"source {url.name!r}: {url.kind} cannot be polled")
     return decoder
 
 

@@ -26,14 +26,13 @@ from gateway.records import (
 from gateway.sources.csv_lines import CsvLines, read_column_map
 from gateway.sources.nmea import NmeaReader
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
-from gateway.sources.settings import SourceUrl
+from gateway.sources.settings import MAX_VEHICLE, SourceUrl
 from gateway.sources.source import SourceRecord, unusable
 from gateway.units import STANDARD_GRAVITY_MPS2
 from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
 
 MAX_LINE: Final = 4096
-MAX_VEHICLE: Final = 31
 
 DEG_PER_RAD: Final = math.degrees(1.0)
 VECTORS: Final = {

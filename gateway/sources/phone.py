@@ -104,7 +104,7 @@ class PhoneDecoder:
         try:
             self._geoid_m = float(url.options.get("geoid_m", "0"))
         except ValueError as error:
-            raise ValueError(f"source {url.url!r}: geoid_m must be a number") from error
+            raise ValueError(f"source {url.name!r}: geoid_m must be a number") from error
         self._clock = SampleClock()
         self._newest_us: dict[str, float] = {}
         """The newest time of each quantity."""

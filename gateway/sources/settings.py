@@ -30,6 +30,7 @@ PLAIN: Final = frozenset({"push", "receiver", "stdin"})
 NETWORK: Final = frozenset({"udp", "tcp", "tcp-listen", "poll"})
 MAX_SOURCES: Final = 16
 MAX_PORT: Final = 65535
+MAX_VEHICLE: Final = 31
 OPTIONS: Final = ("baud", "id", "token")
 """Of every kind."""
 
@@ -64,13 +65,13 @@ def parse_source(url: str) -> SourceUrl:
     if not transport:
         transport, address = _transport_of(address)
     if not kind or not (colon or transport in PLAIN):
-        raise ValueError(f"source {url!r}: write KIND:WHERE, such as lines:/dev/ttyUSB0")
+        raise ValueError(f"source {location!r}: write KIND:WHERE, such as lines:/dev/ttyUSB0")
     options = dict(parse_qsl(query, keep_blank_values=True))
     port = 0
     if transport in NETWORK:
-        address, port = _host_and_port(url, address)
+        address, port = _host_and_port(location, address)
     elif transport not in PLAIN and not address:
-        raise ValueError(f"source {url!r}: names no device or file")
+        raise ValueError(f"source {location!r}: names no device or file")
     return SourceUrl(url, kind, transport, address, port, options)
 
 
@@ -82,10 +83,10 @@ def _transport_of(address: str) -> tuple[str, str]:
     return ("stdin", "") if address == "-" else ("serial", address)
 
 
-def _host_and_port(url: str, address: str) -> tuple[str, int]:
+def _host_and_port(location: str, address: str) -> tuple[str, int]:
     host, _, port = address.rpartition(":")
     if not (port.isdecimal() and 0 <= int(port) <= MAX_PORT and host):
-        raise ValueError(f"source {url!r}: needs HOST:PORT, such as 127.0.0.1:5600")
+        raise ValueError(f"source {location!r}: needs HOST:PORT, such as 127.0.0.1:5600")
     return host.strip("[]"), int(port)
 
 
@@ -105,7 +106,7 @@ class SourceSettings(Settings, frozen=True):
             "Vehicle id, which is its MAVLink system id; 0 for its place in the list. Several "
             "sources may belong to one vehicle.",
             ge=0,
-            le=31,
+            le=MAX_VEHICLE,
         ),
     ] = 0
 

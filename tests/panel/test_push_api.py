@@ -96,6 +96,16 @@ async def test_post_that_is_too_large_or_of_a_foreign_page_is_refused(
     assert gateway.lines == []
 
 
+async def test_post_of_unknown_length_that_is_too_large_is_refused(gateway: Gateway) -> None:
+    async def content() -> AsyncIterator[bytes]:
+        for _ in range(2):
+            yield b"x" * MAX_BODY
+
+    answer = await gateway.phone.post("/push/right", content=content())
+    assert answer.status_code == 413
+    assert gateway.lines == []
+
+
 async def test_token_does_not_open_the_rest_of_the_panel(gateway: Gateway) -> None:
     for path in ("/v1/mavlink", "/push/../v1/mavlink", "/ws/mavlink"):
         assert (await gateway.phone.get(path)).status_code == 401

@@ -259,11 +259,16 @@ def test_url_names_kind_transport_and_place(url: str, found: tuple[Any, ...]) ->
         ("line:stdin", "did you mean 'lines'"),
         ("lines:stdin?bad=1", "unknown option 'bad'"),
         ("lines:stdin?id=x", "whole number"),
+        ("lines:stdin?id=0", "1 to 31"),
+        ("lines:stdin?id=256", "1 to 31"),
+        ("phone:push?geoid_m=x", "a number"),
     ],
 )
-def test_wrong_url_is_refused_with_the_reason(url: str, why: str) -> None:
-    with pytest.raises(ValueError, match=why.replace("'", ".")):
-        make_sources((SourceSettings(url=url),), str)
+def test_wrong_url_is_refused_with_the_reason_and_without_its_token(url: str, why: str) -> None:
+    secret = url + ("&" if "?" in url else "?") + "token=sesame"
+    with pytest.raises(ValueError, match=why.replace("'", ".")) as refusal:
+        make_sources((SourceSettings(url=secret),), str)
+    assert "sesame" not in str(refusal.value)
 
 
 def test_sources_are_vehicles_by_their_place_unless_a_vehicle_is_set() -> None:
