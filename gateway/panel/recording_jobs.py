@@ -189,17 +189,19 @@ class RecordingJobs:
             self._delete(key, export)
 
     async def _export(self, key: Hashable, export: _Export, order: Order) -> Path:
-        if self._folder is None:
-            self._folder = Path(tempfile.mkdtemp(prefix="mavgate-export-"))
         token = secrets.token_urlsafe(16)
-        work = self._folder / token
         try:
+            # Systems remove old folders of temporary files.
+            if self._folder is None or not self._folder.is_dir():
+                self._folder = Path(tempfile.mkdtemp(prefix="mavgate-export-"))
             async with self._exporting[export.role]:
+                work = self._folder / token
                 work.mkdir()
                 target = await _make(work, order)
         except BaseException:
             # Half a file of a large recording may take gigabytes.
-            shutil.rmtree(work, ignore_errors=True)
+            if self._folder is not None:
+                shutil.rmtree(self._folder / token, ignore_errors=True)
             self._exports.pop(key, None)
             raise
         finally:

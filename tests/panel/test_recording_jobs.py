@@ -1,6 +1,7 @@
 """Exports of recordings by other commands, and the update of the catalogue."""
 
 import asyncio
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -126,6 +127,22 @@ def maker(monkeypatch: pytest.MonkeyPatch) -> Maker:
     made = Maker()
     monkeypatch.setattr(recording_jobs, "_make", made.make)
     return made
+
+
+async def test_export_is_made_again_after_the_temporary_folder_failed_or_was_removed(
+    exported: Path, maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "full"))
+    jobs, order = RecordingJobs(), Order(exported, NAME, "csv")
+    for _ in range(recording_jobs.EXPORTS_OF_ROLE + 1):
+        with pytest.raises(FileNotFoundError):
+            await jobs.export(order)
+    (tmp_path / "full").mkdir()
+    for kind in ("csv", "gpx"):
+        await jobs.export(Order(exported, NAME, kind))
+        shutil.rmtree(*tmp_path.glob("full/mavgate-export-*"))
+    assert maker.kinds == ["csv", "gpx"]
+    jobs.close()
 
 
 VIEWER = Holder(Role.VIEWER, "session", "10.0.0.1")
