@@ -265,7 +265,7 @@ def _open_made(
         for frame in fusion.introduction():
             flight.answers.add_frame(frame, 0)
         add(fusion.frames(), end_of(parts[-1], options))
-        flight.remarks += [f"{parts[0]}: {remark}" for remark in fusion.remarks]
+        flight.remarks += fusion.remarks
 
 
 def lay_out(

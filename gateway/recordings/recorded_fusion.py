@@ -297,7 +297,7 @@ class RecordedFusion:
         try:
             estimator = samples.estimator(self.aircraft.estimation)
         except ValueError as error:
-            self._table.remarks.append(NOT_RESTORED.format(error))
+            self._refused.append(str(error))
             estimator = _kalman_filter(self.aircraft)
         try:
             fused = fuse(samples, estimator, smoothed=True)
@@ -313,7 +313,8 @@ class RecordedFusion:
     @property
     def remarks(self) -> list[str]:
         """Remarks about the states for the user, as far as the rows were read."""
-        return [*map(NOT_RESTORED.format, self._refused), *self._table.remarks, *self._of_rate()]
+        refused = (f"{self._files[0]}: {NOT_RESTORED.format(why)}" for why in self._refused)
+        return [*refused, *self._table.remarks, *self._of_rate()]
 
     @property
     def summary(self) -> str:

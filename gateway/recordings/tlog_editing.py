@@ -148,6 +148,7 @@ class TlogEditor:
             is_cut = self._limits != (None, None) and edits.are_none
             raise FlightError(NOTHING_WITHIN if is_cut else NOTHING_LEFT)
         if not edits.are_none:
+            kept -= self._left_out.total()
             self._remark(f"kept {kept} of {counted(total, 'record')}")
 
     def _edited(self, batch: Batch) -> bytes:

@@ -384,6 +384,7 @@ def test_unknown_message_that_cannot_be_renumbered_is_left_out_and_listed(
     records = [*make_records(9), TlogRecord(START_US + SECOND_US, bytes(frame))]
     kept, text = convert(write(records), "--as", "1:9", folder=tmp_path)
     assert len(kept) == 9
+    assert "kept 9 of 10 records" in text
     assert "left out 1 frame of unknown message 60001" in text
 
 
