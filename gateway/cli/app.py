@@ -290,7 +290,9 @@ def _options(
     socket: Annotated[
         Path | None,
         typer.Option(
-            "--socket", envvar="MAVGATE_SOCKET", help="Control socket, if several gateways run."
+            "--socket",
+            envvar="MAVGATE_SOCKET",
+            help="Control socket of the gateway to ask, if several run.",
         ),
     ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log details too.")] = False,

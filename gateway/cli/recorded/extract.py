@@ -49,7 +49,7 @@ def _out(name: str, text: str, endings: tuple[str, ...]) -> Any:
 
 @app.command()
 def extract(
-    file: Annotated[Path, typer.Argument(help="Recording, by name or tlog.", show_default=False)],
+    file: Annotated[Path, typer.Argument(help="Recording, by name or file.", show_default=False)],
     *,
     params: Annotated[
         Path | None, _out("--params", "Parameters", (".param", ".params"))
