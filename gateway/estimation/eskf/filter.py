@@ -151,8 +151,8 @@ def start(s: State, p: Gains) -> None:
 def clear_times(s: State) -> None:
     """Discard everything that depends on the clock."""
     s.mag_s = s.mag_used_s = s.fix_s = s.update_s = s.level_s = NEVER_S
-    s.baro_s = s.rejected_s = s.track_s = NEVER_S
-    s.reject_s = 0.0
+    s.baro_s = s.rejected_s = s.track_s = s.zero_s = NEVER_S
+    s.reject_s, s.zero_velocity_wrong = 0.0, 0
     close_gap(s)
 
 

@@ -54,6 +54,9 @@ FASTEST_MPS: Final = 1000.0
 """A larger velocity is an error."""
 BASELINE_S: Final = 2.0 * PAIR_S
 """Positions closer together differ mostly by their noise."""
+ZERO_S: Final = 3.0
+ZERO_MPS: Final = 2.0
+"""Fixes that move so fast for this time contradict a velocity of exactly zero."""
 AFTER_GAP_S: Final = 2.0
 """After a gap: corrections of the position are blended in, and late fixes show no latency."""
 STATIONARY_MPS: Final = 0.1
@@ -86,6 +89,8 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
         compare_latencies(s, p.gps_latency_s, arrival_s, reported)
     wanted_s = arrival_s - s.gps_latency_s
     pos = position_of(s, row)
+    if is_zero_velocity_wrong(s, pos, reported):
+        reported = (NAN, NAN, NAN)
     vel, vel_s = complete_velocity(s, wanted_s, pos, reported)
     sound = is_below(vel, FASTEST_MPS)
     if sound:
@@ -168,8 +173,9 @@ def position_of(s: State, row: FloatArray) -> Vec3:
     elif math.hypot(s.pos_n[0], s.pos_n[1]) > ORIGIN_RENEWAL_M:
         lat, lon = offset_deg(s.origin[0], s.origin[1], 0.0, s.pos_n[0], s.pos_n[1])
         north, east = displacement_m(s.origin[0], s.origin[1], lat, lon, 0.0)
-        s.track_pos_n[0] -= north
-        s.track_pos_n[1] -= east
+        for from_n in (s.track_pos_n, s.zero_pos_n):
+            from_n[0] -= north
+            from_n[1] -= east
         s.pos_n[0] -= north
         s.pos_n[1] -= east
         s.origin[0], s.origin[1] = lat, lon
@@ -181,6 +187,22 @@ def position_of(s: State, row: FloatArray) -> Vec3:
 def is_level_sound(vel: Vec3) -> bool:
     """Return whether a velocity has sound horizontal components."""
     return is_below((vel[0], vel[1], 0.0), FASTEST_MPS)
+
+
+@compiled
+def is_zero_velocity_wrong(s: State, pos: Vec3, vel: Vec3) -> bool:
+    """Return whether the positions contradict a velocity of exactly zero."""
+    if vel[0] != 0.0 or vel[1] != 0.0 or vel[2] != 0.0:
+        s.zero_s, s.zero_velocity_wrong = NEVER_S, 0
+        return False
+    dt = s.time_s - s.zero_s
+    if not 0.0 <= dt < ZERO_S:
+        if s.zero_s != NEVER_S:
+            way_m = math.hypot(pos[0] - s.zero_pos_n[0], pos[1] - s.zero_pos_n[1])
+            s.zero_velocity_wrong = 1 if way_m > ZERO_MPS * dt else 0
+        s.zero_s = s.time_s
+        write_vec(s.zero_pos_n, pos)
+    return s.zero_velocity_wrong == 1
 
 
 @compiled

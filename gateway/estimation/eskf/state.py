@@ -156,6 +156,11 @@ class State:
     track_s: float
     track_pos_n: Annotated[FloatArray, (3,)]
     """Time and position from which a velocity is derived where fixes have none."""
+    zero_s: float
+    zero_pos_n: Annotated[FloatArray, (3,)]
+    """The same for velocities of exactly zero."""
+    zero_velocity_wrong: int
+    """1 while positions contradict a velocity of exactly zero."""
     gps_error_var: Annotated[FloatArray, (3,)]
     pos_density: Annotated[FloatArray, (3,)]
     """Position noise for slow errors of GPS velocities, m2/s."""
