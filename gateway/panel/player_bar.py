@@ -1,6 +1,6 @@
 """The player of a recording, below every view while one is open."""
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, Final
 
@@ -51,6 +51,8 @@ class PlayerBar:
             close = ui.button(icon="close", on_click=partial(self._play, self._playback.close))
             close.props('flat round dense aria-label="Close the playback"')
         self._bar.set_visibility(False)
+        self._is_showing = False
+        """While the values of the player are set, which are no choices of the user."""
         ui.timer(POSITION_S, self._show)
 
     def _show(self) -> None:
@@ -58,11 +60,13 @@ class PlayerBar:
         self._bar.set_visibility(status is not None)
         if status is None:
             return
-        self._fused_again.set_value(playback.has_fused_again)
         playing = status["state"] == "playing"
         self._toggle.props["icon"] = "pause" if playing else "play_arrow"
         speed = status["speed"] or SPEEDS[-1]
+        self._is_showing = True
+        self._fused_again.set_value(playback.has_fused_again)
         self._speed.set_value(speed)
+        self._is_showing = False
         new = {
             "curves": _curves_of(playback, self._context.system_id),
             "duration": status["duration_s"],
@@ -82,18 +86,19 @@ class PlayerBar:
                 await answer
             self._show()
 
-    async def _on_fused_again(self, event: Any) -> None:
+    def _on_fused_again(self, event: Any) -> Awaitable[None] | None:
         name = self._playback.name
-        if name and event.value != self._playback.has_fused_again:
-            await open_playback(self._context, name, fused_again=event.value)
+        if self._is_showing or not name:
+            return None
+        return open_playback(self._context, name, fused_again=event.value)
 
     async def _on_seek(self, event: GenericEventArguments) -> None:
         await self._play(self._playback.order, "seek", to=f"{float(event.args):.2f}")
 
-    async def _on_speed(self, event: Any) -> None:
-        status = self._playback.status
-        if status is not None and float(event.value) != (status["speed"] or SPEEDS[-1]):
-            await self._play(self._playback.order, "play.speed", speed=float(event.value))
+    def _on_speed(self, event: Any) -> Awaitable[None] | None:
+        if self._is_showing:
+            return None
+        return self._play(self._playback.order, "play.speed", speed=float(event.value))
 
 
 def _curves_of(playback: Playback, system_id: int | None) -> list[Profile]:
