@@ -64,7 +64,8 @@ RESET_PULSE_S: Final = 0.05
 SYNC_TRIES: Final = 12
 SYNC_WAIT_S: Final = 0.1
 """Optiboot flashes its LED for 0.3 s before it listens, and waits 1 s for a request."""
-AVRDUDE_LIMIT_S: Final = 180.0
+AVRDUDE_LIMIT_S: Final = 90.0
+"""For one try, which takes 20 s: after a lost byte avrdude may wait for ever."""
 AVRDUDE_TRIES: Final = 3
 """A board that restarts slowly can miss the first requests."""
 
@@ -358,12 +359,12 @@ def _avrdude(device: str, bootloader: Bootloader, *what: str) -> None:
     command = [program, "-c", "arduino", "-p", CHIP, "-P", device, *speed, *what]
     for _ in range(AVRDUDE_TRIES):
         try:
-            code = subprocess.run(command, check=False, timeout=AVRDUDE_LIMIT_S).returncode
-        except subprocess.TimeoutExpired as error:
-            raise FlashError(f"{device}: avrdude took over {AVRDUDE_LIMIT_S:.0f} s") from error
-        if code == 0:
-            return
+            if subprocess.run(command, check=False, timeout=AVRDUDE_LIMIT_S).returncode == 0:
+                return
+        except subprocess.TimeoutExpired:
+            continue
     raise FlashError(
-        f"{device}: avrdude failed {AVRDUDE_TRIES} times, see above; use a short USB cable, and "
-        "disconnect everything else from D0 and D1"
+        f"{device}: avrdude failed {AVRDUDE_TRIES} times, see above, or took over "
+        f"{AVRDUDE_LIMIT_S:.0f} s; use a short USB cable, and disconnect everything else from D0 "
+        "and D1"
     )

@@ -20,7 +20,7 @@ from tests.firmware.harness import Bench
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
-LIMIT_S = 90.0
+LIMIT_S = 240.0
 SPI_CLOCK = 1 << 5
 MakeBench = Callable[..., Bench]
 
@@ -53,8 +53,11 @@ def flash(usb: UsbSerial, *words: str) -> str:
     with subprocess.Popen(
         command, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment
     ) as process:
-        code = usb.run_while(process, LIMIT_S)
         assert process.stdout is not None
+        try:
+            code = usb.run_while(process, LIMIT_S)
+        except TimeoutError as error:
+            raise AssertionError(process.stdout.read()) from error
         output = process.stdout.read()
     assert code == 0, output
     return output

@@ -117,6 +117,19 @@ def test_port_that_another_program_holds_is_left_alone(images: Path) -> None:
     assert "another program has it open" in done.output
 
 
+def test_avrdude_that_waits_for_ever_is_ended_and_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As after a lost byte: the first run waits, the second one writes."""
+    program = tmp_path / "avrdude"
+    program.write_text(f"#!/bin/sh\nmkdir {tmp_path}/tried && exec sleep 60\nexit 0\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.setattr(boards, "AVRDUDE_LIMIT_S", 0.5)
+    boards.write_flash("/dev/null", boards.BOOTLOADERS[0], b":00000001FF\n")
+    assert (tmp_path / "tried").is_dir()
+
+
 def test_missing_avrdude_is_named_with_the_way_to_install_it(
     images: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
