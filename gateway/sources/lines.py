@@ -33,6 +33,8 @@ from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
 
 MAX_LINE: Final = 4096
+PACKETS: Final = ("udp", "receiver")
+"""Transports that keep the bounds of what was sent."""
 
 DEG_PER_RAD: Final = math.degrees(1.0)
 VECTORS: Final = {
@@ -83,15 +85,19 @@ REPORTED: Final = frozenset(
 
 
 class LineSplitter:
-    """Lines of a stream of bytes, of a greatest length."""
+    """Lines of the bytes of a transport, of a greatest length.
 
-    def __init__(self, max_line: int = MAX_LINE) -> None:
+    A datagram or packet ends its last line, whether or not a line feed does.
+    """
+
+    def __init__(self, transport: str, max_line: int = MAX_LINE) -> None:
         self._max = max_line
+        self._end = b"\n" if transport in PACKETS else b""
         self._rest = b""
 
     def feed(self, data: bytes) -> list[str | Fault]:
         """Decode any chunk, and return the lines that it completes."""
-        *lines, rest = (self._rest + data).split(b"\n")
+        *lines, rest = (self._rest + data + self._end).split(b"\n")
         found: list[str | Fault] = [
             line.decode("utf-8", "replace").strip()
             if len(line) <= self._max
@@ -114,7 +120,7 @@ class LinesDecoder:
 
     def __init__(self, url: SourceUrl, node: NodeId) -> None:
         self._node = node
-        self._splitter = LineSplitter()
+        self._splitter = LineSplitter(url.transport)
         self._nmea = NmeaReader(node)
         column_map = url.options.get("columns")
         self._csv = None
@@ -123,8 +129,6 @@ class LinesDecoder:
             self._csv = CsvLines(read_column_map(column_map), names, node)
         self._clocks: dict[int, SampleClock] = {}
         self._has_own_id = "id" in url.options
-        self._ends_line = url.transport in ("udp", "receiver")
-        """A datagram or packet ends its last line, whether or not a line feed does."""
 
     def reset(self) -> None:
         """Discard a line that has not ended."""
@@ -133,7 +137,7 @@ class LinesDecoder:
     def feed(self, data: bytes, arrival_us: int) -> list[SourceRecord | Fault]:
         """Decode every line that a chunk completes."""
         found: list[SourceRecord | Fault] = []
-        for line in self._splitter.feed(data + b"\n" if self._ends_line else data):
+        for line in self._splitter.feed(data):
             if isinstance(line, Fault):
                 found.append(line)
             elif line:

@@ -50,13 +50,13 @@ UNREADABLE: Final = (
     ArithmeticError,
     RecursionError,
 )
-"""Raised by what is not as an app writes it."""
+"""Raised by content in another form than that of the apps."""
 
 Reading = tuple[float, str, tuple[float, ...]]
 """Time of the phone, µs, a quantity, and its values; an absent one is NaN."""
 
-PLACE: Final = ("lat", "lon", "alt", "speed", "course", "h_acc", "v_acc", "satellites")
-"""The values of the quantity `place`."""
+POSITION: Final = ("lat", "lon", "alt", "speed", "course", "h_acc", "v_acc", "satellites")
+"""The values of the quantity `position`."""
 XYZ: Final = ("x", "y", "z")
 LOGGED: Final = {
     "totalacceleration": ("accel", XYZ),
@@ -65,7 +65,7 @@ LOGGED: Final = {
     "gyroscope": ("gyro", XYZ),
     "magnetometer": ("mag", XYZ),
     "barometer": ("pressure", ("pressure",)),
-    "location": ("place", (
+    "location": ("position", (
         "latitude", "longitude", "altitudeAboveMeanSeaLevel", "speed", "bearing",
         "horizontalAccuracy", "verticalAccuracy",
     )),
@@ -77,7 +77,7 @@ BUFFERS: Final = {
     "gyro": ("gyr_time", "gyrX", "gyrY", "gyrZ"),
     "mag": ("mag_time", "magX", "magY", "magZ"),
     "pressure": ("pressure_time", "pressure"),
-    "place": (
+    "position": (
         "loc_time", "locLat", "locLon", "locZ", "locV", "locDir",
         "locAccuracy", "locZAccuracy", "locSatellites",
     ),
@@ -87,19 +87,18 @@ STREAMED: Final = {
     "accelerometer": "accel",
     "gyroscope": "gyro",
     "magnetometer": "mag",
-    "gps": "place",
+    "gps": "position",
 }
 """Sensors of HyperIMU; others are skipped."""
 USUAL_SENSORS: Final = "accelerometer,gyroscope,magnetometer,gps"
 
 
 class PhoneDecoder:
-    """Decode what one phone sends."""
+    """Decode the readings of one phone."""
 
     def __init__(self, url: SourceUrl, node: NodeId) -> None:
         self._node = node
-        self._splitter = LineSplitter(MAX_LINE)
-        self._ends_line = url.transport == "udp"
+        self._splitter = LineSplitter(url.transport, MAX_LINE)
         self._sensors = url.options.get("sensors", USUAL_SENSORS).lower().split(",")
         try:
             self._geoid_m = float(url.options.get("geoid_m", "0"))
@@ -120,7 +119,7 @@ class PhoneDecoder:
         self._splitter.reset()
 
     def request(self) -> str:
-        """Return what to ask phyphox for: all that is newer than its last answer."""
+        """Return the path and query of phyphox for all that is newer than its last answer."""
         found = []
         for quantity, (time, *values) in BUFFERS.items():
             since = self._polled_s.get(quantity, "")
@@ -132,7 +131,7 @@ class PhoneDecoder:
     def feed(self, data: bytes, arrival_us: int) -> list[SourceRecord | Fault]:
         """Decode every line that a chunk completes."""
         found: list[SourceRecord | Fault] = []
-        for line in self._splitter.feed(data + b"\n" if self._ends_line else data):
+        for line in self._splitter.feed(data):
             if isinstance(line, Fault):
                 found.append(line)
             elif line:
@@ -182,21 +181,21 @@ class PhoneDecoder:
             quantity = STREAMED.get(sensor)
             reading = tuple(values[3 * k : 3 * k + 3])
             # Each line repeats the newest field and position.
-            if quantity in ("mag", "place") and self._values.get(quantity) == reading:
+            if quantity in ("mag", "position") and self._values.get(quantity) == reading:
                 continue
-            if quantity is not None and (quantity != "place" or any(reading)):
+            if quantity is not None and (quantity != "position" or any(reading)):
                 yield time_ms * 1000.0, quantity, reading
 
     def _records(self, readings: list[Reading], arrival_us: int) -> list[SourceRecord | Fault]:
         found: list[SourceRecord | Fault] = []
         if not readings:
             return found
-        # What a sample needs comes before the gyroscope of the same time.
+        # Other quantities of a sample come before the gyroscope of the same time.
         readings.sort(key=lambda reading: (reading[0], reading[1] == "gyro"))
         last_us, late = readings[-1][0], 0
         if not 0.0 <= last_us < 1e17:
-            raise ValueError("has a time that is none")
-        # The newest has waited least; by it the others' times are known.
+            raise ValueError("has an invalid time")
+        # The newest has waited least; the others are as much older as on the phone's clock.
         local_us = self._clock.local(round(last_us), arrival_us)
         if last_us < max(self._newest_us.values(), default=0.0) - RESTART_US:
             self._newest_us.clear()
@@ -225,7 +224,7 @@ class PhoneDecoder:
             case "pressure":
                 stamp, pascals = time_us & WRAP_MASK, values[0] * 100.0
                 return None if pascals != pascals else BaroRaw(time_us, node, stamp, pascals, NAN)
-            case "place":
+            case "position":
                 return self._fix(time_us, values)
         level, volts = values
         percent = level * 100.0 if level >= 0.0 else NAN
@@ -247,10 +246,10 @@ class PhoneDecoder:
         return imu_raw(time_us, self._node, _board(accel), _board(rates), field)
 
     def _fix(self, time_us: int, values: tuple[float, ...]) -> SourceRecord | None:
-        known = dict(zip(PLACE, values, strict=False))
+        known = dict(zip(POSITION, values, strict=False))
         # The apps write invalid values as negative ones.
         speed, course, h_acc, v_acc, satellites = (
-            value if (value := known.get(name, NAN)) >= 0.0 else NAN for name in PLACE[3:]
+            value if (value := known.get(name, NAN)) >= 0.0 else NAN for name in POSITION[3:]
         )
         return fix_at(
             time_us,

@@ -2,6 +2,7 @@
 
 import asyncio
 import fcntl
+import math
 import os
 import re
 import select
@@ -15,6 +16,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from mavsdk.asyncio import ComponentType, Configuration, Mavsdk, System
+from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
+from mavsdk.plugins.telemetry.telemetry import Position
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.kit.process import START_LIMIT_S, Process
@@ -157,3 +160,11 @@ async def mavsdk_system(
         system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
         async with asyncio.timeout(START_LIMIT_S):
             yield system
+
+
+async def first_position(telemetry: TelemetryAsync) -> Position:
+    """Return the first position that the vehicle has."""
+    async for position in telemetry.subscribe_position():
+        if math.isfinite(position.latitude_deg):
+            return position
+    raise AssertionError("no position")

@@ -8,7 +8,7 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import Client, Gateway, MavProxy, mavsdk_system
+from tests.end_to_end.processes import Client, Gateway, MavProxy, first_position, mavsdk_system
 
 HOME = SimulatorSettings()
 NEAR_DEG = 0.004
@@ -53,9 +53,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
 async def test_mavsdk_sees_vehicle_attitude_and_position(gateway: Gateway) -> None:
     async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
-        async for position in telemetry.subscribe_position():
-            if math.isfinite(position.latitude_deg):
-                break
+        position = await first_position(telemetry)
         attitude = await anext(telemetry.subscribe_attitude_euler())
         speeds = await anext(telemetry.subscribe_fixedwing_metrics())
     assert position.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)

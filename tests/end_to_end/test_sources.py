@@ -11,7 +11,14 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from mavsdk.plugins.telemetry.telemetry import FlightMode
 
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import CONFIG, Client, Gateway, MavProxy, mavsdk_system
+from tests.end_to_end.processes import (
+    CONFIG,
+    Client,
+    Gateway,
+    MavProxy,
+    first_position,
+    mavsdk_system,
+)
 from tests.kit.cli import invoke
 from tests.ports import free_port
 
@@ -28,9 +35,7 @@ async def test_mavsdk_sees_a_crsf_vehicle(start_gateway: Callable[..., Gateway])
     async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
         attitude = await anext(telemetry.subscribe_attitude_euler())
-        async for position in telemetry.subscribe_position():
-            if math.isfinite(position.latitude_deg):
-                break
+        position = await first_position(telemetry)
         async for battery in telemetry.subscribe_battery():
             if math.isfinite(battery.voltage_v) and battery.voltage_v > 0.0:
                 break
@@ -74,9 +79,7 @@ async def test_mavsdk_and_mavproxy_see_a_vehicle_of_samples(
     gateway = start_gateway("demo", "--source", kind)
     async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
-        async for position in telemetry.subscribe_position():
-            if math.isfinite(position.latitude_deg):
-                break
+        position = await first_position(telemetry)
         attitude = await anext(telemetry.subscribe_attitude_euler())
         heading = await anext(telemetry.subscribe_heading())
     assert abs(attitude.roll_deg) < STEEPEST_DEG

@@ -15,7 +15,7 @@ SKETCHES = sorted(EXAMPLES.glob("*/*.ino"))
 
 @pytest.mark.io
 @pytest.mark.parametrize("sketch", SKETCHES, ids=[path.stem for path in SKETCHES])
-def test_sketch_compiles_for_avr_or_is_said_to_be_untested(sketch: Path, tmp_path: Path) -> None:
+def test_sketch_compiles_for_avr_or_is_marked_as_untested(sketch: Path, tmp_path: Path) -> None:
     if NOT_COMPILED in sketch.read_text():
         return
     if not ARDUINO.is_dir() or shutil.which("avr-g++") is None:

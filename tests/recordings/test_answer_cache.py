@@ -405,7 +405,7 @@ def test_damaged_or_foreign_requests_are_passed_on(link: CachedLink) -> None:
         assert found == ([], frame)
 
 
-def test_confirmation_without_index_keeps_the_place_of_a_parameter(link: CachedLink) -> None:
+def test_confirmation_without_index_keeps_the_index_of_a_parameter(link: CachedLink) -> None:
     values = [mavlink.MAVLink_param_value_message(b"P%d" % i, i, 9, 3, i) for i in range(3)]
     for message in values:
         link.down(message)

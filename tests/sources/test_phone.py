@@ -135,7 +135,7 @@ def test_each_app_gives_the_same_sample_in_axes_of_a_flat_phone(app: Any) -> Non
     assert sample.mag_b_ut == pytest.approx((20.0, -12.0, 40.0), abs=0.01)
 
 
-PLACE = {
+LOCATION = {
     "latitude": 48.1173, "longitude": -11.5167, "altitude": 592.0, "speed": 11.5, "bearing": 90.0,
     "altitudeAboveMeanSeaLevel": 545.4, "horizontalAccuracy": 3.5, "verticalAccuracy": 6.0,
 }  # fmt: skip
@@ -144,7 +144,7 @@ PLACE = {
 def test_location_pressure_and_battery_of_sensor_logger_are_records() -> None:
     data = sensor_logger(
         [
-            (1.0, "location", PLACE),
+            (1.0, "location", LOCATION),
             (1.1, "barometer", {"pressure": 1001.5, "relativeAltitude": 0.2}),
             (1.2, "battery", {"batteryLevel": 0.63, "batteryState": "unplugged"}),
             (1.3, "battery", {"batteryLevel": -1, "voltage": 3.9}),
@@ -161,13 +161,13 @@ def test_location_pressure_and_battery_of_sensor_logger_are_records() -> None:
 
 
 def test_invalid_values_of_a_location_are_unknown() -> None:
-    values = PLACE | {"speed": -1, "bearing": -1, "horizontalAccuracy": -1}
+    values = LOCATION | {"speed": -1, "bearing": -1, "horizontalAccuracy": -1}
     (fix,) = decoder().feed(sensor_logger([(1.0, "location", values)]), 0)
     assert [*map(math.isnan, (*fix.vel_n_mps, fix.h_acc_m))] == [True] * 4
 
 
 def test_height_above_the_ellipsoid_is_used_with_the_geoid_where_there_is_no_other() -> None:
-    values = {k: v for k, v in PLACE.items() if k != "altitudeAboveMeanSeaLevel"}
+    values = {k: v for k, v in LOCATION.items() if k != "altitudeAboveMeanSeaLevel"}
     post = sensor_logger([(1.0, "location", values)])
     (fix,) = decoder("phone:stdin?geoid_m=46.6").feed(post, 0)
     assert fix.alt_amsl_m == pytest.approx(545.4)
@@ -220,7 +220,7 @@ def test_gyroscope_without_an_accelerometer_is_no_sample() -> None:
     assert stream.feed(sensor_logger(late), 0) == [], "the accelerometer is too old"
 
 
-def test_phyphox_is_asked_for_what_is_newer_and_gives_each_reading_once() -> None:
+def test_request_to_phyphox_covers_newer_readings_and_each_is_decoded_once() -> None:
     stream, phone = decoder("phone:poll:127.0.0.1:8080"), Phyphox()
     found, now_us = [], 0
     for tick in range(300):
@@ -270,7 +270,9 @@ def test_hyperimu_repeats_its_field_and_position_which_are_taken_once() -> None:
 
 @pytest.mark.parametrize("size", [1, 7, 1000])
 def test_any_chunking_gives_the_same_records(size: int) -> None:
-    data = sensor_logger(turning(1.0, 20)) + b"junk\n" + sensor_logger([(1.3, "location", PLACE)])
+    data = (
+        sensor_logger(turning(1.0, 20)) + b"junk\n" + sensor_logger([(1.3, "location", LOCATION)])
+    )
     whole, stream = decoder().feed(data, 0), decoder()
     parts = [e for at in range(0, len(data), size) for e in stream.feed(data[at : at + size], 0)]
     assert [repr(each) for each in parts] == [repr(each) for each in whole]
@@ -285,13 +287,16 @@ def test_any_chunking_gives_the_same_records(size: int) -> None:
         ('{"payload":' + "[" * 9999, "no known app"),
         ('{"payload": 3}', "no known app"),
         ('{"payload": [{"name": "gyroscope"}]}', "no known app"),
-        ('{"payload": [{"name": "gyroscope", "time": 1e999, "values": {}}]}', "time that is none"),
+        (
+            '{"payload": [{"name": "gyroscope", "time": 1e999, "values": {}}]}',
+            "has an invalid time",
+        ),
         ('{"payload": [{"name": "gyroscope", "time": 1%s, "values": {}}]}' % ("0" * 400), "app"),
         ('{"buffer": [], "status": 3}', "no known app"),
         ('{"buffer": {"acc_time": 3}, "status": {}}', "no known app"),
         ("1000,1,2", "not three of each"),
         ("1000,x", "could not convert"),
-        ("nan,1,2,3,1,2,3,1,2,3,1,2,3", "time that is none"),
+        ("nan,1,2,3,1,2,3,1,2,3,1,2,3", "has an invalid time"),
     ],
 )
 def test_line_of_no_app_is_an_explained_fault_and_the_next_is_read(line: str, why: str) -> None:
