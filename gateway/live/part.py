@@ -23,6 +23,8 @@ class _Table:
     state: FusionState | None
     rows: RowBuilder = field(default_factory=RowBuilder)
     begun: bool = False
+    has_head: bool = False
+    """Whether its head was taken to be written."""
 
 
 class Part:
@@ -30,7 +32,7 @@ class Part:
 
     def __init__(self, session: str, number: int, offset_us: int) -> None:
         self.session = session
-        """May be set until the table of an aircraft begins."""
+        """May be set until the first bytes are taken."""
         self.number = number
         self.stamper = Stamper(offset_us)
         self.pending: dict[str, bytearray] = {}
@@ -47,8 +49,14 @@ class Part:
 
     def take(self) -> dict[str, bytes]:
         """Return the buffered bytes and clear the buffer."""
+        heads = {}
+        for vehicle_id, table in self._tables.items():
+            if table.begun and not table.has_head:
+                table.has_head = True
+                heads[table_ending(vehicle_id)] = self._head_of(table)
         pending, self.pending, self.size = self.pending, {}, 0
-        return {ending: bytes(data) for ending, data in pending.items()}
+        endings = dict.fromkeys((*pending, *heads))
+        return {each: heads.get(each, b"") + bytes(pending.get(each, b"")) for each in endings}
 
     def add_frame(self, frame: bytes, now_us: int) -> None:
         """Buffer a MAVLink frame for the tlog."""
@@ -82,7 +90,7 @@ class Part:
     def change_settings(self, header: TableHeader) -> None:
         """Note in a prepared table that the following rows are fused with other settings."""
         table = self._tables[header.vehicle_id]
-        self._begin(table)
+        table.begun = True
         self._write(table, table.rows.flush())
         self.add(table_ending(header.vehicle_id), encode_line(header).encode())
 
@@ -97,17 +105,15 @@ class Part:
         for table in self._tables.values():
             self._write(table, table.rows.flush())
 
-    def _begin(self, table: _Table) -> None:
-        if not table.begun:
-            table.begun = True
-            # The name may have changed since the table was prepared.
-            header = msgspec.structs.replace(table.header, session=self.session)
-            begun = "" if table.state is None else encode_line(table.state)
-            self.add(table_ending(header.vehicle_id), (encode_head(header) + begun).encode())
+    def _head_of(self, table: _Table) -> bytes:
+        # The name may have changed since the table was prepared.
+        header = msgspec.structs.replace(table.header, session=self.session)
+        state = "" if table.state is None else encode_line(table.state)
+        return (encode_head(header) + state).encode()
 
     def _write(self, table: _Table, rows: list[TableRow]) -> None:
         for row in rows:
-            self._begin(table)
+            table.begun = True
             self.add(table_ending(table.header.vehicle_id), row_to_line(row).encode())
 
 

@@ -155,7 +155,9 @@ class Recorder:
     def set_in_flight(self, *, in_flight: bool, operates: bool) -> None:
         """Note whether an own aircraft is in flight, and whether one is armed."""
         if self._watch is not None:
-            in_flight = operates or self._watch.is_armed(self._clock(), self._seen)
+            # Some own aircraft report an autopilot's state, and have no samples.
+            own = self._seen | self._vehicles_of().keys()
+            in_flight = operates or self._watch.is_armed(self._clock(), own)
         self._session.set_in_flight(in_flight)
 
     def note(self, text: str) -> bool:
@@ -291,9 +293,9 @@ class Recorder:
         """Return what follows the time in the name of a recording that begins now."""
         if self._settings.name == "time":
             return ""
-        known = self._vehicles_of()
-        if self._watch is not None:
-            known = self._watch.vehicles(self._clock()) | known
+        known = {} if self._watch is None else self._watch.vehicles(self._clock())
+        own = self._vehicles_of().items()
+        known |= {key: at for key, at in own if at is not None or key not in known}
         return label_of(known, with_place=self._settings.name == "place")
 
     def _header(self, vehicle_id: int, part: Part) -> TableHeader:

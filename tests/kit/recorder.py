@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from gateway.live.armed_watch import VehicleLocations
 from gateway.live.recorder import Recorder
 from gateway.live.session import RecordingSettings
 from gateway.recordings.table import TableHeader
@@ -31,6 +32,7 @@ class RecorderBench:
         header_of: Callable[[int], TableHeader] = lambda _: HEADER,
         fusion_of: Callable[[int], FusionState | None] = lambda _: None,
         introduction_of: Callable[[int], list[bytes]] = lambda _: [],
+        vehicles_of: Callable[[], VehicleLocations] = dict,
         **settings: object,
     ) -> None:
         self.clock = clock
@@ -45,6 +47,7 @@ class RecorderBench:
             lambda is_trouble, text: self.announced.append((is_trouble, text)),
             fusion_of,
             introduction_of,
+            vehicles_of,
         )
 
     async def turn(self, seconds: float = 0.5) -> None:

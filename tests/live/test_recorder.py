@@ -46,6 +46,11 @@ async def test_every_frame_is_in_the_tlog_at_its_time(bench: RecorderBench) -> N
     assert bench.announced == [(False, f"Recording {NAME}")]
 
 
+POSITION = mavlink.MAVLink_global_position_int_message(
+    0, -353_632_621, 1_491_652_374, 0, 0, 0, 0, 0, 0
+)
+
+
 def heartbeat(sender: Sender, *, armed: bool) -> bytes:
     mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
     return sender.pack(mavlink.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3))
@@ -63,10 +68,7 @@ async def test_armed_mode_records_from_memory_before_arming_to_ten_seconds_after
         for second in range(230):
             # Armed from 100 to 120 and from 170 to 190 s; turned on every second.
             armed = 100 <= second < 120 or 170 <= second < 190
-            position = mavlink.MAVLink_global_position_int_message(
-                0, -353_632_621, 1_491_652_374, 0, 0, 0, 0, 0, 0
-            )
-            bench.send([heartbeat(sender, armed=armed), sender.pack(position)])
+            bench.send([heartbeat(sender, armed=armed), sender.pack(POSITION)])
             recorder.set_in_flight(in_flight=False, operates=False)
             assert recorder.expected == (recorder.status().state == "recording" or armed)
             await bench.turn(0.998)
@@ -85,6 +87,34 @@ async def test_armed_mode_records_from_memory_before_arming_to_ten_seconds_after
         assert end_s - 1.5 <= times_s[-1] <= end_s + 2
         assert max(np.diff(times_s)) < 1.1
         assert path.name.startswith(session_name(read_tlog(path)[0].time_us - 500_000)[:11])
+
+
+async def test_table_that_begins_in_memory_has_the_name_of_its_recording(
+    tmp_path: Path, clock: ManualClock, rng: np.random.Generator
+) -> None:
+    homes = {3: (47.4, 8.5), 2: None}
+    bench = RecorderBench(tmp_path, clock, mode="armed", name="place", vehicles_of=lambda: homes)
+    sender = Sender(2, 1)
+    try:
+        await bench.turn()
+        for k in range(20):
+            bench.recorder.flight(make_fused(rng, 10_000 * k))
+        # An own aircraft without samples, whose armed bit may follow the recording.
+        bench.send([heartbeat(sender, armed=True), sender.pack(POSITION)])
+        bench.recorder.set_in_flight(in_flight=False, operates=False)
+        await bench.turn()
+        assert bench.recorder.status().state == "idle"
+        bench.recorder.set_in_flight(in_flight=False, operates=True)
+        await bench.turn()
+        await bench.turn()
+    finally:
+        bench.recorder.close()
+    (table,) = tmp_path.glob("*_v3.csv")
+    reader = TableReader()
+    reader.feed(table.read_bytes())
+    assert reader.header is not None
+    assert table.name == f"{reader.header.session}_01_v3.csv"
+    assert reader.header.session.endswith("-v2-v3-35.3633S-149.1652E")
 
 
 async def test_armed_bit_of_own_aircraft_and_its_memory_are_bounded(
