@@ -107,7 +107,7 @@ class IdMap:
         return None
 
     def set_client(self, site: str, client: str) -> None:
-        """Set whose places a site uses; waiting vehicles ask again with their next frames."""
+        """Set the client whose quota a site shares; waiting vehicles get ids by later frames."""
         if self.clients.get(site) != client:
             self.clients[site] = client
             self.unmapped.clear()

@@ -289,7 +289,7 @@ class FleetServer:
         """Note which client each site belongs to, so that no client takes all ids by many names.
 
         A site belongs to the linked session that announces it, which may announce no other one.
-        All sites without a session of their own share the places of one client.
+        All sites without a session of their own share the quota of one client.
         """
         if (clients := self._session.clients()) is None:
             return
@@ -297,9 +297,13 @@ class FleetServer:
         for gone in sessions.keys() - clients.keys():
             del sessions[gone]
         for name, site in self._sites.items():
-            for token in site.tokens & clients.keys():
-                if sessions.setdefault(token, name) == name:
-                    self._ids.set_client(name, clients[token])
+            tokens = (
+                t for t in site.tokens & clients.keys() if sessions.setdefault(t, name) == name
+            )
+            owners = {clients[token] for token in tokens}
+            # Several sessions that announce one site do not take it from one another.
+            if owners and self._ids.clients.get(name) not in owners:
+                self._ids.set_client(name, min(owners))
 
     def _make_room(self, now_us: int) -> None:
         """Pass on the id of one abandoned vehicle, and remove abandoned sites."""

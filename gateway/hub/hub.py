@@ -319,10 +319,8 @@ class Hub:
         self._fanout.settle()
         notes = self._router.clash_notes(self.now_us())
         return tuple(
-            self._clients[key].stats(
-                self._router.origins(key), notes.get(key, ""), self._router.cached(key)
-            )
-            for key in sorted(self._clients)
+            client.stats(self._router.origins(key), notes.get(key, ""), self._router.cached(client))
+            for key, client in sorted(self._clients.items())
         )
 
     def listeners(self) -> tuple[ListenerStats, ...]:

@@ -83,9 +83,11 @@ class Router:
         """Return the systems and components received from a client."""
         return self._table.origins(client_id) or self._untrusted.origins(client_id)
 
-    def cached(self, client_id: int) -> tuple[str, ...]:
-        """List the kept answers of the systems of a client."""
-        systems = sorted({system for system, _ in self.origins(client_id)})
+    def cached(self, client: Client) -> tuple[str, ...]:
+        """List the kept answers of the systems of a client whose link has the option."""
+        if not (client.trusted and client.endpoint.cache):
+            return ()
+        systems = sorted({system for system, _ in self.origins(client.client_id)})
         now_us = self._context.now_us()
         return tuple(text for each in systems if (text := self._cache.describe(each, now_us)))
 

@@ -40,8 +40,9 @@ LOGIN_S: Final = 10.0
 RECORDINGS: Final = "/recordings/"
 MAPS: Final = "/maps/"
 """Paths below these two accept whole files."""
-WITHOUT_LOGIN: Final = ("/web/panel.css", "/push/")
-"""The style of the login, and posts of devices, which have a token."""
+LOGIN_STYLE: Final = "/web/panel.css"
+PUSH: Final = "/push/"
+"""Paths without a login: its style, and posts of devices, which have a token."""
 API_PATHS: Final = ("/v1/", "/mavlink", "/helper/", "/ws/mavlink", "/info")
 """Paths of the REST and WebSocket API, which pages of `panel.origins` may use."""
 CORS_HEADERS: Final = {
@@ -127,7 +128,7 @@ class AccessControl:
         role = self._logins.role_of(token)
         if scope["type"] == "http" and scope["path"] in ("/login", "/logout"):
             await self._serve_login(scope, receive, with_headers(send))
-        elif role is not None or scope["path"].startswith(WITHOUT_LOGIN):
+        elif role is not None or scope["path"] == LOGIN_STYLE or scope["path"].startswith(PUSH):
             client = tuple(scope.get("client") or ("", 0))
             token = "" if self._logins.is_open else token
             scope[ROLE] = role

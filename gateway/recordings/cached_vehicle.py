@@ -60,7 +60,7 @@ class CachedVehicle(RecordedVehicle):
         self._held = answers
         self._files = _Files(answers)
         super().__init__(system_id, answers, files=self._files)
-        self._downloads: dict[tuple[int, int, int, int], None] = {}
+        self._downloads: dict[tuple[int, int, int, int], bool] = {}
         """Missions that are being sent: client, system, component and kind."""
         self.other_lists = False
         """Whether other components of the system have parameters too."""
@@ -96,7 +96,7 @@ class CachedVehicle(RecordedVehicle):
             case "MISSION_REQUEST_LIST" | "MISSION_REQUEST" | "MISSION_REQUEST_INT":
                 return self._holds_mission(request)
             case "MISSION_ACK" if message.type == ACCEPTED:
-                return self._downloads.pop(_download(request), 0) is None
+                return self._downloads.pop(_download(request), False)
             case "COMMAND_LONG" | "COMMAND_INT":
                 command = read_command(request)
                 is_known = command.number == REQUEST_MESSAGE or command.number in SHORTHANDS
@@ -107,11 +107,13 @@ class CachedVehicle(RecordedVehicle):
 
     def _holds_mission(self, request: Request) -> bool:
         if self._held.mission(request.message.mission_type) is None:
+            # A download that was begun here goes on with the vehicle, its confirmation too.
+            self._downloads.pop(_download(request), None)
             return False
         if request.message.get_type() == "MISSION_REQUEST_LIST":
             if len(self._downloads) >= MAX_DOWNLOADS:
                 self._downloads.pop(next(iter(self._downloads)))
-            self._downloads[_download(request)] = None
+            self._downloads[_download(request)] = True
         return True
 
 

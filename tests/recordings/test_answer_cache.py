@@ -164,6 +164,17 @@ def test_downloaded_mission_is_kept_and_its_end_is_passed_on(
     assert link.up == []
 
 
+def test_end_of_a_download_is_passed_on_if_its_mission_was_dropped(
+    link: CachedLink, first: GroundStation, second: GroundStation
+) -> None:
+    upload(first, [item(i) for i in range(3)])
+    first.send(mavlink.MAVLink_mission_request_list_message(1, 1))
+    assert [each.get_type() for each in link.up][-1] != "MISSION_REQUEST_LIST"
+    restart(link)
+    download(first)
+    assert [each.get_type() for each in link.up][-1] == "MISSION_ACK"
+
+
 def test_written_parameter_is_kept_when_it_is_confirmed(
     link: CachedLink, first: GroundStation, second: GroundStation
 ) -> None:
@@ -334,6 +345,18 @@ def test_file_of_metadata_is_read_once_over_the_link(
     is_packed = path.startswith(b"@PARAM")
     first.set_parameter("TUN_ORDER", 3)
     assert (FtpClient(second).open(path).session, len(link.up)) == (0, 1 + is_packed)
+
+
+def test_file_whose_end_is_known_but_not_its_middle_is_left_to_the_vehicle(
+    link: CachedLink, first: GroundStation, second: GroundStation
+) -> None:
+    client = FtpClient(first)
+    session = client.open(b"/general.json").session
+    for offset in (0, 10**6):
+        client.ask(Opcode.READ_FILE, session=session, offset=offset, size=100)
+    link.up.clear()
+    FtpClient(second).open(b"/general.json")
+    assert len(link.up) == 1
 
 
 def test_other_file_and_its_session_are_left_to_the_vehicle(

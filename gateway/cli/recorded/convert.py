@@ -48,8 +48,6 @@ FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
 
 PANEL: Final = "Tlog to tlog"
 """Heading of these options in the help."""
-LEAST_RATE_HZ: Final = 10.0
-"""A hand-held or flying tracker turns within a tenth of a second."""
 
 
 def _option(name: str, text: str, **how: Any) -> Any:

@@ -34,11 +34,12 @@ from gateway.recordings.timed_extracts import (
 )
 from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.units import US_PER_S
-from gateway.vehicle.plan import KINDS
+from gateway.vehicle.plan import KINDS, RALLY
 
 app = typer.Typer()
 
 ITEMS: Final = (".waypoints", ".plan")
+ITEM_NAMES: Final = {**KINDS, RALLY: "rally points"}
 VIDEO_TIME: Final = re.compile(r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)")
 """A time of begin in the name of a video, as cameras write it."""
 
@@ -138,8 +139,8 @@ def _plans(
         recording.read()
     plan, (params, *items) = recording.plan(), paths
     found = [("parameters", params, _params(params, plan) if params else ())]
-    for kind, path in zip(KINDS, items, strict=True):
-        found.append((KINDS[kind], path, _items(path, plan, kind) if path else ()))
+    for (kind, name), path in zip(ITEM_NAMES.items(), items, strict=True):
+        found.append((name, path, _items(path, plan, kind) if path else ()))
     for name, path, pieces in found:
         if path is not None and pieces:
             yield path, pieces
