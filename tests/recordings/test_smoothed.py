@@ -3,6 +3,7 @@
 import gzip
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -106,3 +107,16 @@ def test_flags_of_smoothed_rows_claim_nothing_that_is_not_known(
     ):
         assert np.isfinite(cells[(flags & int(flag)) != 0, column]).all()
     assert (flags & int(NavFlags.ATTITUDE_VALID)).any()
+
+
+def test_recording_with_an_unsuitable_state_is_smoothed_from_its_rows_and_reported(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    settings, stored, rows = fly_from_the_middle("eskf", rng)
+    cut = msgspec.structs.replace(stored, estimation=stored.estimation[:-40])
+    path = tmp_path / "cut.csv"
+    lines = [encode_head(header_for(settings, 1)), encode_line(cut), *map(row_to_line, rows)]
+    path.write_text("".join(lines))
+    fusion = RecordedFusion([path], OPTIONS, smooth=True)
+    assert len(states_of(fusion)[0])
+    assert sum("truncated" in remark for remark in fusion.remarks) == 1
