@@ -1,4 +1,4 @@
-"""Which vehicles of other senders are armed, and where: for recordings from arming on."""
+"""Armed state and position of vehicles by their messages, for recordings from arming on."""
 
 from collections.abc import Set
 from typing import Final
@@ -7,11 +7,10 @@ from gateway.recordings.newest import NewestState, NewestVehicles
 from gateway.recordings.positions import RANKS
 from gateway.recordings.tlog import HEARTBEAT_ID
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 
 LOST_US: Final = 300 * US_PER_S
-"""A vehicle without a heartbeat for so long is not armed any more, as far as is known here."""
+"""A vehicle without a heartbeat for longer counts as disarmed."""
 SHOWN: Final = 4
 """Vehicles in the name of a recording."""
 WATCHED: Final = frozenset({HEARTBEAT_ID, *RANKS})
@@ -42,19 +41,18 @@ class ArmedWatch:
         }
 
     def _armed(self, now_us: int) -> dict[int, NewestState]:
-        name = MESSAGE_NAMES[HEARTBEAT_ID]
         return {
             system_id: state
             for system_id, state in self._newest.states.items()
-            if state.is_armed() and now_us - state.heard_us[name] < LOST_US
+            if state.is_armed() and state.age_us(now_us, "HEARTBEAT") < LOST_US
         }
 
 
-def label_of(vehicles: VehicleLocations, *, with_place: bool) -> str:
+def label_of(vehicles: VehicleLocations, *, with_location: bool) -> str:
     """Return the end of a recording's name: `-v1-v2-47.3977N-8.5456E`."""
     label = "".join(f"-v{system_id}" for system_id in sorted(vehicles)[:SHOWN])
     known = (at for _, at in sorted(vehicles.items()) if at is not None)
-    if with_place and (at := next(known, None)) is not None:
+    if with_location and (at := next(known, None)) is not None:
         north, east = "NS"[at[0] < 0], "EW"[at[1] < 0]
         label += f"-{abs(at[0]):.4f}{north}-{abs(at[1]):.4f}{east}"
     return label

@@ -296,7 +296,7 @@ class Recorder:
         known = {} if self._watch is None else self._watch.vehicles(self._clock())
         own = self._vehicles_of().items()
         known |= {key: at for key, at in own if at is not None or key not in known}
-        return label_of(known, with_place=self._settings.name == "place")
+        return label_of(known, with_location=self._settings.name == "place")
 
     def _header(self, vehicle_id: int, part: Part) -> TableHeader:
         return msgspec.structs.replace(

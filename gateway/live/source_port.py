@@ -25,6 +25,7 @@ from typing import Final
 
 import serial
 
+from gateway.live.part import TLOG
 from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports, open_port
 from gateway.printable import reason_of
 from gateway.sources.recorded_bytes import tunnelled
@@ -36,7 +37,6 @@ log = logging.getLogger(__name__)
 READ_SIZE: Final = 4096
 RETRY_S: Final = 1.0
 FILE_POLL_S: Final = 0.05
-TLOG: Final = ".tlog"
 POLL_S: Final = 0.1
 ANSWER_S: Final = 3.0
 """Longest time for an answer."""
@@ -96,11 +96,14 @@ class SourcePort:
             try:
                 await read()
             except (OSError, PortNotFoundError) as error:
-                self._lost(str(error) if isinstance(error, PortNotFoundError) else reason_of(error))
+                reason = str(error) if isinstance(error, PortNotFoundError) else reason_of(error)
+                if url.transport == "stdin":
+                    self._ended(reason)
+                    return
+                self._lost(reason)
             else:
                 if url.transport == "stdin" or url.address.endswith(TLOG):
-                    log.info("source %s: its end was reached", url.name)
-                    self._source.lost("its end was reached")
+                    self._ended("its end was reached")
                     return
             await asyncio.sleep(RETRY_S)
 
@@ -108,6 +111,10 @@ class SourcePort:
         log.info("source %s is open", self._source.url.name)
         self._complaint = ""
         self._source.opened()
+
+    def _ended(self, reason: str) -> None:
+        log.info("source %s: %s", self._source.url.name, reason)
+        self._source.lost(reason)
 
     def _lost(self, reason: str) -> None:
         """Note and log once why it is not open."""
@@ -199,13 +206,12 @@ class SourcePort:
         """Send the decoder's requests, and take each answer as a line."""
         decoder = self._source.decoder
         assert isinstance(decoder, PolledDecoder)
-        url, is_open = self._source.url, False
+        url = self._source.url
         while True:
             async with asyncio.timeout(ANSWER_S):
                 answer = await _get(url.address, url.port, decoder.request())
-            if not is_open:
+            if not self._source.connected:
                 self._opened()
-                is_open = True
             self._feed(answer.replace(b"\n", b" ") + b"\n")
             await asyncio.sleep(POLL_S)
 

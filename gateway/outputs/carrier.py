@@ -103,7 +103,7 @@ class Carrier:
 class TlsClient(TcpClient):
     """A TCP connection with TLS."""
 
-    make_context: MakeContext = staticmethod(ssl.create_default_context)
+    make_context: MakeContext
     _tls: TlsLayer
 
     async def _connect(self) -> None:

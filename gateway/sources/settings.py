@@ -6,7 +6,7 @@
     KIND:tcp:HOST:PORT           connect, and reconnect when it breaks
     KIND:tcp-listen:HOST:PORT    serve one client at a time
     KIND:poll:HOST:PORT          ask a server by HTTP, again and again
-    KIND:push                    what is posted to the panel, with a token
+    KIND:push                    posts to the panel, with a token
     KIND:receiver                packets of other programs that our receiver passes on
     KIND:stdin                   standard input
     KIND:file:PATH               a file that grows
@@ -23,8 +23,8 @@ from gateway.records import SOURCE_NODE, NodeId
 from gateway.settings import Settings, setting
 
 TRANSPORTS: Final = (
-    *("serial", "udp", "tcp", "tcp-listen", "poll", "push", "receiver", "stdin", "file"),
-)
+    "serial", "udp", "tcp", "tcp-listen", "poll", "push", "receiver", "stdin", "file"
+)  # fmt: skip
 PLAIN: Final = frozenset({"push", "receiver", "stdin"})
 """Transports without an address."""
 NETWORK: Final = frozenset({"udp", "tcp", "tcp-listen", "poll"})
