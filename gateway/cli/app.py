@@ -170,7 +170,7 @@ def tidied(command: Any, words: str = "") -> Any:
 
 
 def _present(command: str, words: list[str]) -> list[str]:
-    """Replace former names of options, with a message; what has moved ends the command."""
+    """Replace former names of options, with a message; a moved one ends the command."""
     found = list[str]()
     for at, word in enumerate(words):
         name, equals, value = word.partition("=")

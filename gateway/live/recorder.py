@@ -88,7 +88,7 @@ class Recorder:
         self._seen: set[int] = set()
         self._part: Part | None = None
         self._memory: deque[tuple[int, Part]] = deque()
-        """What is held before arming, twice: since its begin, and since half of its length."""
+        """The stretch before arming, in two parts that begin half its length apart."""
         self._watch = ArmedWatch() if settings.mode == "armed" else None
         self._files: PartFiles | None = None
         self._disk = DiskState(0, 0)
@@ -254,7 +254,7 @@ class Recorder:
         return [part for _, part in self._memory] if self._part is None else [self._part]
 
     def _hold(self) -> None:
-        """Discard what is too old in memory, or too much, and begin to hold the next stretch."""
+        """Discard the oldest stretch in memory, and begin to hold the next one."""
         if self._watch is None:
             return
         if self._part is not None or any(p.stamper.has_jumped(self._civil) for p in self._parts()):

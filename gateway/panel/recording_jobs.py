@@ -73,7 +73,7 @@ EXTRACTS: Final = {
     "texts": ("Texts", ("extract", "--texts"), ".csv"),
     "events": ("Events", ("extract", "--events"), ".csv"),
 }
-"""The same of what is extracted of one vehicle."""
+"""The same of extracts of one vehicle."""
 KINDS: Final = FORMATS | CUTS | EXTRACTS
 
 
@@ -83,7 +83,7 @@ class ExportError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """What is to be made of a recording."""
+    """A requested export of a recording."""
 
     folder: Path
     name: str
@@ -240,7 +240,7 @@ async def _make(work: Path, order: Order) -> Path:
     """Export a recording into an empty folder, and return the only file in it."""
     folder, name, kind = order.folder, order.name, order.kind
     _, (command, *of_file), suffix = KINDS[kind]
-    # The name of a recording holds its date, and may hold its place.
+    # The name of a recording contains its date, and may contain its location.
     target = work / f"{ANONYMISED if kind == ANONYMISED else name}{suffix}"
     output = work / name if kind == "report" else target
     # Settings with the folder of the recordings, which commands take names from.

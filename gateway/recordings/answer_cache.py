@@ -1,8 +1,8 @@
 """Answers of foreign vehicles on slow links, kept for further ground stations.
 
-The first station loads parameters, missions and metadata over the link; what passes is kept, and
-others are answered from it. A vehicle that signs is answered for only if the gateway has its key:
-requests must be signed by it too, and the answers are.
+The first station loads parameters, missions and metadata over the link; the answers that pass are
+kept, and others are answered from them. A vehicle that signs is answered for only if the gateway
+has its key: requests must be signed by it too, and the answers are.
 """
 
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ class AnswerCache:
         return message_id in NOTED_IDS
 
     def add(self, frame: MavFrame, now_us: int) -> MavFrame | None:
-        """Take in a frame of a vehicle; return a request that must be sent to it after all."""
+        """Process a frame of a vehicle; return a request that must be sent to it after all."""
         system, component = frame.origin
         if component != AUTOPILOT:
             entry = self._entries.get(system)
@@ -80,9 +80,9 @@ class AnswerCache:
     def handle(
         self, client_id: int, frame: MavFrame, now_us: int, *, may_answer: bool
     ) -> tuple[list[Outgoing], MavFrame | None]:
-        """Answer a station's request, or take in what it writes.
+        """Answer a station's request, or process the values that it writes.
 
-        Returns the answers, and what must be sent to the vehicle.
+        Returns the answers, and the frame that must be sent to the vehicle, if any.
         """
         entry = self._entries.get(frame.target[0])
         if entry is None:
@@ -113,16 +113,16 @@ class AnswerCache:
         return min((time_us for time_us in due if time_us is not None), default=None)
 
     def remove(self, system: int) -> None:
-        """Drop what is held of a vehicle, as when its link gets other options."""
+        """Drop the kept answers of a vehicle, as when its link gets other options."""
         self._entries.pop(system, None)
 
     def remove_client(self, client_id: int) -> None:
-        """Drop what was kept for a station that has gone."""
+        """Drop the downloads of a disconnected station."""
         for entry in self._entries.values():
             entry.vehicle.remove_client(client_id)
 
     def describe(self, system: int, now_us: int) -> str:
-        """List what is held of a vehicle, with the age of each part; empty if nothing is."""
+        """List the kept answers of a vehicle with the age of each part; empty without any."""
         entry = self._entries.get(system)
         if entry is None or not entry.live.since_us:
             return ""

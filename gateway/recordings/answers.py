@@ -28,23 +28,22 @@ from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION, Senders,
 from gateway.recordings.status_texts import text_of
 from gateway.recordings.tlog import Batch, fields_of, payload_of
 from gateway.recordings.tlog_scan import IntArray
+from gateway.vehicle.plan import KINDS
 from gateway.wire.frame_editing import edit_frame
-from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, TARGET_OFFSETS
+from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, TARGET_OFFSETS, ids_of
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 
 PARAM_VALUE_ID: Final = MESSAGE_IDS["PARAM_VALUE"]
 AUTOPILOT_VERSION_ID: Final = MESSAGE_IDS["AUTOPILOT_VERSION"]
 HOME_POSITION_ID: Final = MESSAGE_IDS["HOME_POSITION"]
 AVAILABLE_MODES_ID: Final = MESSAGE_IDS["AVAILABLE_MODES"]
-_VALUE: Final = struct.Struct("<4sHH16sB")
+PARAM_VALUE: Final = struct.Struct("<4sHH16sB")
 """PARAM_VALUE: value, count, index, name, type."""
 _SAME: Final = {HOME_POSITION_ID: 52}
 """How much of the payload must be equal to be no change; the rest is the time of sending."""
 _PARAM_SET: Final = MESSAGE_IDS["PARAM_SET"]
 _SET_NAME: Final = slice(6, 22)
 """Of PARAM_SET: behind the value and the target."""
-KINDS: Final = (0, 1, 2)
-"""Mission, fence, rally points."""
 ALL_KINDS: Final = 255
 MAX_KEPT: Final = 200_000
 """Frames; some 10 MB. A vehicle has a thousand parameters that change now and then."""
@@ -52,11 +51,7 @@ Items = tuple[bytes, ...]
 Value = TypeVar("Value")
 
 
-def _ids(*names: str) -> frozenset[int]:
-    return frozenset(MESSAGE_IDS[name] for name in names)
-
-
-_REPORTS: Final = _ids(
+_REPORTS: Final = ids_of(
     "COMMAND_ACK", "MISSION_ACK", "PARAM_ERROR", "MOUNT_STATUS", "CAMERA_STATUS",
     "CAMERA_FEEDBACK", "GIMBAL_REPORT", "GIMBAL_TORQUE_CMD_REPORT",
     "GIMBAL_DEVICE_ATTITUDE_STATUS", "OPEN_DRONE_ID_BASIC_ID", "OPEN_DRONE_ID_LOCATION",
@@ -65,7 +60,7 @@ _REPORTS: Final = _ids(
 )  # fmt: skip
 """Messages with a target that request nothing of it."""
 _ASKING: Final = TARGET_OFFSETS.keys() - _REPORTS
-_FEEDING: Final = _ids(
+_FEEDING: Final = ids_of(
     "GPS_RTCM_DATA", "GPS_INPUT", "HIL_CONTROLS", "HIL_RC_INPUTS_RAW", "HIL_SENSOR",
     "HIL_GPS", "HIL_OPTICAL_FLOW", "HIL_ACTUATOR_CONTROLS", "HIL_STATE_QUATERNION",
     "GLOBAL_VISION_POSITION_ESTIMATE", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE",
@@ -74,7 +69,7 @@ _FEEDING: Final = _ids(
     "OPTICAL_FLOW_RAD", "FOLLOW_TARGET", "TERRAIN_DATA",
 )  # fmt: skip
 """Inputs of an autopilot from other components; when it sends them itself they are telemetry."""
-ANSWERS: Final = np.array(sorted(_ids(
+ANSWERS: Final = np.array(sorted(ids_of(
     "COMMAND_ACK", "MISSION_ACK", "MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT",
     "MISSION_REQUEST", "MISSION_REQUEST_INT", "PARAM_VALUE", "PARAM_ERROR",
     "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "FILE_TRANSFER_PROTOCOL", "LOG_ENTRY", "LOG_DATA",
@@ -82,6 +77,14 @@ ANSWERS: Final = np.array(sorted(_ids(
 )))  # fmt: skip
 """Answers to a station that asked in flight: one of today could take them for its own."""
 _LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
+_KEPT: Final = ids_of(
+    "PARAM_VALUE", "GPS_GLOBAL_ORIGIN", "AUTOPILOT_VERSION", "HOME_POSITION", "PROTOCOL_VERSION",
+    "AVAILABLE_MODES",
+)  # fmt: skip
+_MISSION: Final = ids_of(
+    "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_ACK"
+)
+_READ: Final = np.array(sorted(_KEPT | _MISSION | {_PARAM_SET}))
 
 
 def is_command(frame: bytes, senders: Senders) -> bool:
@@ -113,16 +116,6 @@ def telemetry_of(batch: Batch, begin: int, senders: Senders) -> IntArray:
         kept[i] = not is_command(batch.frame(begin + i), senders)
     found: IntArray = np.flatnonzero(kept) + begin
     return found
-
-
-_KEPT: Final = _ids(
-    "PARAM_VALUE", "GPS_GLOBAL_ORIGIN", "AUTOPILOT_VERSION", "HOME_POSITION", "PROTOCOL_VERSION",
-    "AVAILABLE_MODES",
-)  # fmt: skip
-_MISSION: Final = _ids(
-    "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_ACK"
-)
-_READ: Final = np.array(sorted(_KEPT | _MISSION | {_PARAM_SET}))
 
 
 @dataclass(slots=True)
@@ -198,7 +191,7 @@ class LogAnswers:
             is_set = message_id == PARAM_VALUE_ID and (system, key) in self._set
             self._set.discard((system, key))
             course = self.frames.setdefault((system, message_id, key), _Course(is_set))
-            if not course.values or _content_of(course.values[-1]) != _content_of(frame):
+            if not course.values or content_of(course.values[-1]) != content_of(frame):
                 course.add(time_us, frame)
                 self._kept += 1
 
@@ -299,7 +292,8 @@ class VehicleAnswers:
         frames = self._recorded(PARAM_VALUE_ID)
         # Answers to a setting carry no index (65535); they come last.
         values = sorted(
-            (*_VALUE.unpack(payload_of(frame, _VALUE.size))[2:4], frame) for frame in frames
+            (*PARAM_VALUE.unpack(payload_of(frame, PARAM_VALUE.size))[2:4], frame)
+            for frame in frames
         )
         return {
             text_of(name): self._edited(frame, param_count=len(values), param_index=number)
@@ -311,16 +305,17 @@ def _key_of(frame: bytes) -> bytes:
     """Return a key of frames of one message that hold different items."""
     message_id = message_id_of(frame)
     if message_id == PARAM_VALUE_ID:
-        return bytes(_VALUE.unpack(payload_of(frame, _VALUE.size))[3])
+        return bytes(PARAM_VALUE.unpack(payload_of(frame, PARAM_VALUE.size))[3])
     if message_id == AVAILABLE_MODES_ID:
         # AVAILABLE_MODES: custom_mode and properties, 4 bytes each, then number and index.
         return payload_of(frame, 10)[9:]
     return b""
 
 
-def _content_of(frame: bytes) -> bytes:
+def content_of(frame: bytes) -> bytes:
+    """Return the bytes of a kept frame that change with its content."""
     message_id = message_id_of(frame)
     if message_id == PARAM_VALUE_ID:
-        value, _, _, _, kind = _VALUE.unpack(payload_of(frame, _VALUE.size))
+        value, _, _, _, kind = PARAM_VALUE.unpack(payload_of(frame, PARAM_VALUE.size))
         return bytes((*value, kind))
     return payload_of(frame, _SAME.get(message_id, 255))

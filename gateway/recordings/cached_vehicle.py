@@ -54,7 +54,7 @@ class _Files(FtpService):
 
 
 class CachedVehicle(RecordedVehicle):
-    """Answers what is held, for one autopilot."""
+    """Answer requests for one autopilot from kept answers."""
 
     def __init__(self, system_id: int, answers: LiveAnswers) -> None:
         self._held = answers

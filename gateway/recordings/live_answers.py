@@ -1,6 +1,6 @@
 """The answers of a live vehicle, as they pass between it and ground stations.
 
-| what                       | where from                       | dropped by                     |
+| answer                     | source                           | dropped by                     |
 | -------------------------- | -------------------------------- | ------------------------------ |
 | parameters                 | PARAM_VALUE, the newest of each  | PARAM_SET: this one; another   |
 |                            | name                             | checksum, some commands: all   |
@@ -10,9 +10,9 @@
 |                            | COMPONENT_METADATA               |                                |
 | files of metadata          | a file that was read whole       | a write by MAVLink FTP         |
 
-All of it is dropped when the vehicle restarts or reports another version. What a station writes is
-dropped when it is sent, and kept again when the vehicle confirms it: a lost confirmation does no
-harm.
+All of it is dropped when the vehicle restarts or reports another version. A value or plan of a
+station is dropped when it is sent, and kept again when the vehicle confirms it: a lost confirmation
+does no harm.
 """
 
 import struct
@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.answers import ALL_KINDS, Items, LogAnswers
+from gateway.recordings.answers import ALL_KINDS, PARAM_VALUE, Items, LogAnswers, content_of
 from gateway.recordings.status_texts import text_of
 from gateway.recordings.tlog import payload_of
 from gateway.units import US_PER_S
@@ -67,7 +67,6 @@ MAX_READS: Final = 8
 READING: Final = (Opcode.READ_FILE, Opcode.BURST_READ_FILE)
 PARAMETERS: Final = "parameters"
 
-_VALUE: Final = struct.Struct("<4sHH16sB")
 _PLAN_IDS: Final = struct.Struct("<2xH2xIII")
 """MISSION_CURRENT: number of items, then the ids of mission, fence and rally points."""
 _HOME_BYTES: Final = 12
@@ -95,7 +94,7 @@ class _Reading:
 
 
 class LiveAnswers:
-    """What one vehicle has answered since its start; see `recorded_vehicle.Answers`."""
+    """Answers of one vehicle since its start; see `recorded_vehicle.Answers`."""
 
     def __init__(self, system_id: int) -> None:
         self.system_id = system_id
@@ -225,7 +224,8 @@ class LiveAnswers:
         self._readings = {key: one for key, one in readings if PACKED not in one.path}
 
     def _add_parameter(self, frame: MavFrame, now_us: int) -> None:
-        value, count, index, raw_name, kind = _VALUE.unpack(payload_of(frame.data, _VALUE.size))
+        payload = payload_of(frame.data, PARAM_VALUE.size)
+        value, count, index, raw_name, _ = PARAM_VALUE.unpack(payload)
         name = text_of(raw_name)
         if name == HASH_NAME:
             if self.hash_frame is not None and payload_of(self.hash_frame, 4) != value:
@@ -239,7 +239,7 @@ class LiveAnswers:
             self._drop_parameters()
         self._count = count
         known = self._values.get(name)
-        if known is not None and _value_of(known) != (value, kind):
+        if known is not None and content_of(known) != content_of(frame.data):
             # Dropped now, as there may be no room for the new value.
             del self._values[name]
             self._drop_dependent()
@@ -317,8 +317,3 @@ class LiveAnswers:
             self.files[reading.path] = content
             self.since_us["files"] = now_us
             del self._readings[frame.target]
-
-
-def _value_of(frame: bytes) -> tuple[bytes, int]:
-    value, _, _, _, kind = _VALUE.unpack(payload_of(frame, _VALUE.size))
-    return value, kind

@@ -104,7 +104,7 @@ class Replay:
         self._now_us: int | None = None
 
     def feed(self, row: Line) -> Iterator[tuple[int, Outputs]]:
-        """Process one row, a change of settings, a mark, or a state to restore."""
+        """Process one row, a change of settings, a note, or a state to restore."""
         if isinstance(row, TableHeader):
             if self._follow:
                 now_us = self._now_us or 0

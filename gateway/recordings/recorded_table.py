@@ -57,7 +57,7 @@ class RecordedTable:
     header: TableHeader
     blocks: Iterator[TableBlock]
     """A header among the rows is a change of settings in flight, a state is that of the fusion at
-    this row, and a mark is a remark of the operator."""
+    this row, and a note is a remark of the operator."""
     remarks: list[str] = field(default_factory=list)
     """Remarks about the file for the user; complete once the rows are read."""
 

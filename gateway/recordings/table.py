@@ -188,7 +188,7 @@ def encode_block(block: TableBlock) -> bytes:
 
 
 class TableReader:
-    """Decode any chunks of a table into rows, marks and faults; never raises on data.
+    """Decode any chunks of a table into rows, notes and faults; never raises on data.
 
     Columns are found by name, so a file with more or fewer columns, or in another order, can be
     read too.

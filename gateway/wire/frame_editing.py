@@ -78,7 +78,7 @@ def edit_frame(
 def renumbered(frame: MavFrame, sequence: int) -> MavFrame:
     """Return a frame with another sequence number; one of an unknown message, or signed, as it is.
 
-    The same as `edit_frame` in a third of the time: filters have it done to most frames of ours.
+    The same as `edit_frame` in a third of the time: a client's filter renumbers most of our frames.
     """
     data, extra = frame.data, CRC_EXTRA.get(frame.message_id)
     if extra is None or frame.signed:

@@ -111,7 +111,7 @@ async def test_certificate_of_one_site_gives_no_access_to_another(
     options = f"&config={documented.site_file('field-2')}"
     # The certificate of field-2, the name of field-1.
     url = f"zenoh:{documented.locator}?site=field-1{options}"
-    world.add_site("thief", url, system=66)
+    world.add_site("forger", url, system=66)
     world.add_site("field-2", url.replace("site=field-1", "site=field-2"), system=2)
     await world.until(lambda: {1, 2} <= world.systems())
     await world.until(lambda: len(world.got) > 300)

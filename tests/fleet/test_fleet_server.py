@@ -305,9 +305,10 @@ async def test_two_sites_of_one_name_are_reported(
 
 
 async def test_one_session_under_many_names_takes_no_more_ids_than_one_site(world: World) -> None:
-    thief = open_session(session_config(world.locator, ""))
+    forger = open_session(session_config(world.locator, ""))
     tokens = [
-        thief.liveliness().declare_token(presence_key(f"field-{n}", thief.zid())) for n in range(6)
+        forger.liveliness().declare_token(presence_key(f"field-{n}", forger.zid()))
+        for n in range(6)
     ]
     ids = world.fleet._ids
 
@@ -315,7 +316,7 @@ async def test_one_session_under_many_names_takes_no_more_ids_than_one_site(worl
         for number in range(6):
             for system in range(1, 60):
                 key = out_key(f"field-{number}", system)
-                thief.put(key, world.rig.sender(system).heartbeat())
+                forger.put(key, world.rig.sender(system).heartbeat())
         return len(ids.items()) >= least
 
     # Those of the one site that the session may announce, and of all without a session.
@@ -328,7 +329,7 @@ async def test_one_session_under_many_names_takes_no_more_ids_than_one_site(worl
     assert "sharing the ids of one site: field-" in await run("fleet", "status")
     for token in tokens:
         token.undeclare()
-    thief.close()
+    forger.close()
 
 
 async def test_excluded_vehicle_is_not_shown(world: World, tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ def test_site_gets_no_more_ids_than_its_limit() -> None:
 def test_sites_of_one_client_share_the_limit_of_one_site() -> None:
     ids = IdMap(per_site=3)
     for number in range(5):
-        ids.set_client(f"forged-{number}", "thief")
+        ids.set_client(f"forged-{number}", "forger")
     given = [ids.id_of(f"forged-{n}", system) for n in range(5) for system in (1, 2)]
     assert [each for each in given if each is not None] == [1, 2, 3]
     assert ids.id_of("field", 1) == 4

@@ -15,6 +15,7 @@ from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
     JsonOption,
     console_of,
+    duration_text,
     print_json,
     refuse,
     table_of,
@@ -155,10 +156,9 @@ def _gateways(found: Sequence[Gateway]) -> Table:
 
 def _summary(snapshot: Record) -> str:
     report = snapshot["report"]
-    up_s = snapshot["time_us"] // US_PER_S
+    up = duration_text(snapshot["time_us"] // US_PER_S)
     received = report["bytes_received"], report["frames"]
     receiver = receiver_state(report["port"], report["connected"], *received)
-    up = f"{up_s // 3600}:{up_s // 60 % 60:02d}:{up_s % 60:02d}"
     received, lost = (sum(node[key] for node in report["nodes"]) for key in ("received", "lost"))
     serial = f"serial: {counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
     radio = f"radio: {counted(received, 'payload')}, {lost} lost"
@@ -268,7 +268,7 @@ def _print_clients(console: Console, snapshot: Record) -> None:
         for text in filter(None, (client["reason"], client["note"])):
             console.print(f"{client['name']}: {text}", style="yellow", soft_wrap=True)
         for text in client["cached"]:
-            console.print(f"{client['name']}: kept of {text}", soft_wrap=True)
+            console.print(f"{client['name']}: cached answers of {text}", soft_wrap=True)
 
 
 def _listeners(listeners: Sequence[Record]) -> Table:

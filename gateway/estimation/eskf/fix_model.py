@@ -48,8 +48,9 @@ LEAST_LAG_S: Final = 0.1
 VELOCITY: Final = 0
 POSITION: Final = 1
 GLITCH_GATE_SQ: Final = (9.0, 16.0)
+"""Innovations of velocity and position beyond these squared gates, in variances, are glitches."""
 MAX_GLITCH: Final = (5.0, 30.0)
-"""Gate of either, in variances, beyond which an innovation is a glitch; its limit, m/s and m."""
+"""Largest size of a glitch, m/s and m."""
 GLITCH_S: Final = 10.0
 """Fixes of this time share a glitch."""
 GLITCH_FADE_S: Final = 1.0

@@ -493,7 +493,7 @@ class Client:
     def stats(
         self, systems: tuple[Origin, ...], note: str = "", cached: tuple[str, ...] = ()
     ) -> ClientStats:
-        """Return the client's present figures; the hub passes what it has of the systems."""
+        """Return the present figures; systems, note and kept answers are known to the hub."""
         renumbering = self.renumbering
         counters = {name: getattr(self.counters, name) for name in ClientCounters.__slots__}
         return ClientStats(
