@@ -13,12 +13,13 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.fleet.server import FleetServer
 from gateway.fleet.settings import FleetSettings, SiteSettings
 from gateway.hub.settings import HubSettings
-from tests.hub.conftest import LIMIT_S, Rig, Station, rig
 from tests.kit.cli import invoke
+from tests.kit.hub import Rig, Station, proven, rig
 from tests.kit.mavlink import Sender
+from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
 
-__all__ = ["rig"]
+__all__ = ["proven", "rig"]
 
 
 class World:
@@ -76,7 +77,7 @@ class World:
             self.got += reader.parse_buffer(data) or []
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(LIMIT_S):
+        async with asyncio.timeout(START_LIMIT_S):
             while not condition():
                 self.rig.clock.now_us += 100_000
                 self.exchange()
@@ -119,7 +120,7 @@ async def opened_world(
     fleet = FleetServer(settings, hub)
     await fleet.start()
     station = rig.station(fleet._hub.listening_ports()[0])
-    async with asyncio.timeout(LIMIT_S):
+    async with asyncio.timeout(START_LIMIT_S):
         while not fleet._session.is_open:
             await asyncio.sleep(0.01)
     yield World(rig, fleet, locator or settings.listen, station)

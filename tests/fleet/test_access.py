@@ -16,12 +16,11 @@ from msgspec.structs import replace
 from gateway.config import load
 from gateway.hub.transports.zenoh.session import open_session, session_config
 from tests.fleet.conftest import World, opened_world
-from tests.hub.conftest import LIMIT_S, Rig, rig
+from tests.kit.hub import Rig
+from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
 
 zenoh = pytest.importorskip("zenoh")
-
-__all__ = ["rig"]
 
 pytestmark = pytest.mark.io
 
@@ -158,7 +157,7 @@ def test_site_reads_and_writes_its_own_keys_only(join: Callable[[str], Any]) -> 
         second.declare_subscriber(
             key, lambda sample: got.append((str(sample.key_expr), sample.payload.to_bytes()))
         )
-    end_s = time.monotonic() + LIMIT_S
+    end_s = time.monotonic() + START_LIMIT_S
     while len(got) < 20:
         assert time.monotonic() < end_s
         first.put("mavlink/field-1/1/out", b"telemetry of field-1")

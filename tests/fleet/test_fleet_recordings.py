@@ -29,8 +29,8 @@ from gateway.hub.transports.zenoh.site_queries import (
 )
 from gateway.live.control_socket import ControlError, request
 from tests.fleet.conftest import World
-from tests.hub.conftest import LIMIT_S
 from tests.kit.cli import invoke
+from tests.kit.process import START_LIMIT_S
 
 pytestmark = pytest.mark.io
 
@@ -108,7 +108,7 @@ class TestOverTheSession:
         def recorded(verb: str, params: dict[str, Any], wait_s: float) -> Any:
             asked.append((verb, params.get("offset")))
             if len(asked) == 20:
-                assert gone.wait(LIMIT_S)
+                assert gone.wait(START_LIMIT_S)
             return ask(verb, params, wait_s)
 
         def wait(seconds: float) -> None:

@@ -23,8 +23,7 @@ from gateway.hub.transports.zenoh.session import open_session, out_key, presence
 from gateway.live.control_socket import ControlError, request
 from gateway.wire.mavlink_signing import EPOCH_2015_US, TICK_US, key_from_passphrase
 from tests.fleet.conftest import World, run
-from tests.hub.conftest import LIMIT_S
-from tests.kit.process import Process, wait_for
+from tests.kit.process import START_LIMIT_S, Process, wait_for
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io
@@ -179,7 +178,9 @@ async def test_assigned_id_is_used_shown_and_saved(world: World, settings: Fleet
     await world.until(lambda: bool(world.systems()))
     socket_path = world.fleet.control_socket
     params = {"site": "field-a", "system_id": 1, "own_id": 77}
-    answer = await asyncio.to_thread(request, socket_path, "fleet.id", params, timeout_s=LIMIT_S)
+    answer = await asyncio.to_thread(
+        request, socket_path, "fleet.id", params, timeout_s=START_LIMIT_S
+    )
     assert answer == ["field-a/1 = 77"]
     await world.until(lambda: 77 in world.systems())
     status = await asyncio.to_thread(request, socket_path, "fleet.status", {})
@@ -245,7 +246,7 @@ def test_fleet_ends_on_sigterm(tmp_path: Path, settings: FleetSettings) -> None:
 
 def test_fleet_ends_on_sigterm_while_its_router_does_not_answer(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
-        mute.settimeout(LIMIT_S)
+        mute.settimeout(START_LIMIT_S)
         locator = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
         with command(tmp_path, "--connect", locator) as fleet, mute.accept()[0]:
             assert fleet.end() == 0
@@ -347,5 +348,5 @@ async def test_excluded_vehicle_is_not_shown(world: World, tmp_path: Path) -> No
     assert json.loads((tmp_path / "fleet.json").read_text())["field-a/1"] == 0
     params = {"site": "field-a", "system_id": 1, "own_id": 9}
     path = world.fleet.control_socket
-    await asyncio.to_thread(request, path, "fleet.id", params, timeout_s=LIMIT_S)
+    await asyncio.to_thread(request, path, "fleet.id", params, timeout_s=START_LIMIT_S)
     await world.until(lambda: 9 in world.systems())

@@ -14,7 +14,7 @@ from gateway.hub.send_queue import FLOOR_HZ, HIGH_LATENCY2, NEVER_THINNED, Bandw
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
-from tests.hub.conftest import KeepingClient
+from tests.kit.hub import KeepingClient
 
 STREAMS = {
     # Message: rate in Hz and payload in bytes, as the default settings send them.

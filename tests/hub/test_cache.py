@@ -7,7 +7,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.hub import Hub
 from gateway.wire.mavlink_splitter import frame_of
-from tests.hub.conftest import Rig, Station
+from tests.kit.hub import Rig, Station
 from tests.ports import free_port
 
 COUNT = 30

@@ -9,7 +9,7 @@ from gateway.hub.routing_table import SystemPath
 from gateway.records import ClientInterval
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
-from tests.hub.conftest import KeepingClient
+from tests.kit.hub import KeepingClient
 from tests.kit.mavlink import Sender, signer
 
 ATTITUDE_ID = 30

@@ -10,7 +10,7 @@ import pytest
 
 from gateway.hub.forwarding_step import MAX_DATAGRAM
 from gateway.hub.transports.base import READ_BYTES, UNTRUSTED_READ_BURST, UNTRUSTED_READ_RATE
-from tests.hub.conftest import LIMIT_S
+from tests.kit.process import START_LIMIT_S
 
 pytestmark = pytest.mark.io
 
@@ -40,7 +40,7 @@ async def test_one_wake_up_reads_a_bounded_part_of_a_flood(rig: Any, kind: str) 
     all_of_it = taken[0] + 20 * len(NOISE)
     for _ in range(20):
         send(sock)
-    async with asyncio.timeout(LIMIT_S):
+    async with asyncio.timeout(START_LIMIT_S):
         while taken[-1] < all_of_it:
             await asyncio.sleep(0)
             taken.append(client.counters.bytes_received)
@@ -63,7 +63,7 @@ async def test_untrusted_clients_share_one_read_rate(rig: Any, kind: str) -> Non
                 send(sock)
             await asyncio.sleep(0)
 
-    async with asyncio.timeout(LIMIT_S):
+    async with asyncio.timeout(START_LIMIT_S):
         await flood_until(UNTRUSTED_READ_BURST)
         for _ in range(20):
             for sock in floods:

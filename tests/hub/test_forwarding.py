@@ -19,7 +19,7 @@ from gateway.hub.forwarding import Forwarding
 from gateway.hub.stats import ClientStats
 from gateway.hub.transports.datagram import DatagramPeer
 from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter
-from tests.hub.conftest import Rig
+from tests.kit.hub import Rig
 from tests.kit.mavlink import Sender, packed
 
 pytestmark = pytest.mark.io

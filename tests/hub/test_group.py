@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.hub.conftest import LIMIT_S
+from tests.kit.process import START_LIMIT_S
 
 pytestmark = pytest.mark.io
 
@@ -37,17 +37,14 @@ def source_address() -> str:
         return str(probe.getsockname()[0])
 
 
-async def receive(sock: socket.socket) -> tuple[bytes, tuple[str, int]]:
-    return await asyncio.wait_for(asyncio.get_running_loop().sock_recvfrom(sock, 4096), LIMIT_S)
-
-
 async def test_multicast_is_sent_and_received_without_own_frames(rig: Any) -> None:
     listener = member(rig)
     port = listener.getsockname()[1]
     hub = await rig.open(f"udp-multicast:{GROUP}:{port}")
     frame = rig.vehicle.attitude()
     hub.send(rig.out(frame))
-    data, sender = await receive(listener)
+    async with asyncio.timeout(START_LIMIT_S):
+        data, sender = await asyncio.get_running_loop().sock_recvfrom(listener, 4096)
     assert data == frame
     answer, sent = rig.sender(255, 190), []
     for target in ((GROUP, port), sender):

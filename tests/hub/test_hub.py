@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import common as dialect
 from gateway.hub.transports import base, stream
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
-from tests.hub.conftest import FlyingHub
+from tests.kit.hub import FlyingHub
 from tests.kit.records import BARO
 
 pytestmark = pytest.mark.io

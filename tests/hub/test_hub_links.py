@@ -8,7 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.wire.mavlink_splitter import message_id_of
-from tests.hub.conftest import FlyingHub
+from tests.kit.hub import FlyingHub
 from tests.ports import free_ports
 
 pytestmark = pytest.mark.io

@@ -8,8 +8,8 @@ import pytest
 from gateway.hub.round_trip import PROBE_COMPONENT
 from gateway.records import ClientInterval
 from gateway.wire.mavlink_splitter import MavlinkSplitter, frame_of, message_id_of
-from tests.hub.conftest import LIMIT_S
 from tests.kit.mavlink import KEY, frames_of, signer, strict
+from tests.kit.process import START_LIMIT_S
 
 pytestmark = pytest.mark.io
 
@@ -64,7 +64,7 @@ async def test_timestamps_follow_the_order_in_which_frames_leave_a_queue(rig: An
         hub.send(rig.out(rig.vehicle.attitude()))
     splitter, receiver, kinds = MavlinkSplitter(), strict(), []
     while hub.clients()[0].queued or kinds.count("ATTITUDE") < 50:
-        data = await asyncio.wait_for(loop.sock_recv(client, 65536), LIMIT_S)
+        data = await asyncio.wait_for(loop.sock_recv(client, 65536), START_LIMIT_S)
         kinds += [read(receiver, frame)[0] for frame in frames_of(splitter.feed(data))]
     assert "RAW_IMU" in kinds[kinds.index("ATTITUDE") :], "some were overtaken"
 

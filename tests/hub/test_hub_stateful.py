@@ -32,7 +32,7 @@ from pymavlink.dialects.v20 import common as dialect
 from gateway.records import ClientInterval
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
-from tests.hub.conftest import FlyingHub, Rig, Station
+from tests.kit.hub import FlyingHub, Rig, Station
 from tests.ports import free_port
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]

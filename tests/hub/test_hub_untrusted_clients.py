@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import Outgoing
 from gateway.vehicle.vehicle_settings import VehicleSettings
-from tests.hub.conftest import FlyingHub
+from tests.kit.hub import FlyingHub
 from tests.kit.records import FIX
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]

@@ -17,7 +17,7 @@ from wsproto.events import AcceptConnection, BytesMessage, Request
 from gateway.hub.hub import Hub
 from gateway.hub.transports.datagram import DatagramPeer
 from gateway.wire.mavlink_splitter import MavlinkSplitter
-from tests.hub.conftest import Rig
+from tests.kit.hub import Rig
 from tests.kit.mavlink import frames_of
 from tests.ports import free_port
 

@@ -16,8 +16,8 @@ from pymavlink.dialects.v20 import common as dialect
 from gateway.hub.transports.base import STALE_AFTER_US
 from gateway.hub.transports.stream import UNSENT_BYTES
 from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
-from tests.hub.conftest import LIMIT_S
 from tests.kit.mavlink import frames_of
+from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io
@@ -28,7 +28,7 @@ SIOCOUTQNSD = 0x894B
 
 
 async def receive(client: socket.socket) -> bytes:
-    async with asyncio.timeout(LIMIT_S):
+    async with asyncio.timeout(START_LIMIT_S):
         return await asyncio.get_running_loop().sock_recv(client, 65536)
 
 

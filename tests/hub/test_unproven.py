@@ -6,8 +6,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.hub.round_trip import PROBE_COMPONENT
-from gateway.hub.transports.datagram import UNPROVEN, UNPROVEN_FACTOR, DatagramPeer
-from tests.hub.conftest import FlyingHub, Rig, Station
+from gateway.hub.transports.datagram import UNPROVEN, UNPROVEN_FACTOR
+from tests.kit.hub import FlyingHub, Rig, Station
 
 pytestmark = pytest.mark.io
 
@@ -15,9 +15,8 @@ SYSTEM = 7
 
 
 @pytest.fixture
-def rig(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> Rig:
-    monkeypatch.setattr(DatagramPeer, "is_proven", False)
-    return rig
+def proven() -> None:
+    """Let clients prove that they receive."""
 
 
 class Port:

@@ -31,7 +31,8 @@ from gateway.hub.transports.zenoh.session import (
 )
 from gateway.wire.mavlink_json import template
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
-from tests.hub.conftest import LIMIT_S, Rig
+from tests.kit.hub import Rig
+from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io
@@ -153,7 +154,7 @@ def patient(tmp_path: Path) -> Path:
 
 async def until(rig: Rig, hub: Any, condition: Callable[[], bool]) -> None:
     """Let the hub tick until something holds: Zenoh's own threads take their time."""
-    async with asyncio.timeout(LIMIT_S):
+    async with asyncio.timeout(START_LIMIT_S):
         while not condition():
             rig.clock.now_us += 100_000
             rig.tick(hub)
@@ -349,7 +350,7 @@ class TestTrouble:
         hub.send(site.out(site.vehicle.attitude()))
         station.received()
         # Blocking reads: the loop does nothing meanwhile.
-        station.socket.settimeout(LIMIT_S)
+        station.socket.settimeout(START_LIMIT_S)
         site.router.signal(signal.SIGSTOP)
         for _ in range(5000):
             for frame in (site.vehicle.raw_imu(), site.vehicle.command(1, 1)):
@@ -416,7 +417,7 @@ class TestLoopQueue:
         pauses_s, done = [1e-6, 1e-6, 0.0], asyncio.Event()
         queue = LoopQueue(lambda _: done.set(), pause_s=lambda: pauses_s.pop(0))
         queue.put(0)
-        async with asyncio.timeout(LIMIT_S):
+        async with asyncio.timeout(START_LIMIT_S):
             await done.wait()
         assert not pauses_s
 
@@ -473,7 +474,7 @@ class TestSubscription:
             lambda sample: taken.append((str(sample.key_expr), sample.payload.to_bytes())),
         )
         end = near.session.declare_subscriber("end", lambda _: all_sent.set())
-        async with asyncio.timeout(LIMIT_S):
+        async with asyncio.timeout(START_LIMIT_S):
             while not taken:
                 far.session.put("flood/a", b"begin")
                 await asyncio.sleep(0.01)
@@ -487,7 +488,7 @@ class TestSubscription:
             for site in "ab":
                 far.session.put(f"flood/{site}", b"%d" % number)
         far.session.put("end", b"")
-        assert all_sent.wait(LIMIT_S), "the loop stands still meanwhile"
+        assert all_sent.wait(START_LIMIT_S), "the loop stands still meanwhile"
         del taken[:]
         most = 0
         while len(taken) < 103:
@@ -551,7 +552,7 @@ def test_process_ends_soon_after_its_session_is_closed(
         if stalls:
             router.signal(signal.SIGSTOP)
         try:
-            site.communicate("fill\n" if stalls else "end\n", timeout=LIMIT_S)
+            site.communicate("fill\n" if stalls else "end\n", timeout=START_LIMIT_S)
         finally:
             site.kill()
         assert site.returncode == 7

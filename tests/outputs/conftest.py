@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.outputs import extend
 from gateway.outputs.output import Output
-from tests.hub.conftest import Rig
+from tests.kit.hub import Rig
 from tests.kit.mavlink import Sender, outgoing
 
 UNIX_US = 1_717_243_384_560_000

@@ -14,9 +14,9 @@ from gateway.hub.endpoint import parse_endpoint
 from gateway.outputs import extend
 from gateway.outputs.cot import UNKNOWN
 from gateway.units import US_PER_S
-from tests.hub.conftest import LIMIT_S
 from tests.hub.test_group import GROUP, member
 from tests.hub.web.conftest import certificate as certificate
+from tests.kit.process import START_LIMIT_S
 from tests.outputs.conftest import HERE, UNIX_US, OutputRig, at, beat, gps
 
 BATTERY = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 12_400, -1, 80, 0, 0, 0, 0, 0, 0)
@@ -103,7 +103,7 @@ async def test_events_are_sent_to_a_multicast_group(outputs: OutputRig) -> None:
     outputs.hear(beat(), at())
     outputs.turn(output)
     loop = asyncio.get_running_loop()
-    assert read(await asyncio.wait_for(loop.sock_recv(listener, 4096), LIMIT_S)).type
+    assert read(await asyncio.wait_for(loop.sock_recv(listener, 4096), START_LIMIT_S)).type
 
 
 @pytest.mark.parametrize("is_tls", [False, True])
@@ -132,7 +132,7 @@ async def test_events_are_streamed_to_a_server(
     outputs.hear(beat(), at())
     for _ in range(2):
         outputs.turn(output)
-        data, peer = await asyncio.wait_for(received.get(), LIMIT_S)
+        data, peer = await asyncio.wait_for(received.get(), START_LIMIT_S)
         assert read(data).lat == pytest.approx(HERE[0])
         assert bool(peer) == is_tls
     await outputs.until(lambda: output.carrier.state != "open")

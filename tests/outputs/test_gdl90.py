@@ -12,7 +12,7 @@ from gateway.hub.endpoint import parse_endpoint
 from gateway.outputs import extend
 from gateway.outputs.gdl90 import framed
 from gateway.units import US_PER_S
-from tests.hub.conftest import Station
+from tests.kit.hub import Station
 from tests.outputs.conftest import HERE, UNIX_US, OutputRig, at, beat, gps
 
 ATTITUDE = mavlink.MAVLink_attitude_message(0, math.radians(12.5), math.radians(-7.3), 1, 0, 0, 0)

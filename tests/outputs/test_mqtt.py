@@ -17,8 +17,8 @@ import pytest
 from gateway.hub.endpoint import parse_endpoint
 from gateway.outputs import extend, mqtt
 from gateway.units import US_PER_S
-from tests.hub.conftest import LIMIT_S
 from tests.hub.web.conftest import certificate as certificate
+from tests.kit.process import START_LIMIT_S
 from tests.outputs.conftest import OutputRig, at, beat
 from tests.ports import free_ports
 
@@ -50,7 +50,7 @@ class Mosquitto:
         self.process = subprocess.Popen(["mosquitto", "-c", settings], stderr=subprocess.DEVNULL)
 
     async def subscriber(self) -> aiomqtt.Client:
-        async with asyncio.timeout(LIMIT_S):
+        async with asyncio.timeout(START_LIMIT_S):
             while True:
                 client = aiomqtt.Client(
                     "127.0.0.1", self.port, username="pilot", password="top secret"
@@ -75,7 +75,7 @@ async def broker(tmp_path: Path, certificate: Path) -> AsyncIterator[Mosquitto]:
 
 async def next_of(client: aiomqtt.Client) -> tuple[str, Any, bool]:
     """Return topic and text of the next message, and whether it was retained."""
-    async with asyncio.timeout(LIMIT_S):
+    async with asyncio.timeout(START_LIMIT_S):
         message = await anext(aiter(client.messages))
     data = message.payload.decode()
     return str(message.topic), json.loads(data) if "{" in data else data, message.retain

@@ -18,7 +18,8 @@ from gateway.hub.settings import HubSettings
 from gateway.outputs import extend
 from gateway.recordings.newest import POSITION_OLD_US
 from gateway.units import US_PER_S
-from tests.hub.conftest import LIMIT_S, Station
+from tests.kit.hub import Station
+from tests.kit.process import START_LIMIT_S
 from tests.outputs.conftest import HERE, OutputRig, at, beat, estimator, gps
 from tests.ports import free_port
 
@@ -145,7 +146,7 @@ async def test_listening_port_serves_several_clients(outputs: OutputRig) -> None
     outputs.turn(output)
     loop = asyncio.get_running_loop()
     for client in clients:
-        data = await asyncio.wait_for(loop.sock_recv(client, 4096), LIMIT_S)
+        data = await asyncio.wait_for(loop.sock_recv(client, 4096), START_LIMIT_S)
         assert read(data)["RMC"].status == "A"
     clients[0].close()
     await outputs.until(lambda: len(output.carrier._peers) == 1)
@@ -170,7 +171,7 @@ async def test_broken_connection_is_made_again(outputs: OutputRig) -> None:
         loop = asyncio.get_running_loop()
         output = await outputs.output(f"nmea:tcp:127.0.0.1:{server.getsockname()[1]}")
         for _ in range(2):
-            connection, _ = await asyncio.wait_for(loop.sock_accept(server), LIMIT_S)
+            connection, _ = await asyncio.wait_for(loop.sock_accept(server), START_LIMIT_S)
             await outputs.until(lambda: output.carrier.state == "open")
             connection.close()
             await outputs.until(lambda: output.carrier.state == "connecting")
@@ -230,7 +231,7 @@ async def test_gpsd_reports_the_position(outputs: OutputRig) -> None:
     source = f"tcp://127.0.0.1:{output.carrier.link.port}"
     daemon = subprocess.Popen(["gpsd", "-N", "-n", "-b", "-S", str(port), source])
     try:
-        async with asyncio.timeout(LIMIT_S):
+        async with asyncio.timeout(START_LIMIT_S):
             report = await first_fix(outputs, output, port)
     finally:
         daemon.kill()

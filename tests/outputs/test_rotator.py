@@ -19,7 +19,7 @@ from gateway.outputs.rotator import command
 from gateway.recordings.antenna import AntennaStation, Pointing, pointing_of
 from gateway.recordings.newest import NewestState
 from gateway.recordings.positions import Position
-from tests.hub.conftest import LIMIT_S
+from tests.kit.process import START_LIMIT_S
 from tests.outputs.conftest import HERE, OutputRig, at, beat, gps
 from tests.ports import free_port
 
@@ -174,7 +174,7 @@ class TestHamlib:
         port = free_port()
         daemon = subprocess.Popen(["rotctld", "-m", "1", "-T", "127.0.0.1", "-t", str(port)])
         try:
-            async with asyncio.timeout(LIMIT_S):
+            async with asyncio.timeout(START_LIMIT_S):
                 before = await self.ask(port, "p\n", 2)
                 url = (
                     f"rotator:tcp:127.0.0.1:{port}?protocol=rotctld&station=47.3977420,-8.6,488.13"
@@ -203,7 +203,7 @@ class TestHamlib:
         expected, received = command(protocol, Pointing(124.0, 45.0, 1e3)), b""
         asking = asyncio.get_running_loop().create_task(self.ask(port, "P 124.0 45.0\n", 1))
         try:
-            async with asyncio.timeout(LIMIT_S):
+            async with asyncio.timeout(START_LIMIT_S):
                 while expected not in received:
                     try:
                         received += os.read(main, 4096)

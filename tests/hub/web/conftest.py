@@ -13,8 +13,9 @@ from wsproto import ConnectionType, WSConnection
 from wsproto.events import AcceptConnection, BytesMessage, Event, Ping, Request
 
 from gateway.wire.mavlink_splitter import MavlinkSplitter
-from tests.hub.conftest import LIMIT_S, Rig
+from tests.kit.hub import Rig, receive
 from tests.kit.mavlink import frames_of
+from tests.kit.process import START_LIMIT_S
 
 
 @pytest.fixture(scope="session")
@@ -66,7 +67,7 @@ class Page:
     async def take(self) -> bool:
         """Take the next bytes; return whether there were any before the end."""
         try:
-            data = await asyncio.wait_for(self.reader.read(65536), LIMIT_S)
+            data = await asyncio.wait_for(self.reader.read(65536), START_LIMIT_S)
         except ConnectionError:
             # The hub closed while something of ours was still unread.
             return False
@@ -82,7 +83,7 @@ class Page:
         return True
 
     async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(LIMIT_S):
+        async with asyncio.timeout(START_LIMIT_S):
             while not condition():
                 assert await self.take()
 
@@ -93,7 +94,7 @@ class Page:
 
     async def end(self) -> None:
         """Read until the server has closed."""
-        async with asyncio.timeout(LIMIT_S):
+        async with asyncio.timeout(START_LIMIT_S):
             while await self.take():
                 pass
 
@@ -123,6 +124,6 @@ async def visit(rig: Rig) -> AsyncIterator[Callable[..., Any]]:
 async def hung_up(sock: socket.socket) -> bool:
     """Return whether the hub closes a bare connection without an answer."""
     try:
-        return await asyncio.wait_for(asyncio.get_running_loop().sock_recv(sock, 1), LIMIT_S) == b""
+        return await receive(sock) == b""
     except ConnectionError:
         return True

@@ -10,7 +10,8 @@ import pytest
 from playwright.async_api import Page, async_playwright
 from pymavlink.dialects.v20 import common as dialect
 
-from tests.hub.conftest import LIMIT_S, Rig
+from tests.kit.hub import Rig
+from tests.kit.process import START_LIMIT_S
 
 CHROMIUM = shutil.which("chromium")
 PROGRAMS = Path(__file__).resolve().parents[3] / "docs" / "programs.md"
@@ -34,10 +35,10 @@ def documented_page(port: int) -> str:
 async def page() -> AsyncIterator[Page]:
     async with async_playwright() as playwright:
         browser = await playwright.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox"], timeout=4000 * LIMIT_S
+            executable_path=CHROMIUM, args=["--no-sandbox"], timeout=4000 * START_LIMIT_S
         )
         page = await browser.new_page()
-        page.set_default_timeout(1000 * LIMIT_S)
+        page.set_default_timeout(1000 * START_LIMIT_S)
         yield page
         await browser.close()
 
@@ -63,7 +64,7 @@ async def colour(page: Page, x: int, y: int) -> list[int]:
 
 
 async def until_colour(page: Page, pixel: tuple[int, int], wanted: list[int]) -> None:
-    async with asyncio.timeout(LIMIT_S):
+    async with asyncio.timeout(START_LIMIT_S):
         while await colour(page, *pixel) != wanted:
             await asyncio.sleep(0.01)
 
@@ -96,7 +97,7 @@ async def test_page_of_a_foreign_origin_receives_nothing(rig: Rig, page: Page) -
     """The browser itself sends the page's origin; that of an opened file and a sandbox is null."""
     hub = rig.hub("ws-listen:127.0.0.1:0")
     await page.set_content(documented_page(hub.listening_ports()[0]))
-    async with asyncio.timeout(LIMIT_S):
+    async with asyncio.timeout(START_LIMIT_S):
         while not await page.evaluate("socket.readyState === WebSocket.CLOSED"):
             await asyncio.sleep(0.01)
     assert not hub.clients()

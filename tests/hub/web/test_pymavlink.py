@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from pymavlink import mavutil
 
-from tests.hub.conftest import LIMIT_S, Rig
+from tests.kit.hub import Rig
+from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io
@@ -16,7 +17,7 @@ pytestmark = pytest.mark.io
 
 async def receive(link: Any, kind: str) -> Any:
     """Wait in a thread of its own, since pymavlink blocks."""
-    return await asyncio.to_thread(link.recv_match, type=kind, blocking=True, timeout=LIMIT_S)
+    return await asyncio.to_thread(link.recv_match, type=kind, blocking=True, timeout=START_LIMIT_S)
 
 
 async def test_pymavlink_connects_to_the_hub(rig: Rig) -> None:

@@ -13,8 +13,9 @@ import pytest
 from wsproto.events import RejectConnection, TextMessage
 
 from gateway.hub.settings import HubSettings
-from tests.hub.conftest import LIMIT_S, Rig
 from tests.hub.web.conftest import hung_up
+from tests.kit.hub import Rig
+from tests.kit.process import START_LIMIT_S
 
 pytestmark = pytest.mark.io
 
@@ -67,7 +68,7 @@ class TestTrouble:
         sock = await rig.connect(hub.listening_ports()[0], room_bytes=4096)
         await self.shake_hands(rig, hub, sock)
         ping = b"\x89\xfd" + bytes(4 + 125)
-        async with asyncio.timeout(LIMIT_S):
+        async with asyncio.timeout(START_LIMIT_S):
             while hub.clients():
                 try:
                     await asyncio.get_running_loop().sock_sendall(sock, ping * 30)
@@ -212,7 +213,7 @@ class TestTls:
         page.reader._transport.resume_reading()
         (slow,) = hub.clients()
         got = 0
-        async with asyncio.timeout(LIMIT_S):
+        async with asyncio.timeout(START_LIMIT_S):
             while got < slow.sent:
                 await page.take()
                 got = sum(len(data) for data in page.messages) // len(rig.vehicle.raw_imu())
