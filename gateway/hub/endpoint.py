@@ -1,4 +1,4 @@
-"""Endpoint URLs: where frames go to and come from, and what may pass.
+"""Endpoint URLs: destinations and sources of frames, and their filters.
 
     udp:HOST:PORT            send there; answers come back to the same socket
     udp-listen:HOST:PORT     serve every client that sends to this port
@@ -14,11 +14,11 @@
 
 IPv6 addresses are written in brackets. Options follow as in any URL:
 `?name=tablet&deny=RAW_IMU&pack=1100`. The spellings of MAVProxy, MAVSDK, pymavlink, mavlink-router
-and mavp2p are read with their meaning: the words of `ALIASES`, `//` after the kind, `HOST:PORT` for
+and mavp2p are accepted as well: the words of `ALIASES`, `//` after the kind, `HOST:PORT` for
 `udp:`, and `DEVICE:BAUD` or `DEVICE,BAUD` for `serial:`.
 
-`udp://` listens in MAVSDK, binds and sends in MAVROS, and looks like `udp:`, which sends here: it
-is refused, and so is an address to send to that can only be one to listen on.
+`udp://` is refused, because it listens in MAVSDK, binds and sends in MAVROS, and looks like `udp:`,
+which sends here. So is a destination that can only be an address to listen on.
 
 A browser lets any page of any site connect to any port, this machine's own included, and sends the
 server only the page's origin (RFC 6454, RFC 6455 section 10.2). Pages of this machine may connect,
@@ -54,20 +54,20 @@ MIN_RATE_HZ: Final = 0.001
 NO_MESSAGES: Final = -1
 """An interval that stops a message."""
 BITS_PER_BYTE: Final = 10
-"""On a serial line: start bit, eight data bits, stop bit."""
+"""Bits per byte on a serial line: start bit, eight data bits, stop bit."""
 MAX_BUDGET: Final = 1_000_000_000
 MS_PER_S: Final = 1000
 MAX_WAIT_MS: Final = 1000
 MAX_PACK_BYTES: Final = 1100
-"""Routers on the way cut or drop datagrams beyond 1120 bytes."""
+"""Largest datagram of packed frames, bytes: routers on the way cut or drop those beyond 1120."""
 MAX_PORT: Final = 65535
 DEFAULT_BAUD: Final = 57600
 MIN_BAUD: Final = 300
 MAX_BAUD: Final = 12_000_000
-"""The fastest USB adapters."""
+"""Rate of the fastest USB adapters, Bd."""
 SITE_KEYS: Final = "site"
 LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
-"""How Zenoh names an address."""
+"""Pattern of an address as Zenoh writes it."""
 RAW_KEYS: Final = "mavlink_raw"
 JSON_KEYS: Final = "mavlink_json"
 SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
@@ -98,8 +98,8 @@ PARTS: Final = frozenset({"site", "vehicle"})
 def admits_page(origin: str, local_host: str, named: Collection[str]) -> bool:
     """Return whether a page of this origin may connect.
 
-    A page from `local_host`, the address of ours that the browser connected to, is of this machine
-    too; the host name that the browser used proves nothing. `named` are further allowed origins.
+    A page from `local_host`, our address to which the browser connected, is also a local page; the
+    host name that the browser used proves nothing. `named` are further allowed origins.
     """
     if origin.lower() in named:
         return True
@@ -117,7 +117,7 @@ def admits_page(origin: str, local_host: str, named: Collection[str]) -> bool:
 
 
 def names_loopback(host_header: str) -> bool:
-    """Return whether a request's `Host` is loopback: a page of elsewhere, rebound to it, is not."""
+    """Return whether a request's `Host` is loopback; that of a page after DNS rebinding is not."""
     try:
         return is_loopback(urlsplit(f"//{host_header.strip()}").hostname or "")
     except ValueError:
@@ -133,12 +133,12 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def is_name(host: str) -> bool:
-    """Return whether the resolver would accept a host; it raises for every one that it does not."""
+    """Return whether a host is a valid name: for any other, the resolver raises an error."""
     try:
         host.encode("idna")
     except UnicodeError:
         return False
-    # A mistyped IPv4 address is no name either.
+    # A mistyped IPv4 address is not a name.
     return _HOST.fullmatch(host) is not None and not host.replace(".", "").isdecimal()
 
 
@@ -148,7 +148,7 @@ def is_numeric(host: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address is loopback; of the names only `localhost` is."""
+    """Return whether a host is a loopback address or the name `localhost`."""
     if host == "localhost":
         return True
     address = _address(host)
@@ -187,15 +187,15 @@ OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
 }
 """Options that only some kinds have."""
 HOSTED: Final = LISTENING | {EndpointKind.UDP, EndpointKind.TCP, EndpointKind.WS, EndpointKind.WSS}
-"""Kinds whose frames go to hosts by their addresses, one by one."""
+"""Kinds whose frames are sent to the addresses of single hosts."""
 
 
 @dataclass(frozen=True, slots=True)
 class AddedKind:
-    """A kind of another package, which parses the rest of the URL itself."""
+    """A kind of endpoint added by another package, which parses the rest of the URL itself."""
 
     options: frozenset[str] = frozenset()
-    """Its own options; one that is named like a common option replaces it."""
+    """Its own options; one with the name of a common option replaces it."""
     check: "Callable[[Endpoint], None]" = lambda _endpoint: None
     """Raises ValueError if it does not understand an endpoint."""
 
@@ -213,7 +213,7 @@ class Endpoint:
     host: str
     """Address or name without brackets; device of a serial port; otherwise the whole location."""
     port: int
-    """Port number; the baud rate of a serial port; 0 of an added kind."""
+    """Port number; for a serial port the baud rate, for an added kind 0."""
     location: str
     """The URL in our own spelling and without options but `PARTS`; no two endpoints share one."""
     name: str
@@ -224,26 +224,26 @@ class Endpoint:
     systems: SystemFilter = NO_FILTER
     """Systems and components that pass, in both directions."""
     new_ids: dict[int, int] = field(default_factory=dict)
-    """Ids of systems here by those of the link; see `SystemTranslation`."""
+    """System ids at the gateway by the ids on the link; see `SystemTranslation`."""
     interval_us: dict[int, int] = field(default_factory=dict)
     """Least time between two frames of a message, by message id."""
     pack_bytes: int = 0
     """Gather frames into datagrams or messages of up to this size; 0 sends each on its own."""
     pack_wait_s: float = 0.0
-    """How long the first frame waits for others; 0 sends what has come at once."""
+    """How long the first frame waits for others; 0 packs only frames that arrive together."""
     budget: int = 0
-    """Bytes a second that the link carries; telemetry is thinned to fit. 0 for any number."""
+    """Bytes a second that the link carries; telemetry is thinned to fit. 0 for no limit."""
     trusted: bool | None = None
     """Whether its clients may change state; None: loopback and configured peers except fleets."""
     mavlink: int = 0
-    """Version of all frames sent there; 0 for 2, or for 1 to a client that has only sent 1."""
+    """MAVLink version of all frames sent there; 0 for 2, or 1 if the client has sent only 1."""
     cache: bool | None = None
     """Whether answers of its vehicles are kept for other stations; False: its own stations are
     answered by the vehicles alone."""
     monitor: bool = False
     """Send all traffic, addressed frames included, and ignore everything received."""
     origins: frozenset[str] = frozenset()
-    """Pages of other machines that may connect by WebSocket, as browsers name them."""
+    """Origins of pages of other machines that may connect by WebSocket."""
     path: str = "/"
     """The path requested from a WebSocket server."""
     site: str = ""
@@ -271,7 +271,7 @@ class Endpoint:
 
 
 def parse_endpoint(url: str) -> Endpoint:
-    """Read one endpoint URL, as in the table above.
+    """Read one endpoint URL, as in the table of this module.
 
     Options are `name`, `allow`, `deny` (message names or numbers, separated by commas), `rate`
     (`NAME:hertz`, separated by commas), `pack` (bytes), `wait` (milliseconds), `budget` (bytes a
@@ -384,7 +384,7 @@ def stays_here(endpoint: Endpoint) -> bool:
 
 
 def _options(kind: str, query: str) -> dict[str, str]:
-    """Read the options; each may be given once, or their order would decide which one counts."""
+    """Read the options; a repeated one is refused, since their order would decide its value."""
     own = ADDED_KINDS[kind].options if kind in ADDED_KINDS else OWN_OPTIONS.get(kind, frozenset())
     known = COMMON_OPTIONS | own
     options: dict[str, str] = {}
@@ -400,7 +400,7 @@ def _options(kind: str, query: str) -> dict[str, str]:
 
 
 def _budget(kind: str, baud: int, text: str | None) -> int:
-    """Read the width of a link; a serial line carries no more than its baud rate."""
+    """Read the bandwidth of a link; that of a serial line is at most its baud rate."""
     if text is not None:
         return number_from(text, "budget", 0, MAX_BUDGET)
     return baud // BITS_PER_BYTE if kind == EndpointKind.SERIAL else 0
@@ -433,7 +433,7 @@ def _path(text: str) -> str:
 
 
 def respell(address: str) -> tuple[str, str]:
-    """Read an endpoint without its options, in any of the spellings.
+    """Read an endpoint without its options, in any accepted spelling.
 
     Raises ValueError if programs differ about its meaning; the error names the unambiguous
     spellings.
@@ -444,7 +444,7 @@ def respell(address: str) -> tuple[str, str]:
     word, colon, rest = address.partition(":")
     slashes = rest.startswith("//")
     if colon and not slashes and (word[:1] == "[" or "." in word or word == "localhost"):
-        # There is no kind: a host has a dot or a bracket.
+        # A host without a kind: it has a dot or a bracket.
         return "udp", address
     kind = ALIASES.get(word, word)
     rest = rest.removeprefix("//")
@@ -459,7 +459,7 @@ def respell(address: str) -> tuple[str, str]:
 
 
 def _either(kind: str, rest: str) -> str:
-    """Return how to write both possible meanings."""
+    """Return a text that shows how to write each of the possible meanings."""
     host, _, port = rest.rpartition(":")
     if not port.isdecimal():
         host, port = rest, "PORT"
@@ -485,8 +485,8 @@ def message_id_from(text: str) -> int:
 
 
 def number_from(text: str, what: str, low: int, high: int) -> int:
-    """Read a whole number within bounds; raises ValueError naming what it is."""
-    # A number of thousands of digits is refused by Python itself, in words about Python.
+    """Read a whole number within bounds; the text of a ValueError begins with `what`."""
+    # Python itself refuses thousands of digits, with an error that concerns Python's own limit.
     if not text.isascii() or not text.isdecimal() or len(text) > len(str(high)):
         raise ValueError(f"{what} {text!r} is not {low} to {high}")
     if not low <= int(text) <= high:

@@ -1,4 +1,4 @@
-"""Which client gets which frame, with which sequence number; the cache of these decisions.
+"""Distribution of frames to clients: cached routes, rates and sequence numbers.
 
 Theory of operation. The first frame of each kind (system, component, message) from each source is
 routed by the endpoints' filters, rates and the requested intervals; the resulting `Route` is kept,
@@ -14,7 +14,7 @@ same count share one copy, which is signed too if its vehicle signs. Frames of o
 never changed; a filter on those does show as loss.
 
 The frames to a client of known bandwidth are counted, and thinned once a second so that they fit:
-see `send_queue.py`. A client whose endpoint has `monitor=yes` gets every frame. One that knows only
+see `send_queue.py`. A client whose endpoint has `monitor=yes` gets every frame. A client of
 MAVLink 1 gets the messages that this version can carry, without extensions and signatures.
 """
 
@@ -42,14 +42,14 @@ from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame
 
 MAX_KINDS: Final = 4096
-"""Kinds of frame per client: a vehicle sends some fifty; forged headers must not fill memory."""
+"""Maximum kinds of frame per client: a vehicle sends some fifty; forged headers could be any."""
 MAX_ROUTES: Final = 1024
-"""Cached routes per source; beyond a few hundred they are forged."""
+"""Maximum cached routes per source; more than a few hundred come from forged headers."""
 
 
 @dataclass(slots=True)
 class _Gap:
-    """Frames of one component that a client was not sent, modulo 256."""
+    """Number of frames of one component that were not sent to a client, modulo 256."""
 
     skipped: int = 0
 
@@ -64,16 +64,16 @@ class _Subscription:
     client: Client
     bandwidth: Bandwidth | None
     is_recording: bool
-    """Whether our frames are those of a recording that is played."""
+    """Whether our frames come from the playback of a recording."""
     answered: int = 0
-    """Bytes of answers since the bandwidth was planned last."""
+    """Bytes of answers since the last plan of the bandwidth."""
     requested: dict[tuple[int, int], int] = field(default_factory=dict)
     """Requested intervals by system and message."""
     gaps: dict[Origin, _Gap] = field(default_factory=dict)
     limits: dict[bytes, RateLimit] = field(default_factory=dict)
 
     def carries(self, frame: MavFrame) -> bool:
-        """Return whether the client gets a system, and its version of MAVLink has the message."""
+        """Return whether the client gets this system, and its MAVLink version has the message."""
         endpoint, renumbering = self.client.endpoint, self.client.renumbering
         if endpoint.systems and not endpoint.systems.has(frame.origin):
             return False
@@ -82,7 +82,7 @@ class _Subscription:
         return not self.client.is_mavlink1 or base_size(frame.message_id) is not None
 
     def lets_out(self, frame: MavFrame) -> bool:
-        """Return whether the client's filter lets a frame pass that is not only telemetry."""
+        """Return whether the client's filter passes a frame that is addressed, or a station's."""
         systems = self.client.endpoint.systems
         return not systems or systems.lets_out(frame)
 
@@ -95,7 +95,7 @@ class _Subscription:
         return gap
 
     def limit_of(self, key: bytes, interval_us: int) -> RateLimit | None:
-        """Return the limit of a kind of frame, with its present interval; None for none."""
+        """Return the limit of a kind of frame, with its present interval; None without a limit."""
         if not interval_us:
             return None
         limit = self.limits.get(key)
@@ -122,7 +122,7 @@ class _Subscription:
             return round(HIGH_LATENCY2_BYTES * US_PER_S / endpoint.budget)
         is_ours = is_ours and not self.is_recording
         if message_id == HIGH_LATENCY2 and is_ours and message_id not in endpoint.allow:
-            # Its content is sent there in full by other messages.
+            # Other messages send its content in full.
             return NO_MESSAGES
         limit = endpoint.interval_us.get(message_id, 0)
         requested = self.requested.get((frame.origin[0], message_id), 0)
@@ -142,7 +142,7 @@ class OwnRoute:
         self.frames = self.size = 0
         self.targets: list[tuple[Callable[[MavFrame], None], _Gap, RateLimit | None]] = []
         self.closed: list[_Gap] = []
-        """Clients that get no frame of these."""
+        """Gaps of the clients that get no frame of this kind."""
 
     def settle(self) -> tuple[int, int]:
         """Return the frames and bytes since the last call."""
@@ -169,14 +169,14 @@ class Fanout:
         self._targets: dict[tuple[tuple[int, int], ...], Targets] = {}
         """Targets by client and limit of each: routes share them."""
         self._targets_at: dict[int, Targets] = {}
-        """The same by address."""
+        """The same targets by the address of their memory."""
         self.others: dict[tuple[int, bytes], Route] = {}
         """Routes by client and key of frames that are not only forwarded, such as heartbeats."""
         self.forwarded = 0
         """Frames of other systems that were forwarded by cached routes."""
         self._own: dict[bytes, OwnRoute] = {}
         self._offered: dict[bytes, tuple[int, int, int]] = {}
-        """Message id, frames and bytes of each kind since the bandwidths were planned last."""
+        """Message id, frames and bytes of each kind since the last plan of the bandwidths."""
         self._is_metered = False
         """Whether `_offered` is needed."""
         self._signer = signer
@@ -185,7 +185,7 @@ class Fanout:
         self._planned_us = 0
 
     def clear(self) -> None:
-        """Discard all routes, because a fact has changed on which some depend."""
+        """Discard all routes, because a fact on which some depend has changed."""
         self.settle()
         self._own.clear()
         self.others.clear()
@@ -317,13 +317,13 @@ class Fanout:
         return Route(frame.message_id, shared, source, path, rejects, self._on_foreign)
 
     def keep_route(self, route: Route, source: Client, key: bytes) -> None:
-        """Forward all such frames of a client by a route from now on, without looking at them."""
+        """Forward all frames of this kind from a client by a route, without examining each."""
         source.routes[key] = route
         if source.renumbering is None:
             route.enter(self.forwarding, key)
 
     def finish_run(self, now_us: int) -> None:
-        """Do for a run of frames what the compiled step has left."""
+        """Complete the forwarding of a run: the part that the compiled step leaves to Python."""
         run = self.forwarding.run()
         targets = self._targets_at[self.forwarding.work[TARGETS]]
         targets.finish(run, self.forwarding.failures(), now_us)
@@ -331,7 +331,7 @@ class Fanout:
             self._on_foreign(run)
 
     def align(self, client_ids: Sequence[int]) -> None:
-        """Send links to one peer the same frames, number for number, from now on.
+        """Send the same frames with the same numbers to all links of one peer from now on.
 
         A message interval that one of them requested applies to all; where they differ, the first
         decides.

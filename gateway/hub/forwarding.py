@@ -1,4 +1,4 @@
-"""Memory of the compiled step that forwards: buffers, the table of routes, and what they count."""
+"""Memory of the compiled step that forwards: buffers, the table of routes, and counters."""
 
 from collections.abc import Callable
 from typing import Final
@@ -11,15 +11,15 @@ from gateway.compiled.messages import LENGTH, PARTS, Outbox, headers_of
 from gateway.hub import forwarding_step as step
 
 MAX_COMPILED: Final = step.ENTRIES // 2
-"""Routes in the table; frames of further ones are forwarded by Python."""
+"""Maximum routes in the table; frames of further ones are forwarded by Python."""
 FIRST_LARGEST: Final = 280
-"""Size of a datagram, until some were received: the largest frame."""
+"""Assumed size of datagrams until some are received, bytes: that of the largest frame."""
 
 Words = memoryview
 
 
 def new_client_words(client_id: int) -> Words:
-    """Return the words of a client that is neither received from nor sent to yet."""
+    """Return the words of a client without a file to receive from or send to."""
     words = np.zeros(step.CLIENT_WORDS, np.int64)
     words[step.CLIENT_ID], words[step.LARGEST] = client_id, FIRST_LARGEST
     words[step.INPUT] = words[step.OUTPUT] = -1
@@ -60,7 +60,7 @@ class Forwarding:
         self._kept = (*memory, places)
 
     def step(self, client: Words, *, reads: bool) -> Callable[[], None]:
-        """Return the step of a client that receives, or one that goes on."""
+        """Return a client's step: one that receives first, or one that continues a read."""
         if not self.is_compiled:
             return lambda: None
         return step.forward.bound(self._work_at, address_of(client), int(reads))
@@ -68,7 +68,7 @@ class Forwarding:
     def enter(
         self, client_id: int, key: bytes, seed: int, targets_at: int, numbers_at: int
     ) -> Words | None:
-        """Add the route of a client's frames of one key; return its counters, None without room.
+        """Add the route of a client's frames of one key; return its counters, None if full.
 
         The caller keeps the targets and the times by sequence number, which are passed by address.
         """
@@ -92,7 +92,7 @@ class Forwarding:
             self._table[:, step.KEY_CLIENT] = 0
 
     def load(self, data: bytes, now_us: int) -> None:
-        """Put a chunk of a stream, of at most 256 kB, in the place of a read."""
+        """Load a chunk of a stream, of at most 256 kB, as if the step had received it."""
         self._buffer[: len(data)] = data
         self._lengths[0] = len(data)
         work = self.work

@@ -40,19 +40,19 @@ from gateway.wire.mavlink_splitter import MavFrame, frame_of
 log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.25
-"""Often enough for expiry and reconnection, too seldom to cost anything."""
+"""Interval of the ticks, s: short enough for expiry and reconnection, at negligible cost."""
 CONNECTIONS_IN_FULL: Final = 30
-"""Connects and disconnects at listening ports that are logged one by one in a minute."""
+"""Maximum connects and disconnects at listening ports that are logged one by one in a minute."""
 CONNECTIONS_NOT_LOGGED: Final = "more connects and disconnects at listening ports"
 SENDS_AT_ONCE: Final = 8
 """Maximum sends of our own frames per event-loop turn: each takes some tens of µs."""
 LEAST_READ_BYTES: Final = 192
-"""Some frames: with fewer, each wake-up would cost more than the frames do."""
+"""Minimum read at one wake-up: with fewer frames, the wake-up would cost more than they do."""
 PASSED_ON_BYTES: Final = 12_288
-"""Read from one client at one wake-up, times the clients that may get it: some 250 sends, about a
-millisecond, so that a flooding client delays the others by no more."""
+"""Maximum bytes read from one client at one wake-up, times the clients that may get them: some 250
+sends, about a millisecond, so that a flooding client delays the others by no more."""
 MAX_WAITING: Final = 256
-"""Frames of a burst that wait. More are sent at once, so that a fast playback is slowed down."""
+"""Maximum waiting frames of a burst. More are sent at once, which slows a fast playback down."""
 SHED_AFTER_US: Final = 150_000
 """Telemetry that has waited longer is dropped: the processor is short of time, and newer telemetry
 is waiting already."""
@@ -71,8 +71,8 @@ class Hub:
     settings : HubSettings
         Endpoints and limits.
     on_frame : callable
-        Called with every frame to our vehicles, every request to all, and every heartbeat, within
-        the client's quota of answers.
+        Called with every frame to our vehicles, every request to all systems, and every heartbeat,
+        within the client's quota of answers.
     now_us : callable
         The gateway clock.
     on_foreign : callable, optional
@@ -88,11 +88,11 @@ class Hub:
     recordings : Path, optional
         Folder of the recordings that a fleet may fetch.
     keeps_order : bool, optional
-        Send frames in their order, without answers first, and drop none: for a recording, of which
-        HIGH_LATENCY2 is sent as all others.
+        Send frames in their order, without answers first, and drop none: for a recording, whose
+        HIGH_LATENCY2 is sent like all other messages.
     """
 
-    _said = 0
+    _own_sequence = 0
     """Sequence number of the next message of the gateway itself."""
 
     def __init__(
@@ -183,7 +183,7 @@ class Hub:
         """
         batch = [*frames]
         if len(batch) == 1 and self._burst_turn is None:
-            # Nearly always: a sample carries one message, and nothing waits.
+            # The usual case: a sample gives one message, and nothing waits.
             self.send(batch[0])
             return
         now_us = self.now_us()
@@ -200,7 +200,7 @@ class Hub:
 
     def _queued(self, outgoing: Outgoing, now_us: int) -> _Queued:
         frame, client_id = outgoing.header or frame_of(outgoing.frame), outgoing.client_id
-        # Now, while it is known which client has made the request.
+        # Charged now, while the client that made the request is known.
         self._router.charge(client_id, len(frame.data))
         return frame, self._numbering.enter(frame), client_id, now_us
 
@@ -239,7 +239,7 @@ class Hub:
         self._fanout.publish(frame, sequence, now_us)
 
     def routed_vehicles(self) -> set[int]:
-        """Return the systems of others that are routed and no ground stations."""
+        """Return the routed systems that are neither ours nor ground stations."""
         return self._router.routed_vehicles()
 
     def say(self, messages: Iterable[Any]) -> bool:
@@ -252,10 +252,10 @@ class Hub:
             for system in systems:
                 sender = dialect.MAVLink(None, system, PROBE_COMPONENT)
                 frame = frame_of(bytes(message.pack(sender)))
-                self._fanout.publish(frame, self._said, now_us)
+                self._fanout.publish(frame, self._own_sequence, now_us)
                 if self._on_foreign is not None:
                     self._on_foreign((frame.data,))
-            self._said = self._said + 1 & 0xFF
+            self._own_sequence = self._own_sequence + 1 & 0xFF
         return bool(systems)
 
     def set_interval(self, request: ClientInterval) -> None:
@@ -383,7 +383,7 @@ class Hub:
         if wait_s:
             loop.call_later(wait_s, self._flush, wait_s)
         else:
-            # Not before the sockets were polled once more: a wake-up may read one datagram only.
+            # After one more poll of the sockets: a wake-up may read only one datagram.
             loop.call_soon(loop.call_soon, self._flush, wait_s)
 
     def _flush(self, wait_s: float) -> None:
@@ -415,7 +415,7 @@ class Hub:
                     self._ask_round_trip([client], frame.origin[0], now_us)
 
     def _tick(self) -> None:
-        # First, so that the next tick follows whatever happens below.
+        # Scheduled first, so that the next tick follows even if an error is raised below.
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
         now_us = self.now_us()
         self._fanout.settle()
@@ -427,7 +427,7 @@ class Hub:
         self._router.links.expire(now_us)
         self._fanout.thin(now_us)
         interval_us = round(self.settings.ping_interval_s * US_PER_S)
-        # One at a tick: either takes as long as several frames.
+        # One of the two per tick: each takes as long as several frames.
         if now_us - self._alerts_us >= US_PER_S:
             self._alerts_us = now_us
             self._report_alerts(now_us)
@@ -478,7 +478,7 @@ class Hub:
 
 
 def _new_forwarding() -> Forwarding:
-    """Return the memory of the compiled step; a warning says so if there is none."""
+    """Return the memory of the compiled step; log a warning if the step is missing."""
     forwarding = Forwarding()
     if forwarding.problem is not None:
         log.warning("%s; Python forwards, at less than half the speed", forwarding.problem)

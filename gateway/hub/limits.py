@@ -3,9 +3,9 @@
 Theory of operation. Requests wait in a bounded queue for each client and are taken in turn: a
 client that asks a thousand times a second delays only itself. Answers are limited by a token
 bucket for each client, in bytes, which fills at a steady rate: a request costs what reading it
-costs, each byte of an answer costs one, and no request is taken of a client whose level is
-negative. All untrusted clients share a single small bucket, because one that is refused could
-return from another address.
+costs, each byte of an answer costs one, and no request is taken from a client whose level is
+negative. All untrusted clients share a single small bucket, because a refused one could return
+from another address.
 
 What a ground station does in a session (a parameter list, files of metadata, a mission of two
 thousand items) fits into a full bucket; the rate matters only after that.
@@ -19,15 +19,15 @@ from gateway.records import Incoming
 from gateway.units import US_PER_S
 
 REQUEST_COST: Final = 200
-"""Bytes: decoding a request and building its answer takes as long as sending this many."""
+"""Cost of a request, bytes: reading and answering it takes as long as sending this many."""
 CLIENT_RATE: Final = 80_000
-"""Bytes a second: 400 requests, a few percent of a processor."""
+"""Refill of a client's bucket, bytes a second: 400 requests, a few percent of a processor."""
 CLIENT_BURST: Final = 400_000
 UNTRUSTED_RATE: Final = 20_000
 UNTRUSTED_BURST: Final = 200_000
-"""The start-up traffic of three ground stations on tablets."""
+"""Bucket of the untrusted, bytes: the start-up traffic of three ground stations on tablets."""
 MAX_WAITING: Final = 64
-"""Requests of a client; one that waits for its answers has one or two."""
+"""Maximum waiting requests of a client; one that waits for its answers has one or two."""
 SLACK_SHIFT: Final = 2
 """A limited frame may be a quarter of its interval early, or jitter would halve the rate."""
 
@@ -39,9 +39,9 @@ class TokenBucket:
     rate: int
     """Bytes a second added."""
     burst: int
-    """Most that it holds."""
+    """Capacity, bytes."""
     level: float
-    """Present content; may be negative."""
+    """Present content, bytes; may be negative."""
     filled_us: int = 0
     """Time of the last refill."""
 
@@ -58,7 +58,7 @@ class TokenBucket:
 
 @dataclass(slots=True, eq=False)
 class _Line:
-    """One client's requests."""
+    """Waiting requests of one client."""
 
     bucket: TokenBucket
     waiting: deque[Incoming] = field(default_factory=deque)
@@ -97,7 +97,7 @@ class RequestQueue:
         return None
 
     def wait_us(self, now_us: int) -> int | None:
-        """Return how long until `take` gives something; None if the queue is empty."""
+        """Return the time until `take` returns a request; None if the queue is empty."""
         for line in self._turns.values():
             line.bucket.refill(now_us)
         return min((line.bucket.wait_us() for line in self._turns.values()), default=None)
@@ -137,7 +137,7 @@ class RateLimit:
         return True
 
     def change(self, interval_us: int) -> None:
-        """Apply another interval to the next frame already."""
+        """Apply another interval from the next frame on."""
         if self.due_us:
             self.due_us += interval_us - self.interval_us
         self.interval_us = interval_us

@@ -18,9 +18,9 @@ from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
 PROBE_COMPONENT: Final = dialect.MAV_COMP_ID_USER75
-"""Of the ids for private use the last one: mavros and Cockpit are 240, the UDP bridge."""
+"""The last id for private use; MAVROS and Cockpit use 240, that of the UDP bridge."""
 MAX_ASKED: Final = 64
-"""Rounds whose answers are recognized: a minute of them, one a second."""
+"""Rounds whose answers are recognised: those of a minute, one a second."""
 LONGEST_US: Final = 60 * US_PER_S
 """An answer to an older request is ignored."""
 NOBODY: Final = 0

@@ -36,9 +36,9 @@ from gateway.wire.mavlink_splitter import MavFrame, frame_of
 from gateway.wire.system_ids import LAST_ID
 
 UNADDRESSED_REQUESTS: Final = frozenset({HEARTBEAT_ID, dialect.MAVLINK_MSG_ID_TIMESYNC})
-"""Messages without a target that our vehicles handle, whoever sends them."""
+"""Messages without a target that our vehicles handle, from any sender."""
 MAX_UNTRUSTED_SYSTEMS: Final = 8
-"""Systems that are shown for an untrusted client."""
+"""Maximum systems that are shown for an untrusted client."""
 
 
 class Router:
@@ -92,7 +92,7 @@ class Router:
         return tuple(text for each in systems if (text := self._cache.describe(each, now_us)))
 
     def routed_vehicles(self) -> set[int]:
-        """Return the systems of trusted clients that are no ground stations."""
+        """Return the systems of trusted clients that are not ground stations."""
         return {
             origin[0]
             for client_id in self._clients
@@ -156,7 +156,7 @@ class Router:
             return
         is_rejected = path is not None and self._is_rejected(client, path, frame, now_us)
         if is_of_gateway(frame):
-            # For each link separately, copies or not, and never forwarded.
+            # Answered on each link, copies too, and never forwarded.
             self._ask(client, frame, forwarded=False)
         elif is_rejected:
             return
@@ -166,7 +166,7 @@ class Router:
             self._route_broadcast(client, path, frame, table.is_station(origin), now_us)
 
     def _lets_in(self, client: Client, frame: MavFrame, now_us: int) -> bool:
-        """Return whether the filter of an endpoint lets a frame of it pass."""
+        """Return whether the filter of a client's endpoint passes a frame received from it."""
         tables, own = (self._table, self._untrusted), self._vehicles.systems(now_us)
         from_station = any(table.is_station(frame.origin) for table in tables)
         if frame.message_id == HEARTBEAT_ID:
@@ -181,14 +181,14 @@ class Router:
         )
 
     def _reaches(self, client: Client, frame: MavFrame, other_id: int) -> bool:
-        """Return whether a broadcast may be sent to another client, by the filter of its own."""
+        """Return whether the filter of its source allows a broadcast to reach another client."""
         allowed = client.endpoint.systems
         if not allowed or not commands(frame.message_id):
             return True
         return all(map(allowed.has_system, self._table.vehicles(other_id)))
 
     def clash_notes(self, now_us: int) -> dict[int, str]:
-        """Return by client how to distinguish its vehicle from another with the same id."""
+        """Return, by client, a text on how to separate its vehicle from another of the same id."""
         notes: dict[int, str] = {}
         origins = (each for key in self._clients for each in self._table.origins(key))
         taken = {system for system, _ in origins} | {*self._vehicles.systems(now_us)}
@@ -205,7 +205,7 @@ class Router:
         return notes
 
     def _is_rejected(self, client: Client, path: SystemPath, frame: MavFrame, now_us: int) -> bool:
-        """Return whether a frame is a copy, or late; only one with several paths can be."""
+        """Return whether a frame is a copy, or late; its system then has several paths."""
         client_id = client.client_id
         if not client.trusted:
             return False
@@ -226,7 +226,7 @@ class Router:
         return True
 
     def _register_link(self, first: int, client: Client, frame: MavFrame, now_us: int) -> None:
-        """Join two links that bring the same frame, if neither can have it from us."""
+        """Pair two links that bring the same frame, if neither can have received it from us."""
         for_us = frame.target[0] in self._vehicles.systems(now_us)
         if not (for_us or is_of_gateway(frame)):
             return
@@ -237,7 +237,7 @@ class Router:
                 self._ask(client, frame, forwarded=False)
 
     def _keep(self, client: Client, frame: MavFrame, now_us: int) -> None:
-        """Keep the answers of a client's vehicles, if its endpoint says so."""
+        """Keep the answers of a client's vehicles, if its endpoint has the option `cache`."""
         if client.endpoint.cache and client.trusted:
             request = self._cache.add(frame, now_us)
             if request is not None:
@@ -246,7 +246,7 @@ class Router:
     def _ask_cache(
         self, client: Client, frame: MavFrame, clients: list[int], now_us: int
     ) -> MavFrame | None:
-        """Answer a request by kept answers; return what the vehicle must get."""
+        """Answer a request by kept answers; return the frame for the vehicle, if still needed."""
         kept = all(self._clients[key].endpoint.cache for key in clients)
         answers, passed = self._cache.handle(
             client.client_id,
@@ -363,7 +363,7 @@ class Router:
             if wait_us is not None:
                 self._pause = loop.call_later(wait_us / US_PER_S, self._serve)
             return
-        # Before it is answered, so that one that raises does not hold up the others.
+        # Scheduled before the answer, so that a request that raises does not delay the others.
         self._turn = loop.call_soon(self._serve)
         self._serving = incoming.client_id
         try:

@@ -27,18 +27,18 @@ Origin = tuple[int, int]
 """System and component id."""
 
 MAX_ORIGINS: Final = 256
-"""Per client: every system there can be, or fewer with several components each."""
+"""Maximum per client: every possible system id, or fewer with several components each."""
 ROUTE_FRESH_US: Final = 10 * US_PER_S
 """A path on which a system was received this recently is preferred to stale ones."""
 MEMORY_US: Final = 30 * US_PER_S
 """Duplicates are recognised for this long: longer than a congested mobile network delays them."""
 REPEAT_US: Final = US_PER_S
-"""Copies of a frame by the same path arrive within a radio's delay."""
+"""Maximum delay of a copy of a frame on the same path: that of a radio."""
 MEMORY_OF_ONE: Final = 224
-"""Frames of a component; 256 frames later one of the same content has the same number and so the
-same bytes."""
+"""Frames of a component after which the same bytes may be a new frame: sequence numbers repeat
+after 256 frames, lost ones included."""
 MEMORY_FRAMES: Final = 32_768
-"""Per generation, of some 200 bytes each: half a minute at 1000 frames a second, 13 MB in all."""
+"""Maximum per generation, some 200 bytes each: half a minute at 1000 frames a second, 13 MB."""
 NEIGHBOURS: Final = 8
 """Sequence numbers before and after a frame that show whether it is late."""
 
@@ -47,17 +47,17 @@ LATE: Final = 0
 """Results of `DuplicateFilter.check`; client ids are positive."""
 
 REPORTED_US: Final = 3 * US_PER_S
-"""Most vehicles send such messages several times a second."""
+"""Maximum age of a start time: most vehicles send messages with it several times a second."""
 SAME_START_US: Final = 5 * US_PER_S
-"""Difference of start times that no delay of a link explains; two vehicles are seldom switched on
-at the same moment."""
+"""Difference of start times beyond which they are two vehicles: no link delays by so much, and two
+are seldom switched on at the same moment."""
 
 Note = TypeVar("Note")
 LINKED_US: Final = 60 * US_PER_S
-"""Without a further copy for so long, it was chance, or one of the two links has gone."""
+"""A pair ends after this time without a copy: it was chance, or one of the links has gone."""
 HEARTBEAT_ID, HOME_POSITION_ID = MESSAGE_IDS["HEARTBEAT"], MESSAGE_IDS["HOME_POSITION"]
 GREETING: Final = (HEARTBEAT_ID, HOME_POSITION_ID)
-"""In this order: a vehicle exists, and its home."""
+"""Messages of a greeting, in this order: the vehicle exists, and its home."""
 OWN_FRESH_US: Final = 5 * US_PER_S
 """A system whose heartbeat we have not sent for so long is no longer ours: a playback ended."""
 
@@ -72,7 +72,7 @@ class FrameStream:
     newest_us: int = 0
     """When the newest frame was sent, as estimated by the lag of its path."""
     sent_us: "array[int]" = field(default_factory=lambda: array("q", bytes(8 * 256)))
-    """The same of the newest frame with each sequence number; 0 for none."""
+    """The same for the newest frame of each sequence number; 0 for none."""
 
     def accept(self, sequence: int, client_id: int, sent_us: int) -> None:
         """Register a frame that is neither a copy nor late."""
@@ -85,7 +85,7 @@ class FrameStream:
         """Return whether the frames after a number were accepted more than a limit ago.
 
         The number is behind the newest one if a following number was seen later than a preceding
-        one; of a number ahead, the following were seen one turn of the counter ago.
+        one; of a number ahead, the following ones were seen one cycle of the counter ago.
         """
         after = self._nearest(sequence, 1)
         return after > self._nearest(sequence, -1) and self.newest_us - after > limit_us
@@ -99,10 +99,10 @@ class FrameStream:
 
 @dataclass(slots=True)
 class SystemPath:
-    """One system as one client brings it."""
+    """One system as received from one client."""
 
     since_us: int
-    """Its first frame after a timeout."""
+    """Time of its first frame after a timeout."""
     heard_us: int
     stream: FrameStream = field(default_factory=FrameStream)
     """Frames of the system on all its paths."""
@@ -115,7 +115,7 @@ class SystemPath:
     is_vehicle: bool = False
     """Whether telemetry was received on this path."""
     booted_us: int | None = None
-    """When the system started, by the newest frame with its time since then."""
+    """When the system started, computed from the newest frame with its time since start."""
     booted_heard_us: int = 0
     """When that frame was received."""
 
@@ -127,7 +127,7 @@ class SystemPath:
             self.stream.newest_us, self.stream.leader = heard_us, client_id
 
     def note_boot(self, frame: MavFrame, now_us: int) -> None:
-        """Compute when the system started, if a frame contains its time since then."""
+        """Compute when the system started, if a frame contains its time since start."""
         booted_us = boot_time_us(frame, now_us)
         if booted_us is not None:
             self.booted_us, self.booted_heard_us = booted_us, now_us
@@ -135,7 +135,7 @@ class SystemPath:
     def is_another_vehicle(self, other: "SystemPath", now_us: int) -> bool:
         """Return whether another path of the same id leads to another vehicle.
 
-        Both bring frames, none of them a copy, and the two have not started at the same time.
+        Frames arrive on both, none of them a copy, and the two start times differ.
         """
         if self.booted_us is None or other.booted_us is None:
             return False
@@ -156,7 +156,7 @@ class SystemPath:
 
 
 class RoutingTable:
-    """The client from which the frames of each system came.
+    """The clients from which frames of each system were received.
 
     `changed` is called when cached routes may be wrong: a system has one path more, or fewer. Of
     more than `max_origins` systems of a client, the one received longest ago is replaced.
@@ -207,16 +207,16 @@ class RoutingTable:
         ]
 
     def vehicles(self, client_id: int) -> set[int]:
-        """Return the systems of a client that have sent telemetry and are no ground stations."""
+        """Return the systems of a client that have sent telemetry and are not ground stations."""
         paths = self._of_client.get(client_id, {})
         return {
             origin[0] for origin, path in paths.items() if path.is_vehicle and not path.is_station
         }
 
     def clashes(self, now_us: int) -> dict[int, tuple[int, int]]:
-        """Return the clients with a system whose id another vehicle has too.
+        """Return the clients with a vehicle whose id an earlier vehicle of another client has.
 
-        Each has the system, and the client that brought that id first.
+        The value is the system id, and the client from which that id was received first.
         """
         found: dict[int, tuple[int, int]] = {}
         for origin, paths in self._to.items():
@@ -237,9 +237,10 @@ class RoutingTable:
         return tuple(self._of_client.get(client_id, ()))
 
     def clients_to(self, target: Origin, source_id: int, now_us: int) -> list[int]:
-        """Return the clients that recently brought exactly this component, else this system.
+        """Return the clients from which this component, else this system, was received recently.
 
-        Stale ones only if there is no other, and never the sender. Component 0 is all of it.
+        Stale clients are returned only if there is no other, the sender never. Component 0 is the
+        whole system.
         """
         exact = [target] if target[1] and self._to.get(target, {}).keys() - {source_id} else []
         for origins in (exact, [origin for origin in self._to if origin[0] == target[0]]):
@@ -318,8 +319,8 @@ class DuplicateFilter:
         self._memory: FrameMemory[tuple[int, int, int, int, bool]] = FrameMemory(
             MEMORY_US, MEMORY_FRAMES
         )
-        """When a frame was sent and received, by which client, as which of its stream, and whether
-        its bytes were accepted before."""
+        """Times at which a frame was sent and received, its client, its number in the stream, and
+        whether the same bytes were accepted before."""
 
     def check(
         self, frame: MavFrame, client_id: int, path: SystemPath, now_us: int, limit_us: int

@@ -21,8 +21,8 @@ Answers that a client waits for, heartbeats and texts are never thinned; their b
 from the bandwidth first. If even the floors do not fit they are all lowered alike, so that no
 message stops. A radio reports in RADIO_STATUS how full its own buffer is, since the air carries
 less than the serial line: the used share of the bandwidth decreases while the buffer fills and
-increases again slowly. A link of a few bytes a second gets HIGH_LATENCY2 alone, which carries a
-whole vehicle in 54 bytes.
+increases again slowly. A link of a few bytes a second gets HIGH_LATENCY2 alone, which summarises
+the state of a vehicle in 54 bytes.
 """
 
 import math
@@ -62,27 +62,27 @@ IMPORTANCE: Final[dict[int, float]] = {
     dialect.MAVLINK_MSG_ID_ATTITUDE: 2.0,
     dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 2.0,
 }
-"""Others have 1: position and health come first, then motion."""
+"""Importance of messages; that of others is 1. Position and health come first, then motion."""
 FLOOR_HZ: Final = 0.5
 LEAST_FLOOR_SHARE: Final = 0.1
 """Part of this rate that is sent even where answers use all of the bandwidth."""
 LEAST_FLOW: Final = 1e-3
 """Bytes a second below which a kind of frame counts as ended."""
 SMOOTHING: Final = 0.3
-"""Weight of the newest second."""
+"""Weight of the newest second in the moving averages."""
 FULL_PERCENT: Final = 20
 LOW_PERCENT: Final = 50
 FREE_PERCENT: Final = 90
-"""Free part of a radio's buffer at which it is used less, a little less, and more again; as
-autopilots do."""
+"""Free percentages of a radio's buffer: below the first two the used share decreases by much or by
+little, above the last it increases, as in autopilots."""
 LEAST_SHARE: Final = 0.05
 STEPS: Final = 20
-"""Of the bisection: the factor to a millionth."""
+"""Steps of the bisection, which give the factor to a millionth."""
 
 Key = bytes
 """System, component and message of a frame, as in `MavFrame.key`."""
 ANSWER_IDS: Final = ids_of("HEARTBEAT", "COMMAND_INT", "COMMAND_LONG", "COMMAND_ACK", "STATUSTEXT")
-"""The next one does not replace a lost one."""
+"""Messages of which the next one does not replace a lost one."""
 URGENT_IDS: Final = ids_of(
     *("ATTITUDE", "ATTITUDE_QUATERNION", "ATTITUDE_QUATERNION_COV"),
     *("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"),
@@ -104,9 +104,9 @@ BULK_IDS: Final = ids_of(
 NOT_TELEMETRY_IDS: Final = ANSWER_IDS | BULK_IDS
 """Messages that are never dropped while there is room, because they are not repeated."""
 BULK_BYTES: Final = 16_384
-"""Least room for bulk: the parameters of three aircraft."""
+"""Least size of the bulk queue, bytes: the parameters of three aircraft."""
 URGENT_RUN: Final = 4
-"""Urgent frames in a row before a frame of another queue."""
+"""Maximum urgent frames in a row before a frame of another queue."""
 SEQUENCE_MASK: Final = 0xFF
 _Queue = deque[tuple[MavFrame, int | None, int]]
 """Frames, their steps (see `Numbering`), and the time at which they were added."""
@@ -117,7 +117,7 @@ class Bandwidth:
 
     def __init__(self, bytes_per_s: int) -> None:
         self.share = 1.0
-        """Part of the bandwidth that the radio behind it accepts."""
+        """Share of the bandwidth that the radio of the link accepts."""
         self.bytes_per_s = bytes_per_s
         self._offered: dict[Key, tuple[int, float, float]] = {}
         """Message id, and smoothed frames and bytes a second."""

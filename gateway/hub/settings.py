@@ -6,13 +6,13 @@ from gateway.hub.endpoint import EndpointKind, parse_endpoint
 from gateway.settings import Settings, setting
 
 SOURCES: Final = frozenset({EndpointKind.SERIAL, EndpointKind.TCP, EndpointKind.UDP_LISTEN})
-"""Kinds by which autopilots are connected."""
+"""Kinds of endpoint to which autopilots connect."""
 ENDPOINTS: Final = ("udp:127.0.0.1:14550", "udp-listen:127.0.0.1:14551")
-"""The default."""
+"""Default endpoints."""
 
 
 class HubSettings(Settings, frozen=True):
-    """Where MAVLink goes to and comes from."""
+    """Endpoints and limits of the hub."""
 
     endpoints: Annotated[
         tuple[str, ...],

@@ -11,9 +11,9 @@ from gateway.units import US_PER_S
 
 WINDOW_US: Final = 60 * US_PER_S
 ALERT_AFTER_US: Final = 5 * US_PER_S
-"""A shorter outage is not announced."""
+"""Shortest announced outage."""
 SLOW_FOR_US: Final = 30 * US_PER_S
-"""A client that has dropped nothing for so long is no longer slow."""
+"""A client that has dropped nothing for this time is no longer slow."""
 ALERT_STATES: Final = {
     "unreachable": "unreachable",
     "resolving": "its address is not known",
@@ -22,7 +22,7 @@ ALERT_STATES: Final = {
 """Texts used without a reason. `refused` is not among them: a ground station that is not running
 is not unusual."""
 ALERTS_IN_FULL: Final = 3
-"""Alerts of listening ports' clients that are passed on one by one in a minute."""
+"""Maximum alerts of listening ports' clients that are passed on one by one in a minute."""
 Key = int | str
 """Id of a client, or URL of a listening port."""
 
@@ -34,7 +34,7 @@ class ClientCounters:
     sent: int = 0
     dropped: int = 0
     unheard: int = 0
-    """Sent to a port on which nobody listens, or withheld from an unproven client."""
+    """Frames sent to a port on which nobody listens, or withheld from an unproven client."""
     bytes_sent: int = 0
     received: int = 0
     bytes_received: int = 0
@@ -122,7 +122,7 @@ class HubCounters:
 
 
 class LogRateLimiter:
-    """Lines of one kind: `in_full` of each minute as they are, the number of others with `rest`."""
+    """Pass `in_full` lines of each minute; count the others, reported with the text `rest`."""
 
     def __init__(self, in_full: int, rest: str) -> None:
         self._in_full = in_full
@@ -160,7 +160,7 @@ class ClientAlerts:
         self._notes: dict[int, tuple[str, int | None]] = {}
         """The note of each client, and since when it waits to be announced."""
         self._dropped: dict[int, int] = {}
-        """Drops at the last look, of clients that were open then."""
+        """Drop counts of the clients that were open at the last update."""
         self._slow_until_us: dict[int, int] = {}
         self._limiter = LogRateLimiter(ALERTS_IN_FULL, "more alerts of clients of listening ports")
 

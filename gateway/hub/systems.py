@@ -13,7 +13,7 @@ from a link with a filter must not reach an excluded vehicle: it is sent only to
 Frames without a target field, such as a heartbeat, command nothing.
 
 A renumbered frame is another frame: it gets a new checksum, and a new signature if its own is
-genuine by a key that the gateway has. Otherwise it is refused: nobody else may sign it.
+genuine by a key that the gateway has. Otherwise it is refused, since the gateway cannot sign it.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ from gateway.wire.system_ids import LAST_ID, rename_systems
 HARMLESS: Final = ids_of("TIMESYNC", "PING")
 """Messages with a target field that command nothing."""
 MAX_NEIGHBOURS: Final = 64
-"""Other systems and components of a link that are known by their heartbeats."""
+"""Maximum other systems and components of a link that are known by their heartbeats."""
 WAITS: Final = "as=: no autopilot has sent a heartbeat on this link so far"
 FILTER_OPTIONS: Final = ("systems", "not-systems", "components")
 
@@ -81,7 +81,7 @@ class SystemFilter:
     def lets_send(self, message_id: int, target: Origin) -> bool:
         """Return whether a message addresses only what passes, or commands nothing.
 
-        Some messages name no component: they are for the autopilot.
+        Messages without a target component are for the autopilot.
         """
         if not target[0]:
             return not commands(message_id)
@@ -118,9 +118,9 @@ def ids_from(option: str, text: str) -> frozenset[int]:
 
 
 def new_ids_from(text: str) -> dict[int, int]:
-    """Read the option `as`: `LINK:HERE` of each system, or only the id here of the one vehicle.
+    """Read the option `as`: `LINK:HERE` for each system, or the id here of the only vehicle.
 
-    Returns the ids here by those of the link; 0 is the one vehicle. Raises ValueError.
+    Returns the ids here by those of the link; the key 0 is the only vehicle. Raises ValueError.
     """
     found: dict[int, int] = {}
     for part in filter(None, text.split(",")):
@@ -154,7 +154,7 @@ class SystemTranslation:
     renewal : callable
         Returns the signer of a changed frame; None if no key of the gateway fits its signature.
     on_change : callable
-        Called when the one vehicle is found: routes have to be made again.
+        Called when the only vehicle is found, because all routes are then outdated.
     """
 
     new_ids: dict[int, int]
@@ -168,8 +168,8 @@ class SystemTranslation:
     """Ids of the link by those of this side."""
     _here: dict[int, int] = field(default_factory=dict)
     _neighbours: set[Origin] = field(default_factory=set)
-    _heard_us: int = 0
-    """When the one vehicle was heard last."""
+    _received_us: int = 0
+    """When a frame of the only vehicle was received last."""
 
     def __post_init__(self) -> None:
         """Use all ids that are known already."""
@@ -189,7 +189,7 @@ class SystemTranslation:
         return self._link.get(system, system)
 
     def has_room_for(self, system: int) -> bool:
-        """Return whether no other system has the id of this one on the link."""
+        """Return whether the id of a system is not used by another one on the link."""
         return system in self._link or system not in self._here
 
     def from_link(self, frame: MavFrame, now_us: int) -> MavFrame | None:
@@ -225,17 +225,17 @@ class SystemTranslation:
         return None
 
     def _finds_vehicle(self, frame: MavFrame, now_us: int) -> bool:
-        """Find the one vehicle; return whether the sender of a frame is known by a heartbeat."""
+        """Find the only vehicle; return whether a frame can be translated already."""
         origin = frame.origin
         if frame.message_id == HEARTBEAT_ID and origin[0] not in self._here:
             if not frame.is_autopilot_heartbeat:
                 if len(self._neighbours) < MAX_NEIGHBOURS:
                     self._neighbours.add(origin)
-            elif not self._here or now_us - self._heard_us > ROUTE_FRESH_US:
+            elif not self._here or now_us - self._received_us > ROUTE_FRESH_US:
                 self._use({origin[0]: self.new_ids[0]})
                 self.reason = ""
                 self.on_change()
         if origin[0] in self._here:
-            self._heard_us = now_us
+            self._received_us = now_us
             return True
         return bool(self._here) or origin in self._neighbours

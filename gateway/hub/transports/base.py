@@ -47,9 +47,9 @@ UNTRUSTED_READ_RATE: Final = 64_000
 processor. The rest waits with the sender, or is lost in the kernel."""
 UNTRUSTED_READ_BURST: Final = 256_000
 VERSION_PROBE_US: Final = 5 * US_PER_S
-"""Several heartbeats of the client."""
+"""Time for which a client of version 1 is sent version 2: several heartbeats of the client."""
 RETRY_US: Final = US_PER_S
-"""Between attempts to reopen a socket."""
+"""Interval of attempts to reopen a socket."""
 
 OnForeign = Callable[[Sequence[bytes]], None]
 """Called with frames of other systems that are forwarded, in their order."""
@@ -63,7 +63,7 @@ FEW: Final = 4
 
 @contextmanager
 def new_socket(family: int, kind: int) -> Iterator[socket.socket]:
-    """Give a socket that does not block; it is closed if the block of `with` raises."""
+    """Yield a non-blocking socket; it is closed if the `with` block raises."""
     sock = socket.socket(family, kind)
     try:
         sock.setblocking(False)
@@ -100,7 +100,7 @@ class HubContext(Protocol):
         """Route one received frame for which there is no cached route."""
 
     def finish_run(self, now_us: int) -> None:
-        """Do for a run of frames what the compiled step has left."""
+        """Complete the forwarding of a run: the part that the compiled step leaves to Python."""
 
     def appear(self, client: "Client") -> None:
         """Add a client."""
@@ -143,7 +143,7 @@ class Targets:
         self._send_others(frame, now_us)
 
     def finish(self, run: list[bytes], failures: list[list[int]], now_us: int) -> None:
-        """Do for a run of frames what the compiled step has left."""
+        """Complete the forwarding of a run: the part that the compiled step leaves to Python."""
         for index, sent, *failure in failures:
             self.direct[index].send_rest(run[sent:], *failure)
         if self.others:
@@ -333,13 +333,13 @@ class Client:
         self.context.reconfigure(self)
 
     def prove(self) -> None:
-        """Note that a frame from it depends on one that it was sent, so that it does receive."""
+        """Note that it does receive, because a frame from it depends on one sent to it."""
 
     def tick(self, now_us: int) -> None:
         """Reconnect and expire; called a few times a second."""
 
     def _is_retry_due(self, now_us: int) -> bool:
-        """Return whether the last True is `RETRY_US` ago."""
+        """Return True at most once in `RETRY_US`."""
         if now_us < self._retry_us:
             return False
         self._retry_us = now_us + RETRY_US
@@ -352,7 +352,7 @@ class Client:
 
     @property
     def last_us(self) -> int:
-        """When it was received last, or else appeared."""
+        """When a frame from it was received last, or else when it was added."""
         return self.since_us if self.heard_us is None else self.heard_us
 
     @property
@@ -390,7 +390,7 @@ class Client:
         return self.is_mavlink1 != before
 
     def send_rest(self, frames: Iterable[bytes], number: int, part: int) -> None:
-        """Send what the compiled step has not sent, though it counts it as sent.
+        """Send the frames that the compiled step counted as sent but did not send.
 
         `number` is that of the first frame's error, and `part` the bytes of it that were sent.
         """
@@ -426,7 +426,7 @@ class Client:
             self.context.deliver(self, frame, now_us)
 
     def go_on(self, step: Callable[[], None], now_us: int) -> None:
-        """Process what the compiled step leaves to Python, until all bytes read are processed."""
+        """Call the step again, and process the frames it leaves to Python, until none is left."""
         work = self.context.forwarding.work
         while (status := work[kernel.STATUS]) & (kernel.RUN_SENT | kernel.HAND_OVER):
             if status & kernel.RUN_SENT:
@@ -434,7 +434,7 @@ class Client:
             if status & kernel.HAND_OVER:
                 self._take_over(now_us)
             if self.words[kernel.INPUT] < 0:
-                # Closed meanwhile.
+                # Closed by one of the frames.
                 return
             step()
 
@@ -467,7 +467,7 @@ class Client:
         self.counters.bytes_garbage += size
 
     def limit_reads(self, sock: socket.socket, read: Callable[[], None], size: int) -> None:
-        """Stop reading for a while from an untrusted client, if all such sent too much."""
+        """Stop reading for a while from an untrusted client, if they all together sent too much."""
         if self.trusted:
             return
         self.context.untrusted_reads.level -= size
@@ -477,7 +477,7 @@ class Client:
 
     def _read_later(self, sock: socket.socket, read: Callable[[], None]) -> None:
         if sock.fileno() < 0:
-            # Closed meanwhile.
+            # Closed during the pause.
             return
         if pause_us := self.read_pause_us():
             self.loop.call_later(pause_us / US_PER_S, self._read_later, sock, read)
@@ -493,7 +493,7 @@ class Client:
     def stats(
         self, systems: tuple[Origin, ...], note: str = "", cached: tuple[str, ...] = ()
     ) -> ClientStats:
-        """Return the present figures; systems, note and kept answers are known to the hub."""
+        """Return the present figures; the hub passes systems, note and kept answers."""
         renumbering = self.renumbering
         counters = {name: getattr(self.counters, name) for name in ClientCounters.__slots__}
         return ClientStats(

@@ -24,16 +24,17 @@ UNPROVEN: Final = "unproven"
 SENDING: Final = ("open", UNPROVEN)
 NOBODY_LISTENS: Final = "nobody listens there"
 RECEIVE_BUFFER_BYTES: Final = 1 << 20
-"""The default holds only about 256 small datagrams; a parameter upload bursts more."""
+"""Receive buffer of a socket: the default holds only some 256 small datagrams; a parameter upload
+sends more at once."""
 IP_PKTINFO: Final = 8
-"""Not exported by `socket` before Python 3.14; gives the local address of a datagram."""
+"""Option for the local address of a datagram; `socket` exports it only from Python 3.14 on."""
 BACKLOG_DATAGRAMS: Final = 256
-"""Most datagrams that wait for a full socket buffer: older ones are of no use."""
+"""Maximum datagrams that wait for a full socket buffer: older ones are of no use."""
 UNPROVEN_FACTOR: Final = 10
 """Bytes sent for each byte received, to a peer that has not proven that it receives: a heartbeat of
 a station pays for a vehicle's heartbeat and home, which is all that it waits for."""
 HEARTBEAT_RESERVE: Final = 42
-"""Bytes of these that only heartbeats may use, or telemetry would leave no room for them."""
+"""Part of that allowance for heartbeats only, bytes: telemetry would leave no room for them."""
 UNPROVEN_IDLE_US: Final = 5 * US_PER_S
 """A peer that has not proven that it receives is removed after this time without a frame."""
 
@@ -132,7 +133,7 @@ class DatagramClient(Client):
         self._update_plain()
 
     def _update_plain(self) -> None:
-        """Let Python process the next datagram if it is to change the state or ends a frame."""
+        """Let Python process the next datagram if it may change the state or complete a frame."""
         self.words[kernel.IS_PLAIN] = self.state in SENDING and not self.splitter
 
     def accept_rest(self, data: bytes, now_us: int) -> None:
@@ -157,7 +158,7 @@ class DatagramClient(Client):
         self.refused_us = None
 
     def send_rest(self, frames: Iterable[bytes], number: int, part: int) -> None:  # noqa: ARG002
-        """Send what the compiled step has not sent, though it counts it as sent."""
+        """Send the frames that the compiled step counted as sent but did not send."""
         for data in frames:
             self._count_sent(-1, -len(data))
             if number:
@@ -261,7 +262,7 @@ class DatagramClient(Client):
         return read
 
     def _end_read(self, sock: socket.socket) -> None:
-        """Handle an error, and keep what there is no time for in this turn of the loop."""
+        """Handle an error, and keep unread datagrams for a later turn of the loop."""
         forwarding = self.context.forwarding
         if forwarding.work[kernel.STATUS] & kernel.ERROR:
             self._note_read_error(forwarding.work[kernel.ERROR_NUMBER])

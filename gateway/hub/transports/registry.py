@@ -1,4 +1,4 @@
-"""Which transport serves which kind of endpoint."""
+"""The transport of each kind of endpoint."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, Final

@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 READ_BYTES: Final = 4096
 AHEAD_US: Final = 30_000
-"""Most time on the line that is in the driver's buffer: keeps the line busy between wake-ups."""
+"""Maximum content of the driver's buffer as time on the line: keeps it busy between wake-ups."""
 QUEUE_US: Final = US_PER_S
 """Size of the queue as time on the line; older telemetry is of no use on a radio."""
 MIN_QUEUE_BYTES: Final = 2048
@@ -42,7 +42,7 @@ class SerialClient(QueuedClient):
 
     @property
     def queue_bytes(self) -> int:
-        """Most bytes that wait for the line."""
+        """Maximum bytes that wait for the line."""
         bytes_per_s = self.endpoint.port / BITS_PER_BYTE
         return max(MIN_QUEUE_BYTES, round(bytes_per_s * QUEUE_US / US_PER_S))
 

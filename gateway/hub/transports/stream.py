@@ -20,9 +20,9 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter, frame_of
 
 ACCEPT_AGAIN_S: Final = 1.0
-"""After which a connection is accepted that could not be."""
+"""Delay after which a failed accept is repeated, s."""
 CHUNK_BYTES: Final = 4096
-"""Joined into one write while a queue drains."""
+"""Maximum bytes joined into one write while a queue drains."""
 SLOW_CHUNK_BYTES: Final = 512
 """The same for a slow connection: joined frames can no longer be overtaken."""
 USER_TIMEOUT_MS: Final = 30_000
@@ -34,11 +34,11 @@ UNSENT_BYTES: Final = 2048
 JOINED_BYTES: Final = 1024
 """The kernel joins unsent writes, and checks `UNSENT_BYTES` only when it starts another segment."""
 SLOW_AFTER_US: Final = US_PER_S
-"""A connection that needs longer to drain its queue is slow; after a stall it is faster."""
+"""A connection that needs longer to drain its queue is slow; after a stall it drains faster."""
 FRESH_US: Final = US_PER_S // 2
-"""Telemetry that has waited longer is not sent to a slow one."""
+"""Telemetry that has waited longer is not sent on a slow connection."""
 ACCEPT_BACKLOG: Final = 128
-"""Connections that wait in the kernel, since each wake-up accepts one: pages that all reconnect."""
+"""Connections that may wait in the kernel, as when all pages reconnect: a wake-up accepts one."""
 
 
 def accept_each(
@@ -48,8 +48,8 @@ def accept_each(
 ) -> None:
     """Accept the connections of a socket until it is closed; needs a running event loop.
 
-    While there are no file descriptors left, a waiting connection would wake the loop for ever, so
-    the socket is left alone meanwhile.
+    Without free file descriptors a waiting connection would wake the loop for ever, so the socket
+    is then not watched for `ACCEPT_AGAIN_S`.
 
     Parameters
     ----------
@@ -110,13 +110,13 @@ class QueuedClient(Client):
         return self.context.is_own((self._system_here(origin[0]), origin[1]))
 
     def feed(self, data: bytes, now_us: int) -> None:
-        """Process a chunk of the stream: frames with compiled routes by the step."""
+        """Process a chunk of the stream; the compiled step forwards frames with known routes."""
         forwarding = self.context.forwarding
         if not self.routes or not forwarding.is_compiled:
             self.accept_rest(data, now_us)
             return
         rest = self._splitter.take()
-        # They are counted again.
+        # These bytes will be counted again.
         self.counters.bytes_received -= len(rest)
         forwarding.load(rest + data, now_us)
         self._step()
@@ -128,7 +128,7 @@ class QueuedClient(Client):
 
     @property
     def queue_bytes(self) -> int:
-        """Most bytes that wait."""
+        """Maximum bytes that wait."""
         return self.context.settings.queue_bytes
 
     @property
@@ -167,7 +167,7 @@ class StreamClient(QueuedClient):
         return self.is_unchanged
 
     def send_rest(self, frames: Iterable[bytes], number: int, part: int) -> None:  # noqa: ARG002
-        """Send what the compiled step has not sent, though it counts it as sent."""
+        """Send the frames that the compiled step counted as sent but did not send."""
         for data in frames:
             self.counters.bytes_sent -= len(data) - part
             if part and self._socket is not None:

@@ -15,7 +15,7 @@ from gateway.hub.transports.datagram import RECEIVE_BUFFER_BYTES, DatagramClient
 from gateway.units import US_PER_S
 
 RESOLVE_AGAIN_US: Final = 60 * US_PER_S
-"""Names of home networks change their address at most some times a day."""
+"""Interval of look-ups: names of home networks change their address a few times a day at most."""
 
 
 class UdpClient(DatagramClient):

@@ -16,7 +16,7 @@ from gateway.hub.transports.base import new_socket
 from gateway.hub.transports.datagram import Address, DatagramClient
 
 MULTICAST_HOPS: Final = 1
-"""The local network only."""
+"""Hop limit of multicast datagrams: the local network only."""
 
 
 class GroupClient(DatagramClient):

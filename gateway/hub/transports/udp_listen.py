@@ -37,7 +37,7 @@ from gateway.wire.mavlink_splitter import DatagramSplitter, MavFrame
 
 ANCILLARY_BYTES: Final = 64
 REMOVALS: Final = 32
-"""Dead clients removed at one tick; they cost nothing until then."""
+"""Maximum dead clients removed at one tick; those left until the next cost nothing."""
 
 
 class UdpListener(Listener[DatagramPeer]):
@@ -49,13 +49,13 @@ class UdpListener(Listener[DatagramPeer]):
         self._full_until_us = 0
         """Until then no client of a full port can have become stale."""
         self._splitter = DatagramSplitter()
-        """Of peers that have not sent a complete frame yet."""
+        """Splitter for peers that have not sent a complete frame yet."""
 
     def tick(self, now_us: int) -> None:
         """Bind again if that failed, and remove clients that have gone."""
         super().tick(now_us)
         if self._socket is not None and now_us >= self._retry_us:
-            # Whether the next one can be admitted shows only when it comes.
+            # Whether the next client can be admitted is decided when it arrives.
             self.reason, self._retry_us = "", now_us + RETRY_US
         clients = self._by_address.values()
         idle_us = round(self._context.settings.idle_timeout_s * US_PER_S)
@@ -114,7 +114,7 @@ class UdpListener(Listener[DatagramPeer]):
         try:
             sock.connect(address)
         except OSError:
-            # There is no route to the address that it claims.
+            # There is no route to the claimed address.
             sock.close()
             return None
         self._report(None)

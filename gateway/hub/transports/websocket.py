@@ -26,11 +26,11 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
 
 HANDSHAKE_US: Final = 5 * US_PER_S
-"""From the connection to the upgrade; a slower client only occupies a slot."""
+"""Maximum time from connection to upgrade; a slower client only occupies a slot."""
 PINGS: Final = 3
-"""Within the idle time-out, so that one lost answer does not break the connection."""
+"""Pings within the idle timeout, so that one lost answer does not break the connection."""
 UNREAD_BYTES: Final = 65_536
-"""Most bytes outside the queue: answers to a peer that sends requests and never reads."""
+"""Maximum bytes outside the queue: answers to a peer that sends requests and never reads."""
 
 
 class WebStream(StreamClient):
@@ -79,7 +79,7 @@ class WebStream(StreamClient):
 
     @property
     def is_direct(self) -> bool:
-        """Whether frames are sent as they are: each is wrapped in a message."""
+        """False, because each frame is wrapped in a message."""
         return False
 
     def transmit(self, frame: MavFrame) -> None:

@@ -55,9 +55,9 @@ from wsproto.utilities import ProtocolError
 from gateway.hub.settings import HubSettings
 
 READ_BYTES: Final = 16_384
-"""One record of TLS."""
+"""Bytes of one read: a TLS record."""
 MAX_MESSAGE: Final = 65_536
-"""No program packs more; longer messages are not MAVLink."""
+"""Longest accepted message, bytes: no program packs more into one."""
 SUBPROTOCOLS: Final = ("mavlink", "binary")
 """Names that pages request, if any; a browser gives up if none is accepted."""
 FINAL_BINARY: Final = b"\x82"
@@ -99,7 +99,7 @@ class TlsLayer:
                 plain += chunk
             self.is_ended = True
         except ssl.SSLWantReadError:
-            # All that is complete was read.
+            # All complete records were read.
             pass
         return plain, self.outgoing()
 
@@ -143,10 +143,10 @@ def caller_context(settings: HubSettings) -> ssl.SSLContext:
 def valid_until_s(certificate: Path, key: Path) -> float:
     """Return when a certificate ends, in s since 1970.
 
-    Python reads only certificates that were verified: so a client in memory, to which this one is
-    its own authority, connects to a server that presents it. Raises OSError if the PEM files, which
-    may be the same, cannot be read or are invalid; ssl.SSLCertVerificationError if the certificate
-    is not valid now.
+    Python reads only verified certificates: so an in-memory client, which accepts this one as its
+    own authority, connects to an in-memory server that presents it. Raises OSError if the PEM
+    files, which may be the same, cannot be read or are invalid; ssl.SSLCertVerificationError if
+    the certificate is not valid now.
     """
     trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     trusting.check_hostname = False
@@ -186,7 +186,7 @@ class WsInput:
     text_size: int = 0
     """Bytes of text messages, which are not MAVLink."""
     reply: bytes = b""
-    """To be sent at once, as it is."""
+    """Bytes to send at once, unchanged."""
     opened: bool = False
     """The handshake is done."""
     ponged: bool = False

@@ -116,7 +116,7 @@ class ZenohClient(Client):
             self._packers.clear()
 
     def close(self) -> None:
-        """End the session; a thread closes it, which may take a moment."""
+        """End the session; a thread closes it, which may take some time."""
         if self._task is not None:
             self._task.cancel()
         if self._connection is not None:

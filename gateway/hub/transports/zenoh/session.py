@@ -4,8 +4,8 @@ Theory of operation. Zenoh calls back on threads of its own; received messages a
 handled by the loop, a bounded number at a time. Messages that may be dropped are published by the
 loop itself, because Zenoh then never waits. The others are published by a thread, because Zenoh
 waits while a link is congested: 5 s before it gives a message up, 10 s before it gives a session
-up. Python cannot end in order meanwhile, so every call that may wait runs in `off_loop`'s threads,
-and the end of the process waits for those with a timeout (`end_calls`).
+up. Python cannot exit cleanly during such a wait, so every call that may wait runs in `off_loop`'s
+threads, and the end of the process waits for those with a timeout (`end_calls`).
 
 Nothing is published as `express`: that gives every message a batch of its own, and a link has only
 a few batches, so an idle link would drop frames of a short burst. Messages that share batches leave
@@ -20,11 +20,11 @@ as soon as the link is free, so nothing is held back for it.
 | `mavlink/SITE/recordings`    | the site answers queries for its recordings                 |
 | `mavlink_raw/out`, `…/in`    | frames without sites, as mavlink-server has them            |
 | `mavlink/out`, `…/in`        | messages as JSON, as mavlink-server has them by default     |
-| `mavlink/SYSTEM/COMPONENT/NAME[/FIELD]` | the newest one of each kind, and its fields      |
+| `mavlink/SYSTEM/COMPONENT/NAME[/FIELD]` | the newest message of each kind, and its fields  |
 
 `OWN` is attached to frames of the site's own gateway. The hub accepts no frame in their name from a
-client, so such a frame began here and has not gone round a loop. Frames of a client of the site, as
-of an autopilot behind it, and of other programs have no attachment.
+client, so such a frame originates here and has not gone round a loop. Frames of a client of the
+site, such as an autopilot, and those of other programs have no attachment.
 """
 
 import asyncio
@@ -60,30 +60,30 @@ RAW_IN: Final = "mavlink_raw/in"
 JSON_OUT: Final = "mavlink/out"
 JSON_IN: Final = "mavlink/in"
 MAX_CONFIG: Final = 1 << 20
-"""Bytes of a configuration file, which Zenoh reads at once; a complete one has some 30 kB."""
+"""Maximum size of a configuration file, which Zenoh reads at once; a full one has some 30 kB."""
 MAX_KEY: Final = 256
-"""Letters of a key; ours have at most 150."""
+"""Maximum characters of a key; ours have at most 150."""
 MAX_WAITING: Final = 4096
-"""Received messages that wait for the loop: a third of a second of two hundred aircraft."""
+"""Maximum received messages that wait for the loop: a third of a second of 200 aircraft."""
 AT_ONCE: Final = 64
-"""Messages handled in one turn of the loop, so that a flood does not delay other clients."""
+"""Maximum messages handled in one turn of the loop, so that a flood delays no other client."""
 MAX_MESSAGE: Final = 4096
-"""Bytes of one message with frames, as of a datagram; ours have at most 1100. Longer ones are
-dropped unread."""
+"""Maximum bytes of one message with frames, as of a datagram; ours have at most 1100. Longer ones
+are dropped unread."""
 BYTES_AT_ONCE: Final = 4 * MAX_MESSAGE
-"""Bytes handled in one turn by a fleet, which has no sensor samples that would wait meanwhile."""
+"""Maximum bytes handled in one turn by a fleet, which has no sensor samples to delay."""
 MAX_RELIABLE: Final = 1024
-"""Messages that wait for a congested link and must not be dropped: a whole parameter list."""
+"""Maximum waiting messages of a congested link that must not be dropped: a whole parameter list."""
 BATCHES: Final = 4
 """Batches of 64 KiB that may wait on a link: two thousand frames, and little memory a site."""
 GIVE_UP_S: Final = 10.0
-"""Zenoh gives a message up after half of this, and closes the link."""
+"""Timeout of publishing a message; Zenoh gives it up after half of this, and closes the link."""
 RELIABLE_IDS: Final = BULK_IDS | ids_of("COMMAND_INT", "COMMAND_LONG", "COMMAND_ACK", "STATUSTEXT")
-"""Parameters, missions, files, commands, their answers, texts: none of them is sent again."""
+"""Messages that are not repeated: parameters, missions, files, commands, their answers, texts."""
 MAX_CALLS: Final = 64
-"""Calls at a time: sessions that open or end, and a query for each recording being fetched."""
+"""Maximum calls at a time: sessions that open or end, and a query for each fetched recording."""
 CLOSE_S: Final = 3.0
-"""Ten times the duration of closing over a link that works."""
+"""Timeout of closing, s: ten times its duration over a link that works."""
 TLS_FILES: Final = (
     "root_ca_certificate",
     *("connect_certificate", "connect_private_key", "listen_certificate", "listen_private_key"),
@@ -133,12 +133,12 @@ def site_of(key: str) -> str:
 
 
 def off_loop(work: Callable[..., Result], *args: object) -> "asyncio.Future[Result]":
-    """Call a function that waits for Zenoh, on a thread whose end the process waits for."""
+    """Call a function that waits for Zenoh, on a thread that `end_calls` waits for."""
     return asyncio.get_running_loop().run_in_executor(_calls, work, *args)
 
 
 def end_calls() -> bool:
-    """Let running calls end, refuse new ones, and return whether none is left after `CLOSE_S`."""
+    """Refuse new calls, wait for running ones, and return whether all have ended in `CLOSE_S`."""
     ending = threading.Thread(target=_calls.shutdown, daemon=True)
     ending.start()
     ending.join(CLOSE_S)
@@ -207,7 +207,7 @@ def open_session(config: "zenoh.Config") -> "zenoh.Session":
 
 
 def _check_files(config: "zenoh.Config") -> None:
-    """Name a certificate or key that cannot be read; Zenoh only reports that it cannot connect."""
+    """Raise an error that names an unreadable certificate or key; Zenoh's error does not."""
     tls: dict[str, Any] = msgspec.json.decode(config.get_json("transport/link/tls")) or {}
     for name in TLS_FILES:
         if file := tls.get(name):
@@ -272,7 +272,7 @@ class LoopQueue(Generic[Item]):
             try:
                 self._loop.call_soon_threadsafe(self._drain)
             except RuntimeError:
-                # The loop has ended meanwhile.
+                # The loop has ended.
                 self._is_closed = True
 
     def close(self) -> None:
@@ -297,8 +297,8 @@ class Subscription:
 
     Zenoh would call back once a message on a thread of its own, and each call would wait for
     Python's lock: at thousands of messages a second that costs more than handling them. Here a
-    thread waits for the first message, wakes the loop, and sleeps until the loop has handled all
-    messages that arrived meanwhile.
+    thread waits for the first message, wakes the loop, and sleeps until the loop has handled this
+    and all later messages.
     """
 
     def __init__(
@@ -312,14 +312,14 @@ class Subscription:
         self._waiting: deque[zenoh.Sample] = deque()
         self._all_handled = threading.Event()
         self._is_closed = False
-        # Twice, so that an overflow is dropped and counted here, not within Zenoh.
+        # Twice the size, so that an overflow is dropped and counted here, not within Zenoh.
         ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(2 * MAX_WAITING)
         self._subscriber: Any = session.declare_subscriber(key, ring)
         self.dropped = 0
         threading.Thread(target=self._wait, name=key, daemon=True).start()
 
     def close(self) -> None:
-        """Handle nothing more."""
+        """Stop handling messages."""
         self._is_closed = True
         self._all_handled.set()
 
@@ -333,7 +333,7 @@ class Subscription:
             try:
                 self._loop.call_soon_threadsafe(self._drain, sample)
             except RuntimeError:
-                # The loop has ended meanwhile.
+                # The loop has ended.
                 return
             if self._is_closed:
                 return
@@ -409,9 +409,9 @@ class Publishers:
         return self._waiting.qsize()
 
     def close(self) -> None:
-        """Publish nothing more; waiting messages are lost."""
+        """Stop publishing; waiting messages are lost."""
         self._is_closed = True
-        # It wakes the thread; if there is no room for it the thread is awake.
+        # None wakes the thread; if the queue is full, the thread is awake.
         with suppress(queue.Full):
             self._waiting.put_nowait(None)
 
@@ -446,7 +446,7 @@ class Connection:
         self.session = session
         self.publishers = Publishers(session)
         self.readers: list[LoopQueue[Any] | Subscription] = []
-        """They pass messages to the loop until the session is closed."""
+        """Queues that pass messages to the loop until the session is closed."""
         self.declared: list[Any] = []
 
     @property
@@ -455,7 +455,7 @@ class Connection:
         return bool(self.session.info.routers_zid())
 
     def watch_presence(self, site: str, handle: Callable[[str, str, bool], None]) -> None:
-        """Call back with a site, one of its sessions, and whether that is here or gone."""
+        """Call back with a site, one of its sessions, and whether that session is present."""
         import zenoh
 
         here = zenoh.SampleKind.PUT
@@ -479,7 +479,7 @@ class Connection:
     def _end(self) -> None:
         """Undeclare everything, and close; waits for Zenoh.
 
-        A declaration left at the end of Python would wait for ever for threads that have ended. A
+        A declaration that is left when Python ends would wait for ever for ended threads. A
         publisher cannot be undeclared while its thread publishes.
         """
         import zenoh

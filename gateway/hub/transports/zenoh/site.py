@@ -20,11 +20,11 @@ from gateway.wire.mavlink_splitter import MavFrame
 log = logging.getLogger(__name__)
 
 MAX_DUPLICATE_SESSIONS: Final = 16
-"""Other sessions with this site's name that are registered; more are forged."""
+"""Maximum registered sessions with this site's name; more are forged."""
 
 
 class ZenohSite(ZenohClient):
-    """One site, which is the only one of its name."""
+    """One site, whose name no other site of the fleet may have."""
 
     def __post_init__(self) -> None:
         """Begin without other sessions of the same name."""

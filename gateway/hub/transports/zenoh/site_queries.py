@@ -24,25 +24,25 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_QUERIES: Final = 64
-"""Queries of one key that wait; beyond, the oldest is not answered."""
+"""Maximum waiting queries of one key; beyond, the oldest is not answered."""
 MAX_QUERY: Final = 4096
-"""Bytes of a query; ours have at most some hundred."""
+"""Maximum bytes of a query; ours have at most some hundred."""
 JOIN_S: Final = 1.0
-"""Longest wait for an answer that is being given; a digest of gigabytes takes longer."""
+"""Longest wait for the present answer when queries end; a digest of gigabytes takes longer."""
 MAX_PIECE: Final = 128 << 10
-"""Bytes of a recording in one answer."""
+"""Maximum bytes of a recording in one answer."""
 MAX_LIST: Final = 256 << 10
-"""Bytes of a list of recordings, some 2500; beyond, the oldest are left out."""
+"""Maximum bytes of a list of recordings, some 2500; beyond, the oldest are left out."""
 MAX_FILE: Final = 1 << 60
-"""Bytes of a file: far beyond any disk, and within the range of a seek."""
+"""Maximum bytes of a file: far beyond any disk, and within the range of a seek."""
 DIGEST_TIMEOUT_S: Final = 300.0
-"""Longest time of a digest, of gigabytes on a slow card: whoever asks waits no longer."""
+"""Timeout of a digest, of gigabytes on a slow card: no client waits longer."""
 READ_SIZE: Final = 1 << 20
 """Bytes read at once for a digest."""
 
 
 class RefusedQueryError(Exception):
-    """A query that cannot be answered; the text says why."""
+    """A query that cannot be answered; the text gives the reason."""
 
 
 class RecordingQuery(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
