@@ -24,9 +24,9 @@ from gateway.records import Outgoing
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.mavlink import STATION, Sender
+from tests.kit.recordings import START_US, make_tlog
 from tests.ports import free_port
 from tests.recordings.flights import OPTIONS
-from tests.recordings.frames import START_US, make_tlog
 
 pytestmark = pytest.mark.io
 

@@ -15,8 +15,8 @@ from tests.end_to_end.processes import Client, Gateway, MavProxy, mavsdk_system
 from tests.end_to_end.test_demo import NEAR_DEG
 from tests.kit.mavlink import Sender
 from tests.kit.process import START_LIMIT_S, Process
+from tests.kit.recordings import START_US, make_tlog
 from tests.ports import free_port
-from tests.recordings.frames import START_US, make_tlog
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

@@ -9,7 +9,7 @@ from gateway.live.session import RecordingSettings
 from gateway.recordings.table import TableHeader
 from gateway.records import FusionState
 from tests.conftest import ManualClock
-from tests.recordings.frames import make_frames, read_tlog
+from tests.kit.recordings import make_frames, read_tlog
 
 UNIX_US = 1_781_187_930_000_000
 NAME = "20260611-142530"

@@ -17,8 +17,8 @@ from gateway.recordings.index import Recording
 from gateway.vehicle.plan import Location
 from tests.conftest import ManualClock
 from tests.kit.recorder import RecorderBench
+from tests.kit.recordings import START_US, make_frames, make_records, make_tlog
 from tests.live.test_player_edge import Played
-from tests.recordings.frames import START_US, make_frames, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 

@@ -15,7 +15,7 @@ from gateway.live.other_gateways import conflicts, identity_verb, log_other_gate
 from gateway.recordings.tlog import TlogRecord
 from tests.kit.cli import invoke
 from tests.kit.mavlink import Sender
-from tests.recordings.frames import START_US, make_tlog
+from tests.kit.recordings import START_US, make_tlog
 
 pytestmark = pytest.mark.io
 

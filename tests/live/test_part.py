@@ -10,7 +10,7 @@ from gateway.live.recording_budget import BURST_S, TRUSTED_RATE, UNTRUSTED_RATE,
 from gateway.live.restamper import STEP, Restamper, clear_copies
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogScanner
-from tests.recordings.frames import START_US, make_records, make_tlog
+from tests.kit.recordings import START_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 

@@ -22,7 +22,7 @@ from gateway.wire.timesync import ENOUGH
 from tests.conftest import ManualClock
 from tests.kit.mavlink import Sender
 from tests.kit.recorder import FRAMES, HEADER, NAME, UNIX_US, RecorderBench, frames_of
-from tests.recordings.frames import read_tlog
+from tests.kit.recordings import read_tlog
 from tests.recordings.samples import make_baro, make_flight, make_fused
 
 pytestmark = pytest.mark.io

@@ -27,7 +27,7 @@ from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, layout_of
 from gateway.wire.mavlink_splitter import MavFrame, frame_of, message_id_of, split_datagram
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender, packed
-from tests.recordings.frames import START_US, make_tlog
+from tests.kit.recordings import START_US, make_tlog
 
 LAT, LON = 47.3712345, 8.5412345
 TOLERANCE_DEG = 1e-5

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.recordings.answers import LogAnswers, VehicleAnswers
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.recordings.tlog_index import TlogIndex
-from tests.recordings.frames import START_US
+from tests.kit.recordings import START_US
 
 SECOND_US = 1_000_000
 MISSION = mavlink.MAV_MISSION_TYPE_MISSION

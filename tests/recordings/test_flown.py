@@ -11,8 +11,8 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
 from gateway.recordings.table import encode_head
 from gateway.recordings.tlog import encode_record
+from tests.kit.recordings import START_US, make_records, make_tlog
 from tests.recordings.flights import OPTIONS, flown_table, read
-from tests.recordings.frames import START_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 

@@ -16,8 +16,8 @@ from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord
+from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog
 from tests.recordings.flights import OPTIONS, flown_table, fly, make_flight, read
-from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 

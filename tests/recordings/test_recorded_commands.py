@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.recordings.play import Track
 from gateway.recordings.tlog import TlogScanner, encode_record
 from tests.kit.mavlink import packed
-from tests.recordings.frames import START_US
+from tests.kit.recordings import START_US
 from tests.recordings.test_track import make_track, play_all
 
 VEHICLE, COMPANION, STATION, OLD_STATION = (1, 1), (1, 191), (255, 190), (42, 190)

@@ -9,7 +9,7 @@ from gateway.recordings.summary import FileInfo, Rate, TableSummary, TlogSummary
 from gateway.recordings.table import TableHeader, TableNote, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from tests.kit.mavlink import packed
-from tests.recordings.frames import START_US, make_tlog, senders_of
+from tests.kit.recordings import START_US, make_tlog, senders_of
 from tests.recordings.samples import make_baro, make_fused
 
 SECOND_US = 1_000_000

@@ -29,7 +29,7 @@ from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_splitter import message_id_of
 from gateway.wire.timesync import ENOUGH
 from tests.kit.mavlink import KEY, packed
-from tests.recordings.frames import START_US, STEP_US, make_frames, make_records, make_tlog
+from tests.kit.recordings import START_US, STEP_US, make_frames, make_records, make_tlog
 
 
 def scan(data: bytes, *, strict: bool = False, chunk: int | None = None) -> list[Batch]:

@@ -24,7 +24,7 @@ from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender, packed
-from tests.recordings.frames import START_US, make_records, make_tlog, read_tlog, senders_of
+from tests.kit.recordings import START_US, make_records, make_tlog, read_tlog, senders_of
 
 pytestmark = pytest.mark.io
 

@@ -6,7 +6,7 @@ from gateway.recordings.play import Track
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.recordings.tlog_index import TlogIndex
 from gateway.wire.mavlink_splitter import message_id_of
-from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
+from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog
 
 
 class Source:

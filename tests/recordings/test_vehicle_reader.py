@@ -11,7 +11,7 @@ from gateway.recordings.tlog import TlogRecord
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.units import US_PER_S
 from tests.kit.mavlink import packed
-from tests.recordings.frames import START_US, messages_of
+from tests.kit.recordings import START_US, messages_of
 
 LAT, LON = 470_000_000, 85_000_000
 VEHICLE, GIMBAL, CAMERA, STATION = (1, 1), (1, 154), (1, 100), (255, 190)

@@ -13,7 +13,7 @@ from gateway.live.control_verbs import RecorderVerbs
 from tests.conftest import ManualClock
 from tests.kit.cli import invoke
 from tests.kit.recorder import RecorderBench
-from tests.recordings.frames import make_frames
+from tests.kit.recordings import make_frames
 
 pytestmark = pytest.mark.io
 

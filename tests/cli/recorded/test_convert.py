@@ -13,8 +13,8 @@ from gateway.recordings.columns import TableRow
 from gateway.recordings.table import TableFault, TableHeader, TableReader
 from gateway.wire.mavlink_splitter import origin_of
 from tests.kit.cli import run
+from tests.kit.recordings import make_records, make_tlog, read_tlog
 from tests.recordings.flights import flown_table
-from tests.recordings.frames import make_records, make_tlog, read_tlog
 
 pytestmark = pytest.mark.io
 

@@ -15,7 +15,7 @@ from gateway.live.control_verbs import introduction_verb
 from gateway.recordings.tlog import TlogRecord
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender
-from tests.recordings.frames import START_US, make_tlog
+from tests.kit.recordings import START_US, make_tlog
 
 pytestmark = pytest.mark.io
 

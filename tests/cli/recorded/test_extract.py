@@ -14,7 +14,7 @@ from gateway.recordings.extracts import RecordedParameter
 from gateway.recordings.tlog import TlogRecord
 from tests.kit.cli import invoke, run
 from tests.kit.mavlink import Sender
-from tests.recordings.frames import START_US, make_tlog
+from tests.kit.recordings import START_US, make_tlog
 
 pytestmark = pytest.mark.io
 

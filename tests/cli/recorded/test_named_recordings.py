@@ -19,8 +19,8 @@ from gateway.recordings.columns import row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.table import encode_head
 from tests.kit.cli import invoke
+from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog
 from tests.recordings.flights import flown_table, read
-from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 

@@ -17,7 +17,7 @@ from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import FORMAT_LINE, encode_head
 from gateway.records import NavFlags
 from tests.kit.cli import run
-from tests.recordings.frames import make_frames
+from tests.kit.recordings import make_frames
 
 pytestmark = pytest.mark.io
 

@@ -31,8 +31,8 @@ from gateway.recordings.table import TableNote, block_of
 from gateway.recordings.tlog import TlogRecord
 from gateway.records import NavFlags
 from tests.kit.mavlink import packed
+from tests.kit.recordings import START_US, messages_of
 from tests.recordings.flights import fly, make_flight, read
-from tests.recordings.frames import START_US, messages_of
 
 POINTS = [
     TrackPoint(1_760_000_000_123_000 + i * 100_000, 47.1 + 1e-6 * i, -8.5, 430.25) for i in range(5)

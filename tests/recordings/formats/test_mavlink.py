@@ -13,7 +13,7 @@ from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuCalibrated, ImuFlags, NavFlags, NavState
 from tests.kit.mavlink import packed
-from tests.recordings.frames import START_US, senders_of
+from tests.kit.recordings import START_US, senders_of
 
 G = 9.80665
 Message = Any

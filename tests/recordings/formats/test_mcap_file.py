@@ -18,9 +18,9 @@ from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.tlog import TlogRecord
 from tests.kit.cli import invoke
 from tests.kit.mavlink import packed
+from tests.kit.recordings import START_US, make_tlog
 from tests.recordings.flights import OPTIONS
 from tests.recordings.formats import flown
-from tests.recordings.frames import START_US, make_tlog
 
 pytestmark = pytest.mark.io
 

@@ -15,8 +15,8 @@ from gateway.recordings.formats import parquet as parquet_file
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import TableNote, encode_line
 from tests.kit.cli import run
+from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog
 from tests.recordings.flights import OPTIONS, fly, make_flight
-from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 

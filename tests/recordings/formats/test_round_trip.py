@@ -32,9 +32,9 @@ from gateway.recordings.table import TableNote, encode_line
 from gateway.recordings.tlog import TlogRecord, encode_record
 from gateway.records import NodeId, NodeStatus
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from tests.kit.recordings import START_US
 from tests.recordings.flights import OPTIONS, fly, make_flight
 from tests.recordings.formats import flown
-from tests.recordings.frames import START_US
 
 pytestmark = pytest.mark.io
 

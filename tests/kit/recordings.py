@@ -1,17 +1,25 @@
-"""MAVLink frames and tlogs for the tests of recordings."""
+"""Small recordings: MAVLink frames, the records of a tlog, and files of both formats."""
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.senders import Senders
-from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
+from gateway.recordings.table import TableHeader, encode_head
+from gateway.recordings.tlog import Batch, TlogRecord, TlogScanner, encode_record
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
-from tests.kit.mavlink import Sender
+from tests.kit.mavlink import Sender, packed
 
 START_US = 1_760_000_000_000_000
 STEP_US = 20_000
+"""Default interval of records."""
+SECOND_US = 1_000_000
+
+Sent = Iterable[tuple[tuple[int, int], Any]]
+"""Messages, each with the ids of the system and component that sends it."""
 
 
 def make_frames(count: int, system_id: int = 1) -> list[bytes]:
@@ -28,14 +36,35 @@ def make_frames(count: int, system_id: int = 1) -> list[bytes]:
 
 
 def make_records(count: int, system_id: int = 1) -> list[TlogRecord]:
-    return [
-        TlogRecord(START_US + i * STEP_US, frame)
-        for i, frame in enumerate(make_frames(count, system_id))
-    ]
+    return records_of(make_frames(count, system_id))
 
 
-def make_tlog(records: list[TlogRecord]) -> bytes:
+def records_of(frames: Iterable[bytes], step_us: int = STEP_US) -> list[TlogRecord]:
+    """Record frames at equal intervals."""
+    return [TlogRecord(START_US + k * step_us, frame) for k, frame in enumerate(frames)]
+
+
+def records_sent(sent: Sent, step_us: int = STEP_US) -> list[TlogRecord]:
+    """Record messages at equal intervals, each with sequence number 0."""
+    return records_of((packed(message, *origin) for origin, message in sent), step_us)
+
+
+def make_tlog(records: Iterable[TlogRecord]) -> bytes:
     return b"".join(encode_record(record.time_us, record.frame) for record in records)
+
+
+def write_tlog(path: Path, records: Iterable[TlogRecord]) -> Path:
+    path.write_bytes(make_tlog(records))
+    return path
+
+
+def write_table(path: Path, header: TableHeader, rows: Iterable[TableRow]) -> Path:
+    path.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
+    return path
+
+
+def batch_of(records: Iterable[TlogRecord]) -> Batch:
+    return TlogScanner().feed(make_tlog(records), final=True)
 
 
 def read_tlog(path: Path) -> list[TlogRecord]:
