@@ -56,9 +56,10 @@ class Sender:
         self.link.seq = (self.link.seq + 1) % 256
         return frame
 
-    def heartbeat(self) -> bytes:
+    def heartbeat(self, *, armed: bool = False) -> bytes:
         kind = dialect.MAV_TYPE_GCS if self.is_station else dialect.MAV_TYPE_FIXED_WING
-        return self.pack(dialect.MAVLink_heartbeat_message(kind, 0, 0, 0, 4, 3))
+        mode = dialect.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
+        return self.pack(dialect.MAVLink_heartbeat_message(kind, 0, mode, 0, 4, 3))
 
     def attitude(self, time_ms: int = 5) -> bytes:
         return self.pack(dialect.MAVLink_attitude_message(time_ms, 0, 0, 0, 0, 0, 0))

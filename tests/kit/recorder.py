@@ -1,15 +1,18 @@
 """The recorder on a manual clock."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from gateway.live.armed_watch import VehicleLocations
 from gateway.live.recorder import Recorder
 from gateway.live.session import RecordingSettings
-from gateway.recordings.table import TableHeader
-from gateway.records import FusionState
+from gateway.recordings.table import TableHeader, TableReader
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeId
+from gateway.wire.timesync import ENOUGH
 from tests.conftest import ManualClock
 from tests.kit.recordings import make_frames, read_tlog
+from tests.kit.records import fix_at
 
 UNIX_US = 1_781_187_930_000_000
 NAME = "20260611-142530"
@@ -20,6 +23,14 @@ HEADER = TableHeader(mavgate_version="1.2", settings={"a": {"b": 1}}, calibratio
 def frames_of(folder: Path) -> list[bytes]:
     """Return the frames of all tlogs of a folder, none of which is damaged."""
     return [r.frame for path in sorted(folder.glob("*.tlog")) for r in read_tlog(path)]
+
+
+def read_table(path: Path) -> tuple[TableHeader, list[Any]]:
+    """Return the header of a table, and all that follows."""
+    reader = TableReader()
+    events = reader.feed(path.read_bytes(), final=True)
+    assert reader.header is not None
+    return reader.header, events
 
 
 class RecorderBench:
@@ -63,6 +74,20 @@ class RecorderBench:
         self.send(frames)
         await self.turn(seconds)
 
+    def fly(self, records: Iterable[BaroRaw | GpsFix | FusedSample]) -> None:
+        for record in records:
+            self.recorder.flight(record)
+
+    def receive_gps_time(self, unix_at_zero_us: int, times: int = ENOUGH) -> None:
+        """Let fixes of an aircraft report a civil time."""
+        now_us = self.clock()
+        fix = fix_at(now_us, node=NodeId(3, 1), utc_us=unix_at_zero_us + now_us)
+        self.fly([fix] * times)
+
     @property
     def troubles(self) -> list[str]:
         return [text for is_trouble, text in self.announced if is_trouble]
+
+
+MakeBench = Callable[..., RecorderBench]
+"""Makes a bench by its settings; it is closed after the test."""

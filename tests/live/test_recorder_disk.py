@@ -3,15 +3,14 @@
 import os
 import shutil
 import subprocess
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from gateway.live.session import RETRY_US
 from gateway.recordings.index import list_recordings
-from tests.conftest import ManualClock
-from tests.kit.recorder import FRAMES, NAME, RecorderBench, frames_of
+from tests.kit.recorder import FRAMES, NAME, MakeBench, RecorderBench, frames_of
 
 pytestmark = pytest.mark.io
 
@@ -37,13 +36,12 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.fixture
-async def bench(disk: Path, clock: ManualClock) -> AsyncIterator[RecorderBench]:
-    made = RecorderBench(disk / "recordings", clock)
+async def bench(disk: Path, make_bench: MakeBench) -> RecorderBench:
+    made = make_bench(disk / "recordings")
     await made.turn()
     await made.record(FRAMES[:5])
     assert made.troubles == []
-    yield made
-    made.recorder.close()
+    return made
 
 
 async def test_full_disk_stops_recording_until_there_is_space(

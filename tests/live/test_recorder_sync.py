@@ -2,18 +2,16 @@
 
 import asyncio
 import errno
-import logging
 import os
 import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from gateway.live.part_files import PartFiles
-from gateway.live.session import RETRY_US, ClosePart, CorrectTimes, OpenPart, SessionAction
-from tests.conftest import ManualClock
-from tests.kit.recorder import FRAMES, NAME, RecorderBench, frames_of
+from gateway.live.session import RETRY_US
+from tests.kit.process import until
+from tests.kit.recorder import FRAMES, NAME, UNIX_US, MakeBench, RecorderBench, frames_of
 
 pytestmark = pytest.mark.io
 
@@ -27,17 +25,20 @@ class SlowDisk:
     def __init__(self) -> None:
         self.begun = threading.Semaphore(0)
         self.may_end = threading.Event()
-        self.fails = False
-        self.syncing = self.most = 0
+        self.failures = 0
+        """How many of the next syncs fail."""
+        self.syncing = self.most = self.count = 0
 
     def sync(self, file: int) -> None:
         self.syncing += 1
+        self.count += 1
         self.most = max(self.most, self.syncing)
         self.begun.release()
         self.may_end.wait(FAR_S)
         os.fstat(file)
         self.syncing -= 1
-        if self.fails:
+        if self.failures:
+            self.failures -= 1
             raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     async def await_sync(self) -> None:
@@ -54,20 +55,12 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[SlowDisk]:
 
 
 @pytest.fixture
-async def bench(tmp_path: Path, clock: ManualClock, disk: SlowDisk) -> AsyncIterator[RecorderBench]:
-    made = RecorderBench(tmp_path / "recordings", clock)
+async def bench(make_bench: MakeBench, disk: SlowDisk) -> RecorderBench:
+    made = make_bench(rotate_min=1)
     await made.turn()
     await made.record(FRAMES[:5])
     await disk.await_sync()
-    yield made
-    disk.may_end.set()
-    made.recorder.close()
-
-
-async def await_closing(bench: RecorderBench) -> None:
-    async with asyncio.timeout(FAR_S):
-        while bench.recorder._files is not None:
-            await asyncio.sleep(0)
+    return made
 
 
 async def record_each(bench: RecorderBench, frames: list[bytes]) -> None:
@@ -77,11 +70,22 @@ async def record_each(bench: RecorderBench, frames: list[bytes]) -> None:
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
+async def begin_end(bench: RecorderBench) -> asyncio.Task[None]:
+    """Record the last frames, and begin to end the recording."""
+    bench.send(FRAMES[5:])
+    bench.recorder.stop()
+    turn = asyncio.create_task(bench.turn())
+    await until(lambda: bench.recorder.status().state == "idle")
+    return turn
+
+
 async def test_writes_do_not_wait_for_a_sync(bench: RecorderBench, disk: SlowDisk) -> None:
-    syncing = bench.recorder._syncing
     await record_each(bench, FRAMES[5:])
     assert bench.troubles == []
-    assert bench.recorder._syncing is syncing
+    assert disk.count == 1
+    disk.may_end.set()
+    bench.recorder.close()
+    assert disk.count == 3, "of the folder, of the file, and at the end"
 
 
 async def test_next_sync_begins_once_the_last_has_ended(
@@ -89,25 +93,25 @@ async def test_next_sync_begins_once_the_last_has_ended(
 ) -> None:
     await bench.turn()
     disk.may_end.set()
-    assert bench.recorder._syncing is not None
-    await asyncio.wrap_future(bench.recorder._syncing)
-    while disk.begun.acquire(blocking=False):
-        pass
-    await bench.turn()
+    # The first one syncs the folder, and then the file.
     await disk.await_sync()
+    async with asyncio.timeout(FAR_S):
+        while not disk.begun.acquire(blocking=False):
+            await bench.turn()
     assert disk.most == 1
 
 
 async def test_failed_sync_stops_recording_until_the_disk_recovers(
     bench: RecorderBench, disk: SlowDisk
 ) -> None:
-    disk.fails = True
+    bench.send(FRAMES[5:6])
+    disk.failures = 9
     disk.may_end.set()
-    assert bench.recorder._syncing is not None
-    await asyncio.wait([asyncio.wrap_future(bench.recorder._syncing)])
-    await bench.record(FRAMES[5:6])
+    async with asyncio.timeout(FAR_S):
+        while not bench.troubles:
+            await bench.turn(0.0)
     assert bench.troubles == ["Recording stopped: disk fails"]
-    disk.fails = False
+    disk.failures = 0
     await bench.turn(RETRY_US / 1e6)
     await bench.record(FRAMES[6:])
     # What could be written before is kept.
@@ -116,75 +120,63 @@ async def test_failed_sync_stops_recording_until_the_disk_recovers(
 
 
 async def test_recording_ends_after_the_running_sync(
-    bench: RecorderBench, disk: SlowDisk, monkeypatch: pytest.MonkeyPatch
+    bench: RecorderBench, disk: SlowDisk, caplog: pytest.LogCaptureFixture
 ) -> None:
-    closed: list[int] = []
-    close_all = PartFiles._close_all
-
-    def note(files: PartFiles) -> None:
-        closed.append(disk.syncing)
-        close_all(files)
-
-    monkeypatch.setattr(PartFiles, "_close_all", note)
-    bench.send(FRAMES[5:])
-    bench.recorder.stop()
-    turn = asyncio.create_task(bench.turn())
-    await await_closing(bench)
-    assert closed == []
+    turn = await begin_end(bench)
     assert len(bench.announced) == 1
     disk.may_end.set()
     await turn
-    assert closed == [0]
+    assert caplog.messages == [], "no file was closed during a sync"
     assert disk.most == 1
     assert bench.announced[-1] == (False, f"Recording {NAME} ended")
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-@pytest.mark.parametrize("by", ["stop", "end"])
+@pytest.mark.parametrize("failures", [2, 3])
+@pytest.mark.parametrize("is_stopped", [True, False])
 async def test_failed_last_sync_is_reported(
-    bench: RecorderBench, disk: SlowDisk, caplog: pytest.LogCaptureFixture, by: str
+    bench: RecorderBench,
+    disk: SlowDisk,
+    caplog: pytest.LogCaptureFixture,
+    is_stopped: bool,
+    failures: int,
 ) -> None:
-    disk.fails = True
+    """Also where only the sync before it fails, which is of the folder and the file."""
+    turn = await begin_end(bench) if is_stopped else None
+    disk.failures = failures
     disk.may_end.set()
-    with caplog.at_level(logging.WARNING):
-        if by == "stop":
-            await bench.recorder._close_part(bench.recorder._part, is_last=True)
-        else:
-            bench.recorder.close()
+    if turn is not None:
+        await turn
+    bench.recorder.close()
     assert "disk fails" in caplog.text
-    assert frames_of(bench.recorder.folder) == FRAMES[:5]
+    assert frames_of(bench.recorder.folder) == (FRAMES if is_stopped else FRAMES[:5])
 
 
 async def test_recorder_closed_during_the_end_of_a_part_closes_its_files(
     bench: RecorderBench, disk: SlowDisk
 ) -> None:
-    files = bench.recorder._files
-    assert files is not None
-    bench.send(FRAMES[5:])
-    bench.recorder.stop()
-    turn = asyncio.create_task(bench.turn())
-    await await_closing(bench)
+    turn = await begin_end(bench)
     turn.cancel()
     await asyncio.wait([turn])
     disk.may_end.set()
     bench.recorder.close()
-    assert files._files == {}
+    opened = (each.readlink() for each in Path("/proc/self/fd").iterdir() if each.is_symlink())
+    assert bench.recorder.folder not in {path.parent for path in opened}
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-@pytest.mark.parametrize("between", [[], [CorrectTimes()]])
+@pytest.mark.parametrize("is_corrected", [False, True])
 async def test_next_part_does_not_wait_for_the_sync_of_the_last(
-    bench: RecorderBench, disk: SlowDisk, between: list[SessionAction]
+    bench: RecorderBench, disk: SlowDisk, is_corrected: bool
 ) -> None:
     """Also where the recording gets its true time."""
-    part = bench.recorder._part
-    assert part is not None
     bench.send(FRAMES[5:7])
-    actions = [ClosePart(), *between, OpenPart(part.session, part.number + 1)]
-    await asyncio.wait_for(bench.recorder._perform(actions), FAR_S / 2)
+    if is_corrected:
+        bench.receive_gps_time(UNIX_US + 5_000_000)
+    await asyncio.wait_for(bench.turn(0.5 if is_corrected else 100.0), FAR_S / 2)
     await record_each(bench, FRAMES[7:])
     names = sorted(path.name for path in bench.recorder.folder.glob("*.tlog"))
-    assert names == [f"{part.session}_0{number}.tlog" for number in (1, 2)]
+    assert names == [f"{NAME}_0{number}.tlog" for number in (1, 2)]
     disk.may_end.set()
     bench.recorder.close()
     assert disk.most == 1
