@@ -11,6 +11,7 @@ from gateway.records import (
     GpsFix,
     GpsFixType,
     ImuFlags,
+    ImuRaw,
     ImuSample,
     LinkReport,
     NavFlags,
@@ -67,6 +68,21 @@ SAMPLE = ImuSample(
     flags=ImuFlags(0),
 )
 
+RAW = ImuRaw(
+    time_us=0,
+    node=IMU_NODE,
+    node_time_us=0,
+    accel_raw=(0, 0, 4096),
+    gyro_raw=(0, 0, 0),
+    mag_raw=(218, 0, 431),
+    temperature_raw=-3920,
+    accel_range_g=8,
+    gyro_range_dps=1000,
+    mag_lsb_per_gauss=1090,
+    flags=ImuFlags.MAG_NEW,
+)
+"""At rest, face up: one gravity upwards in sensor axes."""
+
 BARO = BaroSample(1_000_000, 95_123.0, -12.34, 529.5)
 
 FIX = GpsFix(
@@ -99,6 +115,10 @@ def state_at(time_us: int, **changes: Any) -> NavState:
 
 def sample_at(time_us: int, **changes: Any) -> ImuSample:
     return replace(SAMPLE, time_us=time_us, **changes)
+
+
+def raw_at(time_us: int, **changes: Any) -> ImuRaw:
+    return replace(RAW, **{"time_us": time_us, "node_time_us": time_us} | changes)
 
 
 def fix_at(time_us: int, **changes: Any) -> GpsFix:

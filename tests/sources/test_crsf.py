@@ -2,6 +2,8 @@
 
 import math
 import struct
+from functools import reduce
+from operator import xor
 from typing import Any
 
 import pytest
@@ -18,6 +20,7 @@ from gateway.sources.settings import parse_source
 from gateway.wire.framing import Fault
 
 NODE = NodeId(2, 8)
+QUADROTOR, FIXED_WING = mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_FIXED_WING
 
 
 def decoder(options: str = "") -> Any:
@@ -38,11 +41,8 @@ ATTITUDE = struct.pack(">hhh", 1745, -3491, 31416)
 
 
 def test_battery_of_another_implementation_is_read() -> None:
-    data = crsf_build_frame(
-        PacketsTypes.BATTERY_SENSOR,
-        {"voltage": 168, "current": 123, "capacity": 70_000, "remaining": 81},
-    )
-    (report,) = decoder().feed(data, 0)
+    values = {"voltage": 168, "current": 123, "capacity": 70_000, "remaining": 81}
+    (report,) = decoder().feed(crsf_build_frame(PacketsTypes.BATTERY_SENSOR, values), 0)
     battery = report.battery
     assert (battery.voltage_v, battery.current_a) == pytest.approx((16.8, 12.3))
     assert (battery.used_mah, battery.remaining_percent) == (70_000.0, 81.0)
@@ -57,9 +57,8 @@ def test_link_statistics_of_another_implementation_are_read() -> None:
     (report,) = decoder().feed(crsf_build_frame(PacketsTypes.LINK_STATISTICS, values), 0)
     assert (report.signal.rssi_dbm, report.signal.snr_db) == (-88, -7.0)
     assert report.link_quality_percent == 98.0
-    (report,) = decoder().feed(
-        crsf_build_frame(PacketsTypes.LINK_STATISTICS, values | {"downlink_rssi": 0}), 0
-    )
+    values["downlink_rssi"] = 0
+    (report,) = decoder().feed(crsf_build_frame(PacketsTypes.LINK_STATISTICS, values), 0)
     assert (report.signal.rssi_dbm, report.signal.snr_db) == (-65, 9.0), "of the active antenna"
 
 
@@ -104,6 +103,8 @@ def test_gps_frame_is_a_fix() -> None:
     assert (fix.satellites, fix.fix_type, fix.fix_ok) == (11, GpsFixType.FIX_3D, True)
     speed = 41.4 / 3.6
     assert fix.vel_n_mps[1] == pytest.approx(speed * math.sin(math.radians(270.5)))
+    without = one(0x02, struct.pack(">iiHHHB", 0, 0, 0, 0, 1000, 3))
+    assert (without.fix_ok, without.satellites) == (False, 3), "no position"
 
 
 def test_extended_gps_and_time_belong_to_the_next_fix() -> None:
@@ -113,11 +114,6 @@ def test_extended_gps_and_time_belong_to_the_next_fix() -> None:
     assert fix.vel_n_mps == pytest.approx((2.5, -1.3, -0.4))
     assert (fix.h_acc_m, fix.v_acc_m, fix.speed_acc_mps) == pytest.approx((1.8, 2.5, 0.3))
     assert fix.utc_us == 1_774_260_933_250_000
-
-
-def test_gps_without_a_position_is_no_fix() -> None:
-    fix = one(0x02, struct.pack(">iiHHHB", 0, 0, 0, 0, 1000, 3))
-    assert (fix.fix_ok, fix.satellites) == (False, 3)
 
 
 @pytest.mark.parametrize(
@@ -139,14 +135,10 @@ def test_scale_and_sign_of_a_number(kind: int, payload: bytes, field: str, value
 
 
 def test_rpm_temperatures_and_cells_are_read() -> None:
-    assert one(0x0C, bytes([0]) + (1200).to_bytes(3, "big") + b"\xff\xff\x38").values == (
-        ("rpm0.0", 1200.0),
-        ("rpm0.1", -200.0),
-    )
-    assert one(0x0D, b"\x01" + struct.pack(">hh", 250, -50)).values == (
-        ("temp1.0", 25.0),
-        ("temp1.1", -5.0),
-    )
+    turns = one(0x0C, bytes([0]) + (1200).to_bytes(3, "big") + b"\xff\xff\x38")
+    assert turns.values == (("rpm0.0", 1200.0), ("rpm0.1", -200.0))
+    warm = one(0x0D, b"\x01" + struct.pack(">hh", 250, -50))
+    assert warm.values == (("temp1.0", 25.0), ("temp1.1", -5.0))
     battery = one(0x0E, b"\x00" + struct.pack(">HHH", 3850, 3840, 3830)).battery
     assert battery.cells_v == pytest.approx((3.85, 3.84, 3.83))
     assert battery.voltage_v == pytest.approx(11.52)
@@ -156,9 +148,8 @@ def test_pressure_field_and_inertial_sample_of_betaflight_are_samples() -> None:
     stream = decoder()
     # At rest and level, as Betaflight writes it: specific force is up, and its z axis down.
     values = (0, 0, 16384, round(32767 / 16), 0, -round(32767 / 16), 2550)
-    data = frame(0x11, struct.pack(">ii", 100_150, 2150)) + frame(
-        0x12, struct.pack(">hhh", 600, -30, -1200)
-    )
+    data = frame(0x11, struct.pack(">ii", 100_150, 2150))
+    data += frame(0x12, struct.pack(">hhh", 600, -30, -1200))
     for stamp_us in (5_000, 15_000):
         data += frame(0x13, struct.pack(">I7h", stamp_us, *values))
     baro, first, second = stream.feed(data, 1_000_000)
@@ -174,15 +165,15 @@ def test_pressure_field_and_inertial_sample_of_betaflight_are_samples() -> None:
 @pytest.mark.parametrize(
     ("text", "mode", "number", "armed", "kind"),
     [
-        (b"ANGL", "ANGL", 0, True, mavlink.MAV_TYPE_QUADROTOR),
-        (b"ANGL*", "ANGL", 0, False, mavlink.MAV_TYPE_QUADROTOR),
-        (b"ACRO!", "ACRO", 1, False, mavlink.MAV_TYPE_QUADROTOR),
-        (b"RTH?", "RTH", 6, False, mavlink.MAV_TYPE_QUADROTOR),
-        (b"3CRS", "3CRS", 7, True, mavlink.MAV_TYPE_FIXED_WING),
+        (b"ANGL", "ANGL", 0, True, QUADROTOR),
+        (b"ANGL*", "ANGL", 0, False, QUADROTOR),
+        (b"ACRO!", "ACRO", 1, False, QUADROTOR),
+        (b"RTH?", "RTH", 6, False, QUADROTOR),
+        (b"3CRS", "3CRS", 7, True, FIXED_WING),
         (b"WAIT", "WAIT", None, False, None),
         (b"!ERR", "!ERR", None, False, None),
         (b"!FS!", "!FS!", None, None, None),
-        (b"FBWA", "FBWA", 5, True, mavlink.MAV_TYPE_FIXED_WING),
+        (b"FBWA", "FBWA", 5, True, FIXED_WING),
         (b"XYZ", "XYZ", None, True, None),
     ],
 )
@@ -196,9 +187,8 @@ def test_mode_and_arming_are_read_from_the_text(
 
 def test_aeroplane_remains_one_in_modes_that_copters_have_too() -> None:
     stream = decoder()
-    for text in (b"CRS", b"ANGL"):
-        (report,) = stream.feed(frame(0x21, text + b"\0"), 0)
-    assert (report.vehicle_type, report.custom_mode) == (mavlink.MAV_TYPE_FIXED_WING, 5)
+    _, report = stream.feed(frame(0x21, b"CRS\0") + frame(0x21, b"ANGL\0"), 0)
+    assert (report.vehicle_type, report.custom_mode) == (FIXED_WING, 5)
     assert one(0x21, b"ANGL\0", "?type=fixed_wing").custom_mode == 5
 
 
@@ -211,11 +201,11 @@ def passthrough(*packets: tuple[int, int]) -> bytes:
 
 def test_ardupilot_frames_have_mode_type_arming_batteries_and_text() -> None:
     stream = decoder()
-    parameter = (1 << 24) | mavlink.MAV_TYPE_FIXED_WING
+    parameter = (1 << 24) | FIXED_WING
     status = (10 + 1) | 1 << 8 | 63 << 19
     (report,) = stream.feed(passthrough((0x5007, parameter), (0x5001, status)), 0)
     assert (report.mode, report.custom_mode, report.armed) == ("AUTO", 10, True)
-    assert report.vehicle_type == mavlink.MAV_TYPE_FIXED_WING
+    assert report.vehicle_type == FIXED_WING
     assert report.throttle_percent == pytest.approx(100.0)
     assert stream.feed(frame(0x21, b"MANU\0"), 0) == [], "the text is coarser"
     # 12.6 V; 25 A as 25 * 10 tenths; 1500 mAh.
@@ -243,16 +233,15 @@ def test_home_of_ardupilot_is_found_from_distance_and_direction() -> None:
 FLIGHT = frame(0x1E, ATTITUDE) + frame(0x02, GPS) + frame(0x21, b"ACRO*\0") + frame(0x07, b"\0\1")
 
 
-@pytest.mark.parametrize("address", [0xC8, 0xEA, 0xEE, 0xEC, 0x00, 0x7F])
-def test_any_address_is_accepted(address: int) -> None:
-    assert len(decoder().feed(frame(0x1E, ATTITUDE, address), 0)) == 1
+def test_any_address_is_accepted() -> None:
+    for address in (0xC8, 0xEA, 0xEE, 0xEC, 0x00, 0x7F):
+        assert len(decoder().feed(frame(0x1E, ATTITUDE, address), 0)) == 1, address
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 1000])
 def test_any_chunking_gives_the_same_records(size: int) -> None:
-    stream, found = decoder(), []
-    for at in range(0, len(FLIGHT), size):
-        found += stream.feed(FLIGHT[at : at + size], 0)
+    stream, starts = decoder(), range(0, len(FLIGHT), size)
+    found = [each for at in starts for each in stream.feed(FLIGHT[at : at + size], 0)]
     assert [type(each) for each in found] == [VehicleReport, GpsFix, VehicleReport, VehicleReport]
 
 
@@ -290,10 +279,7 @@ def test_unknown_type_and_short_payload_are_counted() -> None:
 
 
 def ltm(kind: bytes, payload: bytes) -> bytes:
-    check = 0
-    for byte in payload:
-        check ^= byte
-    return b"$T" + kind + payload + bytes([check])
+    return b"$T" + kind + payload + bytes([reduce(xor, payload, 0)])
 
 
 def test_ltm_is_read_behind_the_same_interface() -> None:
@@ -317,7 +303,7 @@ def test_ltm_is_read_behind_the_same_interface() -> None:
 def test_wanted_type_is_that_of_crsf_and_ltm_and_must_exist() -> None:
     stream = make_decoder(parse_source("ltm:/dev/ttyUSB0?type=fixed_wing"), NODE)
     (state,) = stream.feed(ltm(b"S", struct.pack("<HHBBB", 0, 0, 0, 0, 2 << 2)), 0)
-    assert (state.vehicle_type, state.custom_mode) == (mavlink.MAV_TYPE_FIXED_WING, 5)
+    assert (state.vehicle_type, state.custom_mode) == (FIXED_WING, 5)
     for kind in ("ltm", "crsf"):
         with pytest.raises(ValueError, match="no MAV_TYPE 'plane'"):
             make_decoder(parse_source(f"{kind}:/dev/ttyUSB0?type=plane"), NODE)
@@ -325,7 +311,6 @@ def test_wanted_type_is_that_of_crsf_and_ltm_and_must_exist() -> None:
 
 def test_ltm_noise_is_counted_and_the_next_frame_is_read() -> None:
     stream = make_decoder(parse_source("ltm:/dev/ttyUSB0"), NODE)
-    good = ltm(b"A", struct.pack("<hhh", 0, 0, 90))
-    fault, report = stream.feed(b"$TA123456x" + good, 0)
+    fault, report = stream.feed(b"$TA123456x" + ltm(b"A", struct.pack("<hhh", 0, 0, 90)), 0)
     assert isinstance(fault, Fault)
     assert report.attitude_rad is not None

@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Iterable
 from typing import Any
 
 import pytest
@@ -17,8 +16,6 @@ from gateway.sources.trial import SourceTrial, describe
 from gateway.wire.framing import Fault
 
 NODE = NodeId(3, 8)
-
-
 MAP = """[columns]
 time_us = { column = "t", scale = 1000.0 }
 accel_x_b_mps2 = "ax"
@@ -35,9 +32,8 @@ HEADER = "t,ax,ay,az,gx,gy,gz,lat,lon,hpa\n"
 
 
 def decode_csv(text: str, names: str = "") -> list[Any]:
-    (source,) = make_sources(
-        (SourceSettings(url=f"lines:stdin?columns=MAP{names}"),), lambda _: MAP
-    )
+    settings = SourceSettings(url=f"lines:stdin?columns=MAP{names}")
+    (source,) = make_sources((settings,), lambda _: MAP)
     return source.decoder.feed(text.encode(), 1_000_000)
 
 
@@ -77,10 +73,10 @@ def test_wrong_map_is_refused_when_the_source_is_made() -> None:
 def test_trial_names_rates_what_is_missing_and_a_map() -> None:
     trial, text = SourceTrial(), "time,acc_x,acc_y,acc_z\n1,2,3,4\n" + json_line(speed=1)
     trial.look_at(text)
-    shown = []
-    for event in decode(text + gga()):
+    events = decode(text + gga())
+    for event in events:
         trial.feed(event)
-        shown.append(describe(event))
+    shown = [*map(describe, events)]
     assert shown[-1] == "GPS fix 48.117300 11.516667 545.4 m, 9 satellites"
     assert shown[0].startswith("not used (text): 'time,acc_x,acc_y,acc_z'")
     summary = trial.summary(2.0)
@@ -114,10 +110,6 @@ def gga(talker: str = "GN", *, time: str = GGA[0]) -> str:
 
 def rmc(talker: str = "GN", *, time: str = RMC[0]) -> str:
     return nmea("RMC", time, *RMC[1:], "", "", "A", talker=talker)
-
-
-def of_kind(found: Iterable[Any], kind: type) -> list[Any]:
-    return [each for each in found if isinstance(each, kind)]
 
 
 def test_imu_in_si_keeps_its_values_through_counts_and_mounting() -> None:
@@ -187,7 +179,7 @@ def test_gga_and_rmc_of_one_time_are_one_fix(talker: str, rmc_first: bool) -> No
     times = [f"10153{n}.00" for n in range(4)]
     pairs = [[gga(talker, time=t), rmc(talker, time=t)] for t in times]
     text = "".join(line for pair in pairs for line in (pair[::-1] if rmc_first else pair))
-    fixes = of_kind(decode(text), GpsFix)[2:]
+    fixes = [each for each in decode(text) if isinstance(each, GpsFix)][2:]
     assert len(fixes) == 2, "after the first time, which shows that both are sent"
     fix = fixes[-1]
     assert fix.lat_dege7 == round((48 + 7.038 / 60) * 1e7)
@@ -200,10 +192,10 @@ def test_gga_and_rmc_of_one_time_are_one_fix(talker: str, rmc_first: bool) -> No
 
 def test_accuracies_come_from_gst_or_else_from_the_dilution() -> None:
     gst = nmea("GST", "101530.20", "5", "", "", "", "3.0", "4.0", "6.0")
-    (fix,) = of_kind(decode(gst + gga()), GpsFix)
+    (fix,) = decode(gst + gga())
     assert (fix.h_acc_m, fix.v_acc_m) == (5.0, 6.0)
     gsa = nmea("GSA", "A", "2", *([""] * 12), "2.0", "0.9", "1.7")
-    (fix,) = of_kind(decode(gsa + gga()), GpsFix)
+    (fix,) = decode(gsa + gga())
     assert fix.fix_type is GpsFixType.FIX_2D
     assert fix.h_acc_m == pytest.approx(3.6)
 
@@ -242,8 +234,7 @@ def test_true_heading_is_reported_without_an_attitude() -> None:
 def test_line_that_cannot_be_used_is_an_explained_fault(line: str, kind: str, why: str) -> None:
     good = json_line(pressure_hpa=1000)
     fault, record = decode(f"{line}\n{good}")
-    assert isinstance(fault, Fault)
-    assert fault.kind == kind
+    assert (type(fault), fault.kind) == (Fault, kind)
     assert why in fault.detail
     assert isinstance(record, BaroRaw), "and the next line is read"
 

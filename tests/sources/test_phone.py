@@ -2,27 +2,25 @@
 
 import json
 import math
-from collections.abc import Iterator
+from itertools import takewhile
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.aircraft import AircraftSettings
 from gateway.geometry.quaternion import to_euler
-from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId, VehicleReport
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.source_bytes import SOURCE_BYTES
-from gateway.sources.kinds import make_decoder, make_sources
-from gateway.sources.settings import SourceSettings, parse_source
+from gateway.sources.kinds import make_decoder
+from gateway.sources.settings import parse_source
 from gateway.units import US_PER_S
 from gateway.wire.framing import Fault
+from tests.kit.pipeline_bench import PipelineBench
 
 NODE = NodeId(4, 8)
 UTC_S = 1_790_000_000
@@ -75,14 +73,8 @@ class Phyphox:
             found[name] = f'"{name}":{{"size":0,"updateMode":"{mode}", "buffer":[{digits}]}}'
         measuring = str(self.measuring).lower()
         status = f'"session":"a1", "measuring":{measuring}, "timedRun":false, "countDown":0'
-        text = (
-            '{"buffer":{\n'
-            + ",\n".join(found.values())
-            + '\n},\n"status":{\n'
-            + status
-            + "\n}\n}\n"
-        )
-        return text.replace("\n", " ").encode() + b"\n"
+        buffers = " , ".join(found.values())
+        return f'{{"buffer":{{ {buffers} }}, "status":{{ {status} }} }} \n'.encode()
 
 
 def hyperimu(time_s: float, *sensors: tuple[float, float, float]) -> bytes:
@@ -95,33 +87,28 @@ ACCEL, RATE, FIELD = (1.0, 2.0, 9.5), (0.1, -0.2, 0.3), (-12.0, 20.0, -40.0)
 """Of a phone: x right, y to its top, z out of the screen."""
 
 
-def of_sensor_logger() -> list[Any]:
-    total = sensor_logger(
-        [
-            (1.02, "gyroscope", xyz(*RATE)),
-            (1.00, "accelerometer", xyz(0.5, 1.5, 0.5)),
-            (1.00, "gravity", xyz(0.5, 0.5, 9.0)),
-            (1.01, "magnetometer", xyz(*FIELD)),
-            (1.01, "light", {"lux": 3}),
-        ]
-    )
-    found: list[Any] = decoder().feed(total, 5_000_000)
-    return found
+def of_sensor_logger() -> Any:
+    readings: Readings = [
+        (1.02, "gyroscope", xyz(*RATE)),
+        (1.00, "accelerometer", xyz(0.5, 1.5, 0.5)),
+        (1.00, "gravity", xyz(0.5, 0.5, 9.0)),
+        (1.01, "magnetometer", xyz(*FIELD)),
+        (1.01, "light", {"lux": 3}),
+    ]
+    return decoder().feed(sensor_logger(readings), 5_000_000)
 
 
-def of_phyphox() -> list[Any]:
+def of_phyphox() -> Any:
     stream, phone = decoder("phone:poll:127.0.0.1:8080"), Phyphox()
     phone.add(acc_time=2.0, accX=ACCEL[0], accY=ACCEL[1], accZ=ACCEL[2])
     phone.add(mag_time=2.001, magX=FIELD[0], magY=FIELD[1], magZ=FIELD[2])
     phone.add(gyr_time=2.005, gyrX=RATE[0], gyrY=RATE[1], gyrZ=RATE[2])
-    found: list[Any] = stream.feed(phone.answer(stream.request()), 5_000_000)
-    return found
+    return stream.feed(phone.answer(stream.request()), 5_000_000)
 
 
-def of_hyperimu() -> list[Any]:
+def of_hyperimu() -> Any:
     packet = hyperimu(1.0, ACCEL, RATE, FIELD, (0.0, 0.0, 0.0))
-    found: list[Any] = decoder("phone:udp:127.0.0.1:2055").feed(packet, 5_000_000)
-    return found
+    return decoder("phone:udp:127.0.0.1:2055").feed(packet, 5_000_000)
 
 
 @pytest.mark.parametrize("app", [of_sensor_logger, of_phyphox, of_hyperimu])
@@ -142,15 +129,13 @@ LOCATION = {
 
 
 def test_location_pressure_and_battery_of_sensor_logger_are_records() -> None:
-    data = sensor_logger(
-        [
-            (1.0, "location", LOCATION),
-            (1.1, "barometer", {"pressure": 1001.5, "relativeAltitude": 0.2}),
-            (1.2, "battery", {"batteryLevel": 0.63, "batteryState": "unplugged"}),
-            (1.3, "battery", {"batteryLevel": -1, "voltage": 3.9}),
-        ]
-    )
-    fix, baro, report, unknown = decoder().feed(data, 9_000_000)
+    readings: Readings = [
+        (1.0, "location", LOCATION),
+        (1.1, "barometer", {"pressure": 1001.5, "relativeAltitude": 0.2}),
+        (1.2, "battery", {"batteryLevel": 0.63, "batteryState": "unplugged"}),
+        (1.3, "battery", {"batteryLevel": -1, "voltage": 3.9}),
+    ]
+    fix, baro, report, unknown = decoder().feed(sensor_logger(readings), 9_000_000)
     assert (fix.lat_dege7, fix.lon_dege7, fix.alt_amsl_m) == (481173000, -115167000, 545.4)
     assert fix.vel_n_mps[:2] == pytest.approx((0.0, 11.5), abs=1e-9)
     assert (fix.h_acc_m, fix.v_acc_m, fix.fix_type) == (3.5, 6.0, GpsFixType.FIX_3D)
@@ -235,9 +220,8 @@ def test_request_to_phyphox_covers_newer_readings_and_each_is_decoded_once() -> 
         now_us += 10_000
         if tick % 7 == 0:
             found += stream.feed(phone.answer(stream.request()), now_us)
-    samples = [each for each in found if isinstance(each, ImuRaw)]
     fixes = [each for each in found if isinstance(each, GpsFix)]
-    assert (len(samples), len(fixes), len(found)) == (295, 3, 298)
+    assert ([*map(type, found)].count(ImuRaw), len(fixes), len(found)) == (295, 3, 298)
     assert (fixes[0].lat_dege7, fixes[0].satellites) == (481173200, 12)
     phone.buffers.clear()
     phone.add(acc_time=0.5, accX=0.0, accY=0.0, accZ=9.81)
@@ -255,10 +239,8 @@ def test_phyphox_that_does_not_measure_is_an_explained_fault() -> None:
 
 
 def test_hyperimu_repeats_its_field_and_position_which_are_taken_once() -> None:
-    stream = decoder(
-        "phone:udp:127.0.0.1:2055?sensors=gyroscope,light,accelerometer,gps,magnetometer"
-    )
-    found = []
+    order, found = "gyroscope,light,accelerometer,gps,magnetometer", []
+    stream = decoder(f"phone:udp:127.0.0.1:2055?sensors={order}")
     for tick in range(4):
         sensors = (RATE, (5.0, 0.0, 0.0), ACCEL, (48.5, 11.5, 600.0), FIELD)
         found += stream.feed(hyperimu(1.0 + tick * 0.01, *sensors), tick * 10_000)
@@ -270,13 +252,15 @@ def test_hyperimu_repeats_its_field_and_position_which_are_taken_once() -> None:
 
 @pytest.mark.parametrize("size", [1, 7, 1000])
 def test_any_chunking_gives_the_same_records(size: int) -> None:
-    data = (
-        sensor_logger(turning(1.0, 20)) + b"junk\n" + sensor_logger([(1.3, "location", LOCATION)])
-    )
+    post, location = sensor_logger(turning(1.0, 20)), sensor_logger([(1.3, "location", LOCATION)])
+    data = post + b"junk\n" + location
     whole, stream = decoder().feed(data, 0), decoder()
     parts = [e for at in range(0, len(data), size) for e in stream.feed(data[at : at + size], 0)]
     assert [repr(each) for each in parts] == [repr(each) for each in whole]
     assert len(whole) == 22
+
+
+GYROSCOPE = '{"payload": [{"name": "gyroscope", "time": %s, "values": {}}]}'
 
 
 @pytest.mark.parametrize(
@@ -287,11 +271,8 @@ def test_any_chunking_gives_the_same_records(size: int) -> None:
         ('{"payload":' + "[" * 9999, "no known app"),
         ('{"payload": 3}', "no known app"),
         ('{"payload": [{"name": "gyroscope"}]}', "no known app"),
-        (
-            '{"payload": [{"name": "gyroscope", "time": 1e999, "values": {}}]}',
-            "has an invalid time",
-        ),
-        ('{"payload": [{"name": "gyroscope", "time": 1%s, "values": {}}]}' % ("0" * 400), "app"),
+        (GYROSCOPE % "1e999", "has an invalid time"),
+        (GYROSCOPE % ("1" + "0" * 400), "app"),
         ('{"buffer": [], "status": 3}', "no known app"),
         ('{"buffer": {"acc_time": 3}, "status": {}}', "no known app"),
         ("1000,1,2", "not three of each"),
@@ -300,8 +281,8 @@ def test_any_chunking_gives_the_same_records(size: int) -> None:
     ],
 )
 def test_line_of_no_app_is_an_explained_fault_and_the_next_is_read(line: str, why: str) -> None:
-    found = decoder().feed(line.encode() + b"\n" + sensor_logger(turning(1.0, 1)), 0)
-    fault, sample = found
+    post = sensor_logger(turning(1.0, 1))
+    fault, sample = decoder().feed(line.encode() + b"\n" + post, 0)
     assert isinstance(fault, Fault)
     assert why in fault.detail
     assert isinstance(sample, ImuRaw)
@@ -317,29 +298,14 @@ def test_values_that_are_no_numbers_make_no_record() -> None:
     assert decoder().feed(sensor_logger(values), 0) == []
 
 
-def flown(seconds: float) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Fly the simulated phone; yield the newest messages after each post."""
-    (source,) = make_sources((SourceSettings(url="phone:stdin"),), str)
-    pipeline = Pipeline(PipelineSettings(AircraftSettings(), sources=[source]))
-    parser, newest, due_us = mavlink.MAVLink(None), {}, 0
-    for post in SOURCE_BYTES["phone"](SimulatorSettings(), UTC_S * US_PER_S):
-        now_us = round(post.time_s * US_PER_S)
-        frames = pipeline.feed_source(source, post.data, now_us).frames
-        while due_us < now_us:
-            due_us += 200_000
-            frames += pipeline.poll(due_us).frames
-        for sent in frames:
-            message = parser.decode(bytearray(sent.frame))
-            newest[message.get_type()] = message
-        yield source, newest
-        if post.time_s > seconds:
-            return
-
-
 def test_flight_of_a_phone_has_attitude_heading_and_position_of_the_truth() -> None:
-    *_, (source, newest) = flown(30.0)
-    assert source.report().faults == ()
-    attitude, position = newest["ATTITUDE"], newest["GLOBAL_POSITION_INT"]
+    bench = PipelineBench(url="phone:stdin")
+    posts = SOURCE_BYTES["phone"](SimulatorSettings(), UTC_S * US_PER_S)
+    for post in takewhile(lambda post: post.time_s < 30.0, posts):
+        bench.wait(post.time_s - bench.now_us / US_PER_S)
+        bench.feed(post.data)
+    assert bench.source.report().faults == ()
+    attitude, position = bench.newest("ATTITUDE"), bench.newest("GLOBAL_POSITION_INT")
     motion = SimulatedAircraft(SimulatorSettings(), 0, UTC_S * US_PER_S).trajectory
     truth = motion.truth_at(np.array([attitude.time_boot_ms, position.time_boot_ms]) / 1000.0)
     wanted = to_euler(tuple(truth.q_nb[0].tolist()))

@@ -8,52 +8,36 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.aircraft import AircraftSettings
-from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.records import BatteryReport, GpsFix, NodeId, VehicleReport
 from gateway.sources.kinds import make_sources
 from gateway.sources.sampling import fix_at, imu_raw
 from gateway.sources.settings import SourceSettings, nodes_of, parse_source
-from gateway.units import US_PER_S
 from gateway.wire.framing import encode_frame
+from tests.kit.pipeline_bench import PipelineBench
 
 NODE = NodeId(1, 8)
 
 
-class Flight:
-    """A pipeline on a clock of its own, and the messages that it has sent."""
+class Flight(PipelineBench):
+    """A pipeline without a receiver whose source is open."""
 
     def __init__(self, url: str = "lines:stdin") -> None:
-        (self.source,) = make_sources((SourceSettings(url=url),), str)
-        self.pipeline = Pipeline(PipelineSettings(AircraftSettings(), sources=[self.source]))
+        super().__init__(url=url)
         self.pipeline.disconnect("none")
         self.source.opened()
-        self.messages: list[Any] = []
-        self.now_us = 0
-        self._parser = mavlink.MAVLink(None)
 
-    def _keep(self, out: Any) -> None:
-        self.messages += [self._parser.decode(bytearray(sent.frame)) for sent in out.frames]
-
-    def wait(self, seconds: float) -> None:
-        end_us = self.now_us + round(seconds * US_PER_S)
-        while self.now_us < end_us:
-            self.now_us += 100_000
-            self._keep(self.pipeline.poll(self.now_us))
-
-    def take(self, record: Any) -> None:
-        self._keep(self.pipeline.feed_record(record, self.now_us))
+    def report(self, time_us: int | None = None, **fields: Any) -> None:
+        """Let the vehicle report fields, by default now."""
+        time_us = self.now_us if time_us is None else time_us
+        self.take(VehicleReport(time_us=time_us, node=NODE, **fields))
 
     def line(self, **content: object) -> None:
-        data = json.dumps(content).encode() + b"\n"
-        self._keep(self.pipeline.feed_source(self.source, data, self.now_us))
+        self.feed(json.dumps(content).encode() + b"\n")
 
-    def newest(self, name: str) -> Any:
-        return next((m for m in reversed(self.messages) if m.get_type() == name), None)
 
-    @property
-    def texts(self) -> list[str]:
-        return [m.text for m in self.messages if m.get_type() == "STATUSTEXT"]
+@pytest.fixture
+def flight() -> Flight:
+    return Flight()
 
 
 def fix(time_us: int, lat_deg: float = 48.0) -> GpsFix:
@@ -62,92 +46,72 @@ def fix(time_us: int, lat_deg: float = 48.0) -> GpsFix:
     return made
 
 
-def test_vehicle_with_gps_only_has_a_position_and_no_attitude() -> None:
-    flight = Flight()
+def test_vehicle_with_gps_only_has_a_position_and_no_attitude(flight: Flight) -> None:
     for _ in range(50):
         flight.wait(0.2)
         flight.line(lat=48.0, lon=11.0, alt_m=500, speed_mps=10, course_deg=90, satellites=9)
     position = flight.newest("GLOBAL_POSITION_INT")
-    assert (position.lat, position.alt, position.vy, position.hdg) == (
-        480000000,
-        500000,
-        1000,
-        65535,
-    )
+    found = (position.lat, position.alt, position.vy, position.hdg)
+    assert found == (480000000, 500000, 1000, 65535)
     assert flight.newest("VFR_HUD").heading == 90, "course over ground"
-    assert flight.newest("ATTITUDE") is None
-    assert flight.newest("ATTITUDE_QUATERNION") is None
-    assert flight.newest("ESTIMATOR_STATUS") is None
+    for kind in ("ATTITUDE", "ATTITUDE_QUATERNION", "ESTIMATOR_STATUS"):
+        assert flight.newest(kind) is None
     assert flight.newest("HEARTBEAT").system_status == mavlink.MAV_STATE_ACTIVE
     present = flight.newest("SYS_STATUS").onboard_control_sensors_present
     assert present & mavlink.MAV_SYS_STATUS_SENSOR_GPS
     assert not present & mavlink.MAV_SYS_STATUS_AHRS
 
 
-def test_reported_attitude_is_passed_on_with_its_own_time() -> None:
-    flight = Flight()
+def test_reported_attitude_is_passed_on_with_its_own_time(flight: Flight) -> None:
     for _ in range(20):
         flight.wait(0.1)
-        roll, pitch, yaw = 0.2, -0.1, 2.5
-        flight.take(
-            VehicleReport(
-                time_us=flight.now_us - 40_000, node=NODE, attitude_rad=(roll, pitch, yaw)
-            )
-        )
+        flight.report(flight.now_us - 40_000, attitude_rad=(0.2, -0.1, 2.5))
     attitude = flight.newest("ATTITUDE")
     assert attitude.time_boot_ms == (flight.now_us - 40_000) // 1000
-    assert (attitude.roll, attitude.pitch, attitude.yaw) == pytest.approx((roll, pitch, yaw))
+    assert (attitude.roll, attitude.pitch, attitude.yaw) == pytest.approx((0.2, -0.1, 2.5))
     assert math.isnan(attitude.rollspeed), "not reported"
     assert flight.newest("GLOBAL_POSITION_INT") is None
     health = flight.newest("SYS_STATUS").onboard_control_sensors_health
     assert health & mavlink.MAV_SYS_STATUS_AHRS
 
 
-def test_position_of_a_reporting_vehicle_is_that_of_its_fixes_at_once() -> None:
-    flight = Flight()
-    flight.take(VehicleReport(time_us=0, node=NODE, attitude_rad=(0.0, 0.0, 1.0)))
+def test_position_of_a_reporting_vehicle_is_that_of_its_fixes_at_once(flight: Flight) -> None:
+    flight.report(attitude_rad=(0.0, 0.0, 1.0))
     flight.take(fix(50_000))
     position = flight.newest("GLOBAL_POSITION_INT")
     assert (position.lat, position.vx, position.hdg) == (480000000, 1000, 5730)
 
 
-def test_old_attitude_is_not_repeated_with_a_new_position() -> None:
-    flight = Flight()
-    flight.take(VehicleReport(time_us=0, node=NODE, attitude_rad=(0.0, 0.0, 1.0)))
+def test_old_attitude_is_not_repeated_with_a_new_position(flight: Flight) -> None:
+    flight.report(attitude_rad=(0.0, 0.0, 1.0))
     flight.wait(5.0)
     flight.take(fix(flight.now_us))
     assert flight.newest("GLOBAL_POSITION_INT").hdg == 65535
 
 
-def test_battery_mode_arming_and_link_are_passed_on() -> None:
-    flight = Flight()
+def test_battery_mode_arming_and_link_are_passed_on(flight: Flight) -> None:
     battery = BatteryReport(voltage_v=15.8, current_a=12.5, remaining_percent=63.0, used_mah=420.0)
-    report = VehicleReport(
-        time_us=0, node=NODE, battery=battery, mode="ANGL", custom_mode=0, armed=True,
+    flight.report(
+        battery=battery, mode="ANGL", custom_mode=0, armed=True,
         vehicle_type=mavlink.MAV_TYPE_QUADROTOR, link_quality_percent=97.0,
     )  # fmt: skip
-    flight.take(report)
     flight.wait(2.0)
     status = flight.newest("SYS_STATUS")
-    assert (status.voltage_battery, status.current_battery, status.battery_remaining) == (
-        15800,
-        1250,
-        63,
-    )
+    found = (status.voltage_battery, status.current_battery, status.battery_remaining)
+    assert found == (15800, 1250, 63)
     assert flight.newest("BATTERY_STATUS").current_consumed == 420
     heartbeat = flight.newest("HEARTBEAT")
     assert heartbeat.type == mavlink.MAV_TYPE_QUADROTOR
     assert heartbeat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED
     assert flight.newest("RC_CHANNELS").rssi == 97
     assert flight.newest("AVAILABLE_MODES_MONITOR").seq == 1
-    flight.take(VehicleReport(time_us=flight.now_us, node=NODE, armed=False))
+    flight.report(armed=False)
     flight.wait(1.0)
     assert not flight.newest("HEARTBEAT").base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 
-def test_unknown_fields_of_a_battery_are_unknown_and_not_zero() -> None:
-    flight = Flight()
-    flight.take(VehicleReport(time_us=0, node=NODE, battery=BatteryReport(voltage_v=7.4)))
+def test_unknown_fields_of_a_battery_are_unknown_and_not_zero(flight: Flight) -> None:
+    flight.report(battery=BatteryReport(voltage_v=7.4))
     sent = flight.newest("BATTERY_STATUS")
     unknown = (sent.current_battery, sent.current_consumed, sent.battery_remaining)
     assert unknown == (-1, -1, -1)
@@ -155,36 +119,31 @@ def test_unknown_fields_of_a_battery_are_unknown_and_not_zero() -> None:
     assert flight.newest("SYS_STATUS").voltage_battery == 65535, "old"
 
 
-def test_modes_of_unknown_autopilots_have_numbers_of_their_own() -> None:
-    flight = Flight()
+def test_modes_of_unknown_autopilots_have_numbers_of_their_own(flight: Flight) -> None:
     numbers = []
     for mode in ("ALPHA", "BETA", "ALPHA"):
-        flight.take(VehicleReport(time_us=flight.now_us, node=NODE, mode=mode))
+        flight.report(mode=mode)
         flight.wait(1.0)
         numbers.append(flight.newest("HEARTBEAT").custom_mode)
     assert numbers == [1000, 1001, 1000]
 
 
-def test_home_is_set_by_the_first_fix_after_arming() -> None:
-    flight = Flight()
+def test_home_is_set_by_the_first_fix_after_arming(flight: Flight) -> None:
     flight.take(fix(0, 48.0))
-    flight.take(VehicleReport(time_us=0, node=NODE, armed=True))
+    flight.report(armed=True)
     flight.take(fix(200_000, 48.5))
     assert flight.newest("HOME_POSITION").latitude == 485000000
 
 
-def test_samples_of_a_source_are_fused() -> None:
-    flight = Flight()
+def test_samples_of_a_source_are_fused(flight: Flight) -> None:
     for _ in range(400):
         flight.now_us += 10_000
-        sample = imu_raw(flight.now_us, NODE, (0.0, 0.0, 9.81), (0.0, 0.0, 0.0))
-        flight.take(sample)
+        flight.take(imu_raw(flight.now_us, NODE, (0.0, 0.0, 9.81), (0.0, 0.0, 0.0)))
     attitude = flight.newest("ATTITUDE")
     assert (attitude.roll, attitude.pitch) == pytest.approx((0.0, 0.0), abs=0.02)
 
 
-def test_silent_source_is_announced_and_so_is_a_lost_one() -> None:
-    flight = Flight()
+def test_silent_source_is_announced_and_so_is_a_lost_one(flight: Flight) -> None:
     for _ in range(30):
         flight.wait(0.1)
         flight.line(pressure_hpa=1000)
@@ -196,8 +155,7 @@ def test_silent_source_is_announced_and_so_is_a_lost_one() -> None:
     assert not [text for text in flight.texts if "Receiver" in text]
 
 
-def test_signal_of_a_source_is_its_radio_status() -> None:
-    flight = Flight()
+def test_signal_of_a_source_is_its_radio_status(flight: Flight) -> None:
     flight.line(rssi_dbm=-71, snr_db=9)
     flight.wait(2.5)
     radio = flight.newest("RADIO_STATUS")
@@ -214,16 +172,15 @@ def test_packets_of_radiohead_through_the_receiver_are_lines() -> None:
         packet = b"\xff\x01\x00\x00" + b'{"pressure_hpa": 990}'
         head = struct.pack("<BBBIBb", 0x14, number, 0xFF, number * 500_000, 104, 20)
         flight.now_us += 500_000
-        flight._keep(flight.pipeline.feed(encode_frame(head + packet), flight.now_us))
+        flight.keep(flight.pipeline.feed(encode_frame(head + packet), flight.now_us))
     flight.wait(2.0)
     assert flight.newest("SCALED_PRESSURE").press_abs == 990.0
     assert flight.newest("SCALED_PRESSURE").get_srcSystem() == 5
     assert flight.newest("RADIO_STATUS").rssi - 256 == -104
 
 
-def test_faults_are_counted_with_the_newest_explained() -> None:
-    flight = Flight()
-    flight.pipeline.feed_source(flight.source, b"one\n{\ntwo\n", 0)
+def test_faults_are_counted_with_the_newest_explained(flight: Flight) -> None:
+    flight.feed(b"one\n{\ntwo\n")
     flight.wait(2.0)
     (report,) = flight.pipeline.report.sources
     assert report.faults == (("json", 1), ("text", 2))
@@ -231,22 +188,25 @@ def test_faults_are_counted_with_the_newest_explained() -> None:
 
 
 @pytest.mark.parametrize(
-    ("url", "found"),
+    ("url", "transport", "address", "port"),
     [
-        ("lines:/dev/ttyUSB0", ("lines", "serial", "/dev/ttyUSB0", 0)),
-        ("lines:usb:1a86:7523", ("lines", "serial", "usb:1a86:7523", 0)),
-        ("lines:udp:0.0.0.0:5600", ("lines", "udp", "0.0.0.0", 5600)),
-        ("lines-udp:0.0.0.0:5600", ("lines", "udp", "0.0.0.0", 5600)),
-        ("lines-tcp-listen:[::1]:70", ("lines", "tcp-listen", "::1", 70)),
-        ("lines:tcp:host:70?id=4", ("lines", "tcp", "host", 70)),
-        ("lines:stdin", ("lines", "stdin", "", 0)),
-        ("lines:-", ("lines", "stdin", "", 0)),
-        ("lines:file:/tmp/a:b", ("lines", "file", "/tmp/a:b", 0)),
+        ("lines:/dev/ttyUSB0", "serial", "/dev/ttyUSB0", 0),
+        ("lines:usb:1a86:7523", "serial", "usb:1a86:7523", 0),
+        ("lines:udp:0.0.0.0:5600", "udp", "0.0.0.0", 5600),
+        ("lines-udp:0.0.0.0:5600", "udp", "0.0.0.0", 5600),
+        ("lines-tcp-listen:[::1]:70", "tcp-listen", "::1", 70),
+        ("lines:tcp:host:70?id=4", "tcp", "host", 70),
+        ("lines:stdin", "stdin", "", 0),
+        ("lines:-", "stdin", "", 0),
+        ("lines:file:/tmp/a:b", "file", "/tmp/a:b", 0),
     ],
 )
-def test_url_names_kind_transport_and_place(url: str, found: tuple[Any, ...]) -> None:
-    parsed = parse_source(url)
-    assert (parsed.kind, parsed.transport, parsed.address, parsed.port) == found
+def test_url_has_kind_transport_and_address(
+    url: str, transport: str, address: str, port: int
+) -> None:
+    found = parse_source(url)
+    parts = (found.kind, found.transport, found.address, found.port)
+    assert parts == ("lines", transport, address, port)
 
 
 @pytest.mark.parametrize(
@@ -280,12 +240,10 @@ def test_sources_are_vehicles_by_their_place_unless_a_vehicle_is_set() -> None:
     assert nodes_of(settings) == [NodeId(1, 8), NodeId(7, 8), NodeId(7, 9)]
 
 
-def test_reported_home_and_height_are_used_and_small_steps_are_not() -> None:
-    flight = Flight()
+def test_reported_home_and_height_are_used_and_small_steps_are_not(flight: Flight) -> None:
     flight.take(fix(0, 48.0))
     for lat in (48.01, 48.0101):
-        report = VehicleReport(time_us=0, node=NODE, home=(lat, 11.0, 480.0), alt_home_m=33.0)
-        flight.take(report)
+        flight.report(home=(lat, 11.0, 480.0), alt_home_m=33.0)
         flight.take(fix(flight.now_us, 48.0))
         flight.wait(1.1)
     assert flight.newest("HOME_POSITION").latitude == 480100000

@@ -5,56 +5,36 @@ from typing import Any
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import AircraftSettings
 from gateway.estimation.select import EstimationSettings
-from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import FusedSample, ImuFlags, ImuRaw, Incoming, NodeId
-from tests.kit.ground_station import command, decode, of_kind
+from gateway.records import FusedSample, Incoming
+from tests.kit.ground_station import command, of_kind
 from tests.kit.mavlink import packed
-
-LEVEL = ImuRaw(
-    time_us=0,
-    node=NodeId(1, 0),
-    node_time_us=0,
-    accel_raw=(0, 0, 4096),
-    gyro_raw=(0, 0, 0),
-    mag_raw=(218, 0, 431),
-    temperature_raw=-3920,
-    accel_range_g=8,
-    gyro_range_dps=1000,
-    mag_lsb_per_gauss=1090,
-    flags=ImuFlags.MAG_NEW,
-)
-"""At rest, face up: one gravity upwards in sensor axes."""
+from tests.kit.pipeline_bench import PipelineBench
+from tests.kit.records import raw_at
 
 
-class Bench:
+class Bench(PipelineBench):
     """A pipeline with one aircraft on the table and one ground station."""
 
     def __init__(self, estimator: str = "paper") -> None:
-        settings = AircraftSettings(estimation=EstimationSettings(estimator=estimator))
-        self.pipeline = Pipeline(PipelineSettings(settings))
-        self.time_us = 0
-        self.reported: list[Any] = []
+        super().__init__(AircraftSettings(estimation=EstimationSettings(estimator=estimator)))
 
     def run(self, seconds: float, **changes: Any) -> FusedSample:
         """Let raw samples come at 100 Hz; the last one fused."""
         fused = []
         for _ in range(round(seconds * 100)):
-            self.time_us += 10_000
-            raw = replace(LEVEL, time_us=self.time_us, node_time_us=self.time_us, **changes)
-            out = self.pipeline.feed_record(raw, self.time_us)
+            self.now_us += 10_000
+            out = self.take(raw_at(self.now_us, **changes))
             fused += [record for record in out.records if isinstance(record, FusedSample)]
-            self.reported += decode(out.frames)
-            self.reported += decode(self.pipeline.poll(self.time_us).frames)
+            self.keep(self.pipeline.poll(self.now_us))
         return fused[-1]
 
     def send(self, message: Any) -> None:
         incoming = Incoming(7, packed(message, 255, 190), trusted=True)
-        self.reported += decode(self.pipeline.handle(incoming, self.time_us).frames)
+        self.keep(self.pipeline.handle(incoming, self.now_us))
 
     def set(self, name: str, value: float) -> None:
         kind = mavlink.MAV_PARAM_TYPE_REAL32
@@ -64,7 +44,7 @@ class Bench:
         self.send(command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, *params))
 
     def parameters(self) -> dict[str, float]:
-        return {m.param_id: m.param_value for m in of_kind(self.reported, "PARAM_VALUE")}
+        return {m.param_id: m.param_value for m in of_kind(self.messages, "PARAM_VALUE")}
 
 
 @pytest.fixture
@@ -120,7 +100,7 @@ def test_mounting_angle_out_of_range_changes_nothing(bench: Bench) -> None:
     before = bench.pipeline.aircraft[1].settings.calibration
     for name, angle in (("CAL_MNT_PIT", 91.0), ("CAL_MNT_YAW", -181.0), ("CAL_MNT_ROLL", math.nan)):
         bench.set(name, angle)
-        assert bench.reported[-2].get_type() == "PARAM_ERROR"
+        assert bench.messages[-2].get_type() == "PARAM_ERROR"
     assert bench.pipeline.aircraft[1].settings.calibration == before
 
 
@@ -145,12 +125,9 @@ def test_changed_weight_does_not_restart_the_estimator(bench: Bench) -> None:
     assert bench.run(1.0).state.q_nb == pytest.approx(before, abs=1e-2), "the compass is left out"
 
 
-@pytest.mark.parametrize(
-    ("estimator", "name", "value"),
-    [("eskf", "ESKF_MAG_NOISE", 3.0), ("eskf", "REF_GPS_LATENCY", 0.2)],
-)
-def test_retuned_kalman_filter_keeps_its_state(estimator: str, name: str, value: float) -> None:
-    bench = Bench(estimator)
+@pytest.mark.parametrize(("name", "value"), [("ESKF_MAG_NOISE", 3.0), ("REF_GPS_LATENCY", 0.2)])
+def test_retuned_kalman_filter_keeps_its_state(name: str, value: float) -> None:
+    bench = Bench("eskf")
     before = bench.run(5.0).state
     bench.set(name, value)
     after = bench.run(0.01).state

@@ -5,7 +5,7 @@ import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.records import ImuFlags, NavFlags, Outgoing
+from gateway.records import GpsFix, ImuFlags, NavFlags, NavState, Outgoing
 from gateway.vehicle.plan import Location, StoredPlan
 from gateway.vehicle.service import INFO
 from gateway.vehicle.vehicle import Vehicle
@@ -18,6 +18,8 @@ from tests.kit.records import (
     GPS_NODE,
     NO_FIX,
     NOTHING,
+    SAMPLE,
+    STATE,
     fix_at,
     link,
     report,
@@ -33,15 +35,23 @@ def make(**changes: Any) -> Vehicle:
     return Vehicle(VehicleSettings(**changes), system_id=1)
 
 
-def fly(vehicle: Vehicle, start_s: int, seconds: int, **state: Any) -> list[Outgoing]:
+def fly(
+    vehicle: Vehicle,
+    start_s: int,
+    seconds: int,
+    state: NavState = STATE,
+    fix: GpsFix | None = FIX,
+    **changes: Any,
+) -> list[Outgoing]:
     """Feed IMU at 200 Hz, GPS at 5 Hz and the barometer at 20 Hz, polling as asked to."""
     found = []
     for time_us in range(start_s * ONE_S, (start_s + seconds) * ONE_S, 5_000):
-        found += vehicle.on_state(state_at(time_us, **state), sample_at(time_us), time_us)
+        now = replace(state, time_us=time_us, **changes)
+        found += vehicle.on_state(now, sample_at(time_us), time_us)
         if time_us % 50_000 == 0:
             found += vehicle.on_baro(replace(BARO, time_us=time_us), time_us)
-        if time_us % 200_000 == 0:
-            found += vehicle.on_gps(fix_at(time_us), time_us)
+        if fix is not None and time_us % 200_000 == 0:
+            found += vehicle.on_gps(replace(fix, time_us=time_us), time_us)
         if vehicle.next_due_us() <= time_us:
             found += vehicle.poll(time_us)
     return found
@@ -83,12 +93,7 @@ def test_rate_of_zero_disables_a_message() -> None:
 
 
 def test_attitude_is_sent_without_a_position_and_positions_are_not() -> None:
-    vehicle = make()
-    found = []
-    for time_us in range(0, 10 * ONE_S, 5_000):
-        state = replace(NOTHING, time_us=time_us)
-        found += vehicle.on_state(state, sample_at(time_us, mag_b_ut=None), time_us)
-        found += vehicle.poll(time_us)
+    found = fly(make(), 0, 10, NOTHING, fix=None)
     counted = Counter(kinds(found))
     assert counted["ATTITUDE_QUATERNION"] == pytest.approx(500, abs=1)
     assert counted["VFR_HUD"] == pytest.approx(100, abs=1)
@@ -101,9 +106,7 @@ def test_position_goes_on_while_dead_reckoned() -> None:
     vehicle = make()
     fly(vehicle, 0, 2)
     flags = NavFlags.ATTITUDE_VALID | NavFlags.DEAD_RECKONING | NavFlags.DEGRADED
-    found = []
-    for time_us in range(2 * ONE_S, 12 * ONE_S, 5_000):
-        found += vehicle.on_state(state_at(time_us, flags=flags), sample_at(time_us), time_us)
+    found = fly(vehicle, 2, 10, fix=None, flags=flags)
     assert kinds(found).count("GLOBAL_POSITION_INT") == pytest.approx(100, abs=1)
 
 
@@ -221,59 +224,24 @@ def test_link_and_nodes_are_reported() -> None:
         assert texts(vehicle.on_link(found, time_s * ONE_S)) == expected
 
 
-def test_good_news_has_severity_info() -> None:
-    """Stations speak a NOTICE and show it as trouble."""
-    vehicle = make()
-    said = fly(vehicle, 0, 2) + vehicle.on_link(report(link(), connected=False), ONE_S)
-    said += vehicle.on_link(report(link(last_time_us=30 * ONE_S)), 30 * ONE_S)
-    severities = {m.text: m.severity for m in of_kind(said, "STATUSTEXT")}
-    assert {"GPS fix", "Receiver connected: /dev/ttyUSB0"} <= severities.keys()
-    trouble = {text for text, severity in severities.items() if severity < INFO}
-    assert trouble == {"Receiver lost: /dev/ttyUSB0"}
-
-
-def test_restarted_node_is_reported() -> None:
-    vehicle = make()
-    assert "Node 0 restarted" not in texts(vehicle.on_link(report(link(restarts=3)), ONE_S))
-    assert texts(vehicle.on_link(report(link(restarts=4)), ONE_S)) == ["Node 0 restarted"]
-
-
-def test_node_that_keeps_restarting_is_reported_once() -> None:
-    """As with two trackers of one id, whose stamps disagree with each sample."""
-    vehicle, reported = make(), []
-    for second in range(60):
-        now_us = (second + 1) * ONE_S
-        alive = link(restarts=100 * min(second, 20), last_time_us=now_us)
-        reported += texts(vehicle.on_link(report(alive), now_us))
-    assert reported == [
-        "Receiver connected: /dev/ttyUSB0",
-        "Node 0 keeps restarting, or two nodes share id 0",
-        "Node 0 no longer restarts",
-    ]
-
-
-def test_compass_with_wrong_axes_is_reported_once_with_the_remedy() -> None:
-    vehicle, reported = make(), []
-    for time_us in range(0, 20 * ONE_S, ONE_S // 10):
-        state = state_at(time_us, flags=NavFlags.MAG_MISPLACED | NavFlags.MAG_DISTURBED)
-        reported += texts(vehicle.on_state(state, sample_at(time_us), time_us))
-    assert reported == ["Compass axes wrong, not used: check CAL_MAG_MNT"]
-
-
 @pytest.mark.parametrize(
-    ("flag", "sensor"),
-    [(ImuFlags.MAG_UNCALIBRATED, "Compass"), (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer")],
+    ("restarts", "expected"),
+    [
+        ([3, 4], ["Node 0 restarted"]),
+        # As with two trackers of one id, whose stamps disagree with each sample.
+        (
+            [100 * min(second, 20) for second in range(60)],
+            ["Node 0 keeps restarting, or two nodes share id 0", "Node 0 no longer restarts"],
+        ),
+    ],
+    ids=["once", "repeatedly"],
 )
-def test_uncalibrated_sensor_is_reported_until_it_is_calibrated(
-    flag: ImuFlags, sensor: str
-) -> None:
+def test_restarts_of_a_node_are_reported(restarts: list[int], expected: list[str]) -> None:
     vehicle, reported = make(), []
-    for time_us in range(0, 20 * ONE_S, ONE_S // 10):
-        flags = flag if time_us < 10 * ONE_S else ImuFlags(0)
-        field = None if time_us % ONE_S else (20.0, 0.0, 43.0)
-        sample = sample_at(time_us, flags=flags, mag_b_ut=field)
-        reported += texts(vehicle.on_state(state_at(time_us, flags=NavFlags(0)), sample, time_us))
-    assert reported == [f"{sensor} not calibrated", f"{sensor} calibrated"]
+    for second, number in enumerate(restarts, 1):
+        alive = link(restarts=number, last_time_us=second * ONE_S)
+        reported += texts(vehicle.on_link(report(alive), second * ONE_S))
+    assert reported == ["Receiver connected: /dev/ttyUSB0", *expected]
 
 
 @pytest.mark.parametrize(
@@ -316,63 +284,75 @@ def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
 LOST = NavFlags.DEAD_RECKONING | NavFlags.DEGRADED
 REJECTED = LOST | NavFlags.GPS_REJECTED
 FAULT = NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
-FINE = state_at(0).flags
+MISPLACED = NavFlags.MAG_MISPLACED | NavFlags.MAG_DISTURBED
+FINE = STATE.flags
 NO_ATTITUDE = ~(NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID)
-GPS_STATUS = status(node=GPS_NODE, sensors_present=1 << 3)
+BEGIN_S = 20
 
 EVENTS: dict[str, tuple[dict[str, Any], list[str]]] = {
-    "no fix": ({"fix": NO_FIX, "flags": FINE | LOST}, ["GPS fix lost", "GPS fix"]),
-    "no data from the receiver": ({"fix": None, "flags": FINE | LOST}, ["GPS fix lost", "GPS fix"]),
+    "no fix": ({"fix": NO_FIX, "flags": LOST}, ["GPS fix lost", "GPS fix"]),
+    "no data from the receiver": ({"fix": None, "flags": LOST}, ["GPS fix lost", "GPS fix"]),
     "silent node": (
-        {"fix": None, "node": False, "flags": FINE | LOST},
-        ["GPS node 1 silent", "GPS node 1 is back"],
+        {"fix": None, "node": False, "flags": LOST}, ["GPS node 1 silent", "GPS node 1 is back"],
     ),
     "receiver unplugged": (
-        {"fix": None, "link": False, "flags": FINE | LOST},
+        {"fix": None, "link": False, "flags": LOST},
         ["Receiver lost: port", "Receiver connected: port"],
     ),
-    "rejected fixes": ({"flags": FINE | REJECTED}, ["GPS fixes rejected", "GPS accepted again"]),
+    "rejected fixes": ({"flags": REJECTED}, ["GPS fixes rejected", "GPS accepted again"]),
     "useless fixes": (
-        {"flags": FINE | LOST},
-        ["Position is dead-reckoned", "Position follows GPS again"],
+        {"flags": LOST}, ["Position is dead-reckoned", "Position follows GPS again"],
     ),
     "faulty sensor": (
-        {"flags": (FINE & NO_ATTITUDE) | FAULT},
-        ["Sensor fault", "Sensors OK again"],
+        {"valid": NO_ATTITUDE, "flags": FAULT}, ["Sensor fault", "Sensors OK again"],
     ),
-    "lost attitude": ({"flags": FINE & NO_ATTITUDE}, ["Attitude not valid", "Attitude valid"]),
+    "lost attitude": ({"valid": NO_ATTITUDE}, ["Attitude not valid", "Attitude valid"]),
     "disturbed field": (
-        {"flags": FINE & ~NavFlags.HEADING_VALID | NavFlags.MAG_DISTURBED},
+        {"valid": ~NavFlags.HEADING_VALID, "flags": NavFlags.MAG_DISTURBED},
         ["Magnetic field disturbed", "Magnetic field normal again"],
     ),
-    "short outage": ({"flags": FINE | LOST, "seconds": 3}, []),
-}
+    "misplaced compass": (
+        {"flags": MISPLACED},
+        ["Compass axes wrong, not used: check CAL_MAG_MNT", "Compass axes right again"],
+    ),
+    "uncalibrated compass": (
+        {"sample": ImuFlags.MAG_UNCALIBRATED}, ["Compass not calibrated", "Compass calibrated"],
+    ),
+    "uncalibrated accelerometer": (
+        {"sample": ImuFlags.ACCEL_UNCALIBRATED},
+        ["Accelerometer not calibrated", "Accelerometer calibrated"],
+    ),
+    "short outage": ({"flags": LOST, "seconds": 3}, []),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", EVENTS)
 def test_one_cause_is_announced_once_and_so_is_its_end(name: str) -> None:
+    """The end has the severity INFO: stations speak a NOTICE and show it as trouble."""
     event, expected = EVENTS[name]
     vehicle, reported = make(), []
-    vehicle.on_node_status(GPS_STATUS, 0)
+    vehicle.on_node_status(status(node=GPS_NODE, sensors_present=1 << 3), 0)
     last_us = 0
     for time_us in range(0, 60 * ONE_S, ONE_S // 5):
-        begin_s = 20
-        is_on = begin_s <= time_us / ONE_S < begin_s + event.get("seconds", 20)
-        now = event if is_on else {}
+        now = event if BEGIN_S <= time_us / ONE_S < BEGIN_S + event.get("seconds", 20) else {}
         # The estimator notices an outage after a while.
-        flags = now["flags"] if now and time_us >= (begin_s + 1.5) * ONE_S else FINE
-        found = [*vehicle.on_state(state_at(time_us, flags=flags), sample_at(time_us), time_us)]
+        seen = now if time_us >= (BEGIN_S + 1.5) * ONE_S else {}
+        state = state_at(time_us, flags=FINE & seen.get("valid", FINE) | seen.get("flags", 0))
+        # The field is not new in every sample.
+        field = None if time_us % ONE_S else SAMPLE.mag_b_ut
+        sample = sample_at(time_us, flags=now.get("sample", ImuFlags(0)), mag_b_ut=field)
+        found = [*vehicle.on_state(state, sample, time_us)]
         if (fix := now.get("fix", FIX)) is not None:
             found += vehicle.on_gps(replace(fix, time_us=time_us), time_us)
         if time_us % ONE_S == 0:
             last_us = time_us if now.get("node", True) else last_us
-            seen = link(node=GPS_NODE, last_time_us=last_us)
-            connected = now.get("link", True)
-            found += vehicle.on_link(
-                report(seen, time_us=time_us, port="port", connected=connected), time_us
-            )
-        reported += [(time_us, text) for text in texts([*found, *vehicle.poll(time_us)])]
-    assert [text for time_us, text in reported if time_us >= 20 * ONE_S] == expected
+            node = link(node=GPS_NODE, last_time_us=last_us)
+            line = report(node, time_us=time_us, port="port", connected=now.get("link", True))
+            found += vehicle.on_link(line, time_us)
+        texts_now = of_kind([*found, *vehicle.poll(time_us)], "STATUSTEXT")
+        reported += texts_now if time_us >= BEGIN_S * ONE_S else []
+    assert [message.text for message in reported] == expected
+    assert [message.severity < INFO for message in reported] == [True, False][: len(expected)]
 
 
 def test_lost_gps_is_no_failed_attitude() -> None:
