@@ -1,5 +1,8 @@
 """MAVLink systems that encode numbered frames, and readers of their bytes."""
 
+import math
+import random
+import struct
 from typing import Any
 
 from pymavlink.dialects.v20 import all as every_dialect
@@ -33,6 +36,43 @@ def packed(
         link.signing.secret_key, link.signing.link_id, link.signing.timestamp = signing
         link.signing.sign_outgoing = True
     return bytes(message.pack(link, force_mavlink1=version == 1))
+
+
+INTEGER_BITS = {"int8_t": 8, "int16_t": 16, "int32_t": 32, "int64_t": 54}
+INTEGER_BITS |= {f"u{form}": min(bits, 53) for form, bits in INTEGER_BITS.items()}
+"""Bits of a field's type; of the longest those that JSON transports."""
+
+
+def random_message(
+    kind: Any, chance: random.Random, letters: bytes = b"ABCxyz_09", **given: Any
+) -> Any:
+    """Fill a message with values that its fields can have, half of them zero."""
+
+    def value(name: str, form: str) -> Any:
+        if chance.random() < 0.5:
+            return 0
+        if form in ("float", "double"):
+            bits = chance.randbytes(8)
+            some = struct.unpack("<d" if form == "double" else "<fxxxx", bits)[0]
+            return chance.choice([-1.5, math.nan, math.inf, some, chance.uniform(-1e6, 1e6)])
+        low = 0 if form.startswith("u") else -(1 << INTEGER_BITS[form] - 1)
+        span = range(low, low + (1 << INTEGER_BITS[form]))
+        enum = kind.fieldenums_by_name.get(name)
+        if enum and kind.fielddisplays_by_name.get(name) != "bitmask" and chance.random() < 0.8:
+            return chance.choice([each for each in every_dialect.enums[enum] if each in span])
+        return chance.choice(span)
+
+    lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
+    for name, form in zip(kind.fieldnames, kind.fieldtypes, strict=True):
+        if name in given:
+            continue
+        if form == "char":
+            size = chance.randint(0, lengths[name]) if lengths[name] else 1
+            given[name] = bytes(chance.choices(letters, k=size))
+        else:
+            several = [value(name, form) for _ in range(lengths[name] or 1)]
+            given[name] = several if lengths[name] else several[0]
+    return kind(**given)
 
 
 class Sender:

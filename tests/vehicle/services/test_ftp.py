@@ -3,15 +3,13 @@
 import json
 import lzma
 import struct
-from typing import Any
 
 import numpy as np
 import pytest
 from MAVProxy.modules.lib.param_ftp import ftp_param_decode
 
 from gateway.aircraft import AircraftSettings
-from gateway.vehicle.services import ftp as ftp_service
-from gateway.vehicle.services.ftp import ACK, NAK, FtpError, Opcode, Packet, crc32
+from gateway.vehicle.services.ftp import ACK, MAX_SESSIONS, NAK, FtpError, Opcode, Packet, crc32
 from gateway.vehicle.services.parameters import PARAMETER_PATH, Metadata, ParameterTable
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
@@ -229,12 +227,9 @@ def test_sessions_of_an_untrusted_client_close_no_others(ftp: FtpClient) -> None
     assert ftp.ask(Opcode.READ_FILE, session=session, size=9).opcode == ACK
 
 
-def test_untrusted_sessions_give_way_to_a_trusted_client(
-    ftp: FtpClient, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ftp_service, "MAX_SESSIONS", 12)
-    untrusted = [FtpClient(ftp.station.other(100 + n, trusted=False)) for n in range(4)]
-    opened: list[Any] = [each.open(GENERAL).opcode for each in untrusted[:3] for _ in range(4)]
-    assert opened == [ACK] * 12
-    assert refusal(untrusted[3].open(GENERAL)) == FtpError.NO_SESSIONS
+def test_untrusted_sessions_give_way_to_a_trusted_client(ftp: FtpClient) -> None:
+    untrusted = [FtpClient(ftp.station.other(100 + n, trusted=False)) for n in range(65)]
+    opened = [each.open(GENERAL).opcode for each in untrusted[:64] for _ in range(4)]
+    assert opened == [ACK] * MAX_SESSIONS + [NAK]
+    assert refusal(untrusted[64].open(GENERAL)) == FtpError.NO_SESSIONS
     assert ftp.open(GENERAL).opcode == ACK
