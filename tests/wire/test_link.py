@@ -1,5 +1,6 @@
 """One receiver's line: records on the gateway clock, and an account that adds up."""
 
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from itertools import pairwise
 
@@ -13,9 +14,11 @@ from gateway.records import (
     GpsFixType,
     ImuFlags,
     ImuRaw,
+    LinkReport,
     NodeId,
     NodeStatus,
     PipeCounters,
+    RawRecord,
 )
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
@@ -48,6 +51,15 @@ class Line:
         self.frame_seq = (self.frame_seq + 1) % 256
         return encode_frame(content)
 
+    def send(self, link: Link, numbers: Iterable[int], start_us: int = 0) -> list[RawRecord]:
+        """Send IMU payloads of 100 Hz by their numbers, which arrive as they are sampled."""
+        times_us = [number * 10_000 for number in numbers]
+        return [r for us in times_us for r in link.feed(self.frame(us, IMU), start_us + us)]
+
+
+def report(link: Link, now_us: int = 0) -> LinkReport:
+    return link.report(now_us, connected=True, port="")
+
 
 @pytest.mark.parametrize(
     ("sequence", "received", "lost", "duplicates", "reordered"),
@@ -76,15 +88,10 @@ def test_sequence_numbers_are_counted_by_kind(
 
 @pytest.mark.parametrize("seed", range(5))
 def test_counts_equal_the_losses_and_duplicates_made(seed: int) -> None:
-    """Random loss, duplicates and swaps: the counts equal what was really done."""
     rng = np.random.default_rng(seed)
     sent = np.arange(5000)
     kept = sent[(rng.random(sent.size) > 0.1) | (sent == 0) | (sent == sent[-1])].tolist()
-    line = []
-    for seq in kept:
-        line.append(seq)
-        if rng.random() < 0.05:
-            line.append(seq)
+    line = [seq for seq in kept for _ in range(1 + (rng.random() < 0.05))]
     counter = SequenceCounter()
     arrivals = [counter.count((seq + 64_000) % 65536) for seq in line]
     assert counter.received == len(kept)
@@ -121,8 +128,7 @@ def test_barometer_and_status_payloads_become_records() -> None:
     status = payloads.NodeStatusPayload((1, 2), 8, 7, 1, 3, 4, 5, 600, 100, 3300)
     (record,) = link.feed(line.frame(1000, status), 1000)
     assert isinstance(record, NodeStatus)
-    assert record.firmware_version == (1, 2)
-    assert record.supply_mv == 3300
+    assert (record.firmware_version, record.supply_mv) == ((1, 2), 3300)
 
 
 def test_fix_has_the_quality_of_its_own_epoch() -> None:
@@ -141,10 +147,7 @@ def test_fix_has_the_quality_of_its_own_epoch() -> None:
 def test_accuracy_of_a_fix_without_its_quality_is_unknown() -> None:
     line, link = Line(1, 1), Link()
     link.feed(line.frame(0, QUALITY), 0)
-    later = payloads.GpsFixPayload(
-        1200, -77_000_000, 1_103_000_000, 110_000, (0, 0, 0), GpsFixType.FIX_3D, True, 11
-    )
-    (fix,) = link.feed(line.frame(200_000, later), 200_000)
+    (fix,) = link.feed(line.frame(200_000, replace(FIX, itow_ms=1200)), 200_000)
     assert np.isnan([fix.h_acc_m, fix.v_acc_m, fix.speed_acc_mps, fix.course_acc_deg]).all()
     assert fix.utc_us is None
     assert fix.alt_ellipsoid_m == pytest.approx(133.0), "the geoid does not move"
@@ -157,18 +160,17 @@ def test_duplicates_and_late_payloads_give_no_records() -> None:
     records = [r for i in order for r in link.feed(frames[i], 50_000 + i * 10_000)]
     assert [r.node_time_us // 10_000 for r in records] == [0, 1, 3, 4, 5]
     assert all(a.time_us < b.time_us for a, b in pairwise(records))
-    (node,) = link.report(0, connected=True, port="").nodes
+    (node,) = report(link).nodes
     assert (node.received, node.lost, node.duplicates, node.reordered) == (6, 0, 2, 1)
 
 
 def test_node_restart_is_counted_and_loses_no_payload() -> None:
     line, link = Line(), Link()
-    for i in range(50):
-        link.feed(line.frame(i * 10_000, IMU), 100_000_000 + i * 10_000)
+    line.send(link, range(50), 100_000_000)
     line.seq = 0
     (record,) = link.feed(line.frame(70_000, IMU), 103_000_000)
     assert record.time_us == 103_000_000
-    (node,) = link.report(0, connected=True, port="").nodes
+    (node,) = report(link).nodes
     assert (node.lost, node.restarts) == (0, 1)
 
 
@@ -177,18 +179,12 @@ def test_halted_clock_is_a_restart_only_if_the_sequence_starts_again(
     next_seq: int, restarts: int
 ) -> None:
     line, link = Line(), Link()
-    for i in range(200):
-        link.feed(line.frame(i * 10_000, IMU), 100_000_000 + i * 10_000)
+    line.send(link, range(200), 100_000_000)
     line.seq = next_seq
-    late_us = 104_000_000
-    records = [
-        record
-        for i in range(200, 1200)
-        for record in link.feed(line.frame(i * 10_000, IMU), late_us + i * 10_000)
-    ]
-    assert records[-1].time_us == late_us + 1199 * 10_000
+    records = line.send(link, range(200, 1200), 104_000_000)
+    assert records[-1].time_us == 104_000_000 + 1199 * 10_000
     assert all(a.time_us < b.time_us for a, b in pairwise(records))
-    (node,) = link.report(0, connected=True, port="").nodes
+    (node,) = report(link).nodes
     assert (node.lost, node.restarts) == (0, restarts)
 
 
@@ -231,7 +227,7 @@ def test_date_before_the_protocol_is_a_fault_and_not_used(year: int, counted: in
     assert isinstance(fix, GpsFix)
     assert (fix.utc_us is None) == bool(counted)
     assert fix.h_acc_m == 1.5
-    faults = dict(link.report(0, connected=True, port="").faults)
+    faults = dict(report(link).faults)
     assert faults == ({"gps_date": counted} if counted else {})
 
 
@@ -240,7 +236,7 @@ def test_constant_sequence_number_is_a_fault(first: int) -> None:
     line, link = Line(), Link()
     for number in range(first + 20):
         link.feed(line.frame(number * 10_000, IMU, seq=min(number, first)), number * 10_000)
-    assert dict(link.report(0, connected=True, port="").faults) == {"sequence": 19}
+    assert dict(report(link).faults) == {"sequence": 19}
 
 
 def test_duplicate_and_late_payloads_are_no_fault() -> None:
@@ -249,32 +245,29 @@ def test_duplicate_and_late_payloads_are_no_fault() -> None:
     for number, stamp in enumerate(stamps):
         frame = line.frame((WRAP_US - 20_000 + stamp * 10_000) % WRAP_US, IMU, seq=stamp)
         link.feed(frame, 1_000_000 + number * 10_000)
-    report = link.report(0, connected=True, port="")
-    assert report.faults == ()
-    assert (report.nodes[0].duplicates, report.nodes[0].reordered) == (3, 1)
+    found = report(link)
+    assert found.faults == ()
+    assert (found.nodes[0].duplicates, found.nodes[0].reordered) == (3, 1)
 
 
 def test_receiver_restart_is_no_serial_loss() -> None:
     line, link = Line(), Link()
-    for i in range(10):
-        link.feed(line.frame(20_000_000 + i * 10_000, IMU), 20_000_000 + i * 10_000)
+    line.send(link, range(2000, 2010))
     line.frame_seq = 0
     link.feed(line.frame(0, IMU, seq=10), 25_000_000)
-    assert link.report(0, connected=True, port="").frames_lost == 0
+    assert report(link).frames_lost == 0
 
 
 def test_aircraft_of_one_receiver_are_counted_separately() -> None:
     link = Link()
     lines = [Line(vehicle, node) for vehicle in (1, 2, 3) for node in (0, 1)]
-    frame_seq = 0
-    for i in range(10):
-        for line in lines:
-            line.frame_seq, frame_seq = frame_seq, (frame_seq + 1) % 256
-            link.feed(line.frame(i * 10_000, IMU), i * 10_000)
-    report = link.report(90_000, connected=True, port="pty")
-    assert {node.node for node in report.nodes} == {line.node for line in lines}
-    assert all(node.received == 10 and node.lost == 0 for node in report.nodes)
-    assert report.frames_lost == 0
+    for i in range(60):
+        lines[i % 6].frame_seq = i
+        lines[i % 6].send(link, [i // 6])
+    found = report(link, 90_000)
+    assert {node.node for node in found.nodes} == {line.node for line in lines}
+    assert all(node.received == 10 and node.lost == 0 for node in found.nodes)
+    assert found.frames_lost == 0
 
 
 def test_serial_and_radio_losses_are_counted_separately() -> None:
@@ -283,12 +276,10 @@ def test_serial_and_radio_losses_are_counted_separately() -> None:
     frames[4] = frames[4][:5] + b"\x55" + frames[4][6:]
     del frames[7]
     link.feed(b"".join(frames), 0)
-    report = link.report(0, connected=True, port="pty")
-    assert dict(report.faults) == {"crc": 1}
-    assert report.frames == 8
-    assert report.frames_lost == 2
-    assert report.nodes[0].lost == 2
-    assert report.bytes_received == sum(map(len, frames))
+    found = report(link)
+    assert dict(found.faults) == {"crc": 1}
+    assert (found.frames, found.frames_lost, found.nodes[0].lost) == (8, 2, 2)
+    assert found.bytes_received == sum(map(len, frames))
 
 
 def test_receiver_status_is_reported() -> None:
@@ -296,36 +287,30 @@ def test_receiver_status_is_reported() -> None:
     status = payloads.ReceiverStatusFrame(0, 5_000_000, 76, 12, 3, 1, pipes)
     link = Link()
     assert link.feed(encode_frame(payloads.encode_receiver_status(status)), 7_000_000) == []
-    receiver = link.report(0, connected=True, port="").receiver
+    receiver = report(link).receiver
     assert receiver is not None
     assert (receiver.time_us, receiver.noise_percent, receiver.pipes) == (7_000_000, 12, pipes)
 
 
 def test_rate_is_that_of_the_last_second() -> None:
     line, link = Line(), Link()
-    for i in range(300):
-        link.feed(line.frame(i * 10_000, IMU), i * 10_000)
-    assert link.report(2_990_000, connected=True, port="").nodes[0].rate_hz == 100.0
-    assert link.report(5_000_000, connected=True, port="").nodes[0].rate_hz == 0.0
+    line.send(link, range(300))
+    assert report(link, 2_990_000).nodes[0].rate_hz == 100.0
+    assert report(link, 5_000_000).nodes[0].rate_hz == 0.0
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_line_with_a_tenth_of_corrupt_bytes_gives_only_true_records(seed: int) -> None:
-    """Never an exception, never a wrong record, and all good frames come out."""
     rng = np.random.default_rng(seed)
     line, link = Line(), Link()
     stream = bytearray(b"".join(line.frame(i * 5_000, IMU) for i in range(2000)))
     hit = rng.random(len(stream)) < 0.10
     for index in np.flatnonzero(hit):
         stream[index] ^= int(rng.integers(1, 256))
-    bounds = np.flatnonzero(~hit & (np.frombuffer(stream, np.uint8) == 0))
-    records = [
-        record
-        for chunk in np.array_split(np.frombuffer(bytes(stream), np.uint8), 97)
-        for record in link.feed(chunk.tobytes(), 10_000_000)
-    ]
-    assert bounds.size
-    report = link.report(0, connected=True, port="")
-    assert report.frames == len(records)
-    assert sum(count for _, count in report.faults) > 0
+    chunks = np.array_split(np.frombuffer(bytes(stream), np.uint8), 97)
+    records = [each for chunk in chunks for each in link.feed(chunk.tobytes(), 10_000_000)]
+    assert records
+    found = report(link)
+    assert found.frames == len(records)
+    assert sum(count for _, count in found.faults) > 0
     assert all(r.accel_raw == (1, 2, 3) for r in records)
