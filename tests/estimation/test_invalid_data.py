@@ -7,25 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateway.estimation.columns import (
-    ACCEL,
-    CLIPPED,
-    GPS_ALT,
-    GPS_COLUMNS,
-    GPS_LAT,
-    GPS_LON,
-    GPS_USABLE,
-    GPS_VEL,
-    GYRO,
-    IMU_COLUMNS,
-    MAG,
-    NAV_FLAGS,
-    NAV_LAT,
-    NAV_LON,
-    NAV_POS_STD,
-    NAV_QUAT,
-    NAV_VEL,
-)
+from gateway.estimation import columns as col
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import NavFlags
@@ -59,14 +41,14 @@ def at_rest(length_s: float, speed_mps: float) -> SampleLog:
     """Rest below a receiver that repeats the same fix."""
     imu_us = np.arange(0, round(length_s * 1e6), 10_000)
     gps_us = np.arange(0, round(length_s * 1e6), 200_000)
-    imu = np.full((len(imu_us), IMU_COLUMNS), np.nan)
-    gps = np.full((len(gps_us), GPS_COLUMNS), np.nan)
-    imu[:, ACCEL : ACCEL + 6] = np.random.default_rng(5).normal(0.0, 1e-3, (len(imu), 6))
-    imu[:, ACCEL + 2] -= STANDARD_GRAVITY_MPS2
-    imu[:, MAG : MAG + 3] = 21.0, 0.0, 43.0
-    imu[:, CLIPPED] = 0.0
-    gps[:, [GPS_USABLE, GPS_LAT, GPS_LON, GPS_ALT]] = 1.0, 47.0, 8.0, 500.0
-    gps[:, GPS_VEL : GPS_VEL + 3] = speed_mps
+    imu = np.full((len(imu_us), col.IMU_COLUMNS), np.nan)
+    gps = np.full((len(gps_us), col.GPS_COLUMNS), np.nan)
+    imu[:, col.ACCEL : col.ACCEL + 6] = np.random.default_rng(5).normal(0.0, 1e-3, (len(imu), 6))
+    imu[:, col.ACCEL + 2] -= STANDARD_GRAVITY_MPS2
+    imu[:, col.MAG : col.MAG + 3] = 21.0, 0.0, 43.0
+    imu[:, col.CLIPPED] = 0.0
+    gps[:, [col.GPS_USABLE, col.GPS_LAT, col.GPS_LON, col.GPS_ALT]] = 1.0, 47.0, 8.0, 500.0
+    gps[:, col.GPS_VEL : col.GPS_VEL + 3] = speed_mps
     return SampleLog(imu_us, imu, imu_us[:0], np.empty(0), gps_us, gps)
 
 
@@ -76,28 +58,28 @@ def run(flight: Flight, log: SampleLog) -> np.ndarray:
 
 def check_sane(flight: Flight, log: SampleLog) -> None:
     out = run(flight, log)
-    assert np.isfinite(out[100:, NAV_QUAT : NAV_QUAT + 4]).all()
-    assert np.isfinite(out[:, NAV_FLAGS]).all()
-    vel = out[:, NAV_VEL : NAV_VEL + 3]
+    assert np.isfinite(out[100:, col.NAV_QUAT : col.NAV_QUAT + 4]).all()
+    assert np.isfinite(out[:, col.NAV_FLAGS]).all()
+    vel = out[:, col.NAV_VEL : col.NAV_VEL + 3]
     assert np.abs(vel[np.isfinite(vel)]).max(initial=0.0) < FASTEST_MPS
 
 
 def noisy_field(log: SampleLog, rng: np.random.Generator) -> None:
-    log.imu[:, MAG : MAG + 3] += rng.normal(0.0, 40.0, (len(log.imu), 3))
+    log.imu[:, col.MAG : col.MAG + 3] += rng.normal(0.0, 40.0, (len(log.imu), 3))
 
 
 def upright_field(log: SampleLog, rng: np.random.Generator) -> None:
-    log.imu[:, MAG : MAG + 2] = 0.0
-    log.imu[:, MAG + 2] += rng.normal(0.0, 20.0, len(log.imu))
+    log.imu[:, col.MAG : col.MAG + 2] = 0.0
+    log.imu[:, col.MAG + 2] += rng.normal(0.0, 20.0, len(log.imu))
 
 
 def swapped_field(log: SampleLog, rng: np.random.Generator) -> None:
-    log.imu[:, MAG : MAG + 3] = log.imu[:, MAG + rng.permutation(3)]
+    log.imu[:, col.MAG : col.MAG + 3] = log.imu[:, col.MAG + rng.permutation(3)]
 
 
 def fixes_off_africa(log: SampleLog, rng: np.random.Generator) -> None:
     """Some receivers send the position 0, 0 without a fix."""
-    log.gps[rng.random(len(log.gps)) < 0.05, GPS_LAT : GPS_LON + 1] = 0.0
+    log.gps[rng.random(len(log.gps)) < 0.05, col.GPS_LAT : col.GPS_LON + 1] = 0.0
 
 
 def fixes_with_gaps(log: SampleLog, rng: np.random.Generator) -> None:
@@ -107,12 +89,14 @@ def fixes_with_gaps(log: SampleLog, rng: np.random.Generator) -> None:
 
 
 def fixes_without_velocity(log: SampleLog, rng: np.random.Generator) -> None:
-    log.gps[rng.random() * len(log.gps) < np.arange(len(log.gps)), GPS_VEL : GPS_VEL + 3] = np.nan
+    log.gps[
+        rng.random() * len(log.gps) < np.arange(len(log.gps)), col.GPS_VEL : col.GPS_VEL + 3
+    ] = np.nan
 
 
 def wild_fixes(log: SampleLog, rng: np.random.Generator) -> None:
     wild = rng.random(len(log.gps)) < 0.1
-    log.gps[wild, 1:GPS_COLUMNS] *= rng.normal(1.0, 1.0, (wild.sum(), GPS_COLUMNS - 1))
+    log.gps[wild, 1 : col.GPS_COLUMNS] *= rng.normal(1.0, 1.0, (wild.sum(), col.GPS_COLUMNS - 1))
 
 
 def samples_with_gaps(log: SampleLog, rng: np.random.Generator) -> None:
@@ -120,12 +104,14 @@ def samples_with_gaps(log: SampleLog, rng: np.random.Generator) -> None:
 
 
 def shaken(log: SampleLog, rng: np.random.Generator) -> None:
-    log.imu[:, ACCEL : ACCEL + 3] += rng.normal(0.0, 30.0, (len(log.imu), 3))
-    log.imu[:, GYRO : GYRO + 3] += rng.normal(0.0, 1.0, (len(log.imu), 3))
+    log.imu[:, col.ACCEL : col.ACCEL + 3] += rng.normal(0.0, 30.0, (len(log.imu), 3))
+    log.imu[:, col.GYRO : col.GYRO + 3] += rng.normal(0.0, 1.0, (len(log.imu), 3))
 
 
 def swapped_rates(log: SampleLog, rng: np.random.Generator) -> None:
-    log.imu[:, GYRO : GYRO + 3] = log.imu[:, GYRO + rng.permutation(3)] * rng.choice([-1, 1], 3)
+    log.imu[:, col.GYRO : col.GYRO + 3] = log.imu[:, col.GYRO + rng.permutation(3)] * rng.choice(
+        [-1, 1], 3
+    )
 
 
 def wild_heights(log: SampleLog, rng: np.random.Generator) -> None:
@@ -169,12 +155,12 @@ def test_several_kinds_of_invalid_data_leave_states_finite(flight: Flight, seed:
 def test_wrongly_mounted_compass_is_reported_and_not_used(flight: Flight, how: str) -> None:
     log = part(flight, -1.0, 300.0)
     if how == "swapped":
-        log.imu[:, MAG : MAG + 2] = log.imu[:, [MAG + 1, MAG]]
+        log.imu[:, col.MAG : col.MAG + 2] = log.imu[:, [col.MAG + 1, col.MAG]]
     else:
-        log.imu[:, MAG + "xy".index(how)] *= -1.0
+        log.imu[:, col.MAG + "xy".index(how)] *= -1.0
     late = replace(flight, counts=log.imu_time_us > 120_000_000)
     out = run(flight, log)
-    flags = out[late.counts, NAV_FLAGS].astype(int)
+    flags = out[late.counts, col.NAV_FLAGS].astype(int)
     reported = NavFlags.MAG_DISTURBED | NavFlags.MAG_MISPLACED
     assert ((flags & int(reported)) == int(reported)).all()
     assert (flags & int(NavFlags.HEADING_VALID) != 0).mean() > 0.9
@@ -194,7 +180,7 @@ def test_clock_jump_is_handled_as_outage(flight: Flight, leap_s: int, since_s: f
     out = run(flight, log)
     scores = attitude_scores(late, out[:, :4])
     assert max(scores["heading"], scores["inclination"]) < 3.0
-    assert np.nanmax(np.abs(out[:, NAV_VEL : NAV_VEL + 3])) < 100.0
+    assert np.nanmax(np.abs(out[:, col.NAV_VEL : col.NAV_VEL + 3])) < 100.0
 
 
 def test_shocks_beyond_accelerometer_range_leave_small_errors(flight: Flight) -> None:
@@ -202,11 +188,11 @@ def test_shocks_beyond_accelerometer_range_leave_small_errors(flight: Flight) ->
     log, rng = part(flight, -1.0, 300.0), np.random.default_rng(11)
     for begin in np.flatnonzero(rng.random(len(log.imu)) < 0.003):
         blow = slice(begin, begin + 4)
-        shape = log.imu[blow, ACCEL : ACCEL + 3].shape
-        log.imu[blow, ACCEL : ACCEL + 3] = rng.choice([-156.9, 156.9], shape)
-        log.imu[blow, CLIPPED] = 1.0
+        shape = log.imu[blow, col.ACCEL : col.ACCEL + 3].shape
+        log.imu[blow, col.ACCEL : col.ACCEL + 3] = rng.choice([-156.9, 156.9], shape)
+        log.imu[blow, col.CLIPPED] = 1.0
     out = run(flight, log)
-    off_m = north_east_m(flight, out[:, NAV_LAT], out[:, NAV_LON]) - flight.pos_ne_m
+    off_m = north_east_m(flight, out[:, col.NAV_LAT], out[:, col.NAV_LON]) - flight.pos_ne_m
     late = log.imu_time_us > 60_000_000
     assert np.percentile(np.linalg.norm(off_m[late], axis=1), 95) < 10.0
     scores = attitude_scores(replace(flight, counts=late), out[:, :4])
@@ -216,15 +202,15 @@ def test_shocks_beyond_accelerometer_range_leave_small_errors(flight: Flight) ->
 def test_impossible_jump_of_fixes_gives_no_velocity(flight: Flight) -> None:
     """All later fixes are at the second position, so they are finally accepted."""
     log = part(flight, 30.0, 60.0)
-    log.gps[:, GPS_VEL : GPS_VEL + 3] = np.nan
-    log.gps[len(log.gps) // 2 :, GPS_LAT : GPS_LON + 1] = 0.0
+    log.gps[:, col.GPS_VEL : col.GPS_VEL + 3] = np.nan
+    log.gps[len(log.gps) // 2 :, col.GPS_LAT : col.GPS_LON + 1] = 0.0
     check_sane(flight, log)
 
 
 def test_zero_velocity_contradicted_by_positions_is_not_used(flight: Flight) -> None:
     """As from a receiver that measures no velocity, or a log without one."""
     log = part(flight, 0.0, 120.0)
-    log.gps[:, GPS_VEL : GPS_VEL + 3] = 0.0
+    log.gps[:, col.GPS_VEL : col.GPS_VEL + 3] = 0.0
     out, late = run(flight, log), log.imu_time_us > 60_000_000
     counted = replace(flight, counts=late, log=log, q_nb=flight.q_nb[: len(out)])
     scores = attitude_scores(counted, out[:, :4])
@@ -236,7 +222,7 @@ def test_repeated_fix_is_used_once(flight: Flight, has_velocity: bool) -> None:
     """As in a log that holds each fix until the next one."""
     log = part(flight, 30.0, 60.0)
     if not has_velocity:
-        log.gps[:, GPS_VEL : GPS_VEL + 3] = np.nan
+        log.gps[:, col.GPS_VEL : col.GPS_VEL + 3] = np.nan
     newest = np.arange(len(log.gps)) // 5 * 5
     once = replace(log, gps_time_us=log.gps_time_us[::5], gps=log.gps[::5])
     out = run(flight, replace(log, gps=log.gps[newest]))
@@ -258,5 +244,5 @@ def test_repeated_fixes_at_rest_are_accepted(speed_mps: float) -> None:
     log = at_rest(20.0, speed_mps)
     estimator: Any = make_estimator(EstimationSettings())
     out = estimator.run(log)
-    assert (out[-1000:, NAV_FLAGS].astype(int) & NavFlags.POSITION_VALID != 0).all()
-    assert (out[-1000:, NAV_POS_STD] < 10.0).all()
+    assert (out[-1000:, col.NAV_FLAGS].astype(int) & NavFlags.POSITION_VALID != 0).all()
+    assert (out[-1000:, col.NAV_POS_STD] < 10.0).all()

@@ -9,17 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from gateway.compiled import address_of, record_at
-from gateway.estimation.columns import (
-    GPS_COLUMNS,
-    IMU_COLUMNS,
-    NAV_COLUMNS,
-    NAV_FLAGS,
-    NAV_LAT,
-    NAV_QUAT,
-    NAV_VEL,
-    imu_row,
-    nav_row,
-)
+from gateway.estimation import columns as col
 from gateway.estimation.kernel import ESKF, CompiledEstimator, KernelEstimator, Kernels, SampleLog
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import EstimationSettings, Estimator, make_estimator
@@ -95,11 +85,11 @@ def as_log(estimator: KernelEstimator, items: Items) -> SampleLog:
     fixes = [i for i in items if isinstance(i, GpsFix)]
     return SampleLog(
         imu_time_us=np.array([i.time_us for i in imus]),
-        imu=np.array([imu_row(i) for i in imus]).reshape(-1, IMU_COLUMNS),
+        imu=np.array([col.imu_row(i) for i in imus]).reshape(-1, col.IMU_COLUMNS),
         baro_time_us=np.array([b.time_us for b in baros]),
         baro_alt_m=np.array([b.alt_pressure_m for b in baros]),
         gps_time_us=np.array([f.time_us for f in fixes]),
-        gps=np.array([estimator.fix_row(f) for f in fixes]).reshape(-1, GPS_COLUMNS),
+        gps=np.array([estimator.fix_row(f) for f in fixes]).reshape(-1, col.GPS_COLUMNS),
     )
 
 
@@ -108,7 +98,7 @@ def off_m(state: NavState) -> tuple[float, float]:
 
 
 def as_rows(states: list[NavState]) -> np.ndarray:
-    return np.array([nav_row(state) for state in states])
+    return np.array([col.nav_row(state) for state in states])
 
 
 def test_log_and_samples_give_the_same_bits(estimator: KernelEstimator) -> None:
@@ -116,7 +106,7 @@ def test_log_and_samples_give_the_same_bits(estimator: KernelEstimator) -> None:
     live = as_rows(feed(estimator, items))
     estimator.reset()
     offline = estimator.run(as_log(estimator, items))
-    assert offline.shape == (len(live), NAV_COLUMNS)
+    assert offline.shape == (len(live), col.NAV_COLUMNS)
     np.testing.assert_array_equal(offline, live)
 
 
@@ -160,7 +150,7 @@ def test_split_run_equals_one_run(either: Estimator, seed: int) -> None:
     feed(either, items[cut : cut + 50])
     either.restore(kept)
     np.testing.assert_array_equal(as_rows(first + feed(either, items[cut:])), whole)
-    np.testing.assert_allclose(np.linalg.norm(whole[:, NAV_QUAT:4], axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(whole[:, col.NAV_QUAT : 4], axis=1), 1.0, atol=1e-12)
 
 
 def test_rest_is_detected_and_reported(estimator: KernelEstimator) -> None:
@@ -185,7 +175,7 @@ def test_fix_gives_position_and_true_north(estimator: KernelEstimator) -> None:
 class TestInvalidData:
     def finite(self, states: list[NavState]) -> bool:
         rows = as_rows(states)
-        return bool(np.isfinite(rows[:, :4]).all() and np.isfinite(rows[1:, NAV_LAT]).all())
+        return bool(np.isfinite(rows[:, :4]).all() and np.isfinite(rows[1:, col.NAV_LAT]).all())
 
     @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30, 1e300, -500.0])
     def test_invalid_samples_are_left_out_and_reported(self, either: Estimator, bad: float) -> None:
@@ -295,5 +285,5 @@ def test_unusable_fix_is_ignored(either: Estimator) -> None:
 
 def test_velocity_of_an_aircraft_at_rest_is_zero(estimator: KernelEstimator) -> None:
     rows = as_rows(feed(estimator, [*still(0, 3.0), fix(3_000_000), *still(3_000_000, 8.0)]))
-    assert np.abs(rows[-1, NAV_VEL : NAV_VEL + 3]).max() < 0.3
-    assert int(rows[-1, NAV_FLAGS]) & NavFlags.AT_REST
+    assert np.abs(rows[-1, col.NAV_VEL : col.NAV_VEL + 3]).max() < 0.3
+    assert int(rows[-1, col.NAV_FLAGS]) & NavFlags.AT_REST

@@ -4,16 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from tools import score_estimators as scores
 from tools.flights import read_flight
 from tools.peers import run_vqf
-from tools.score_estimators import (
-    attitude_scores,
-    outage_score,
-    position_errors_m,
-    rms,
-    run_eskf,
-    share_scores,
-)
 
 LIMITS: dict[str, dict[str, float]] = {
     "arduplane_testlog2": {
@@ -33,16 +26,16 @@ SHARE = 0.9
 @pytest.mark.parametrize("name", LIMITS)
 def test_errors_are_within_limits(data_dir: Path, name: str) -> None:
     flight = read_flight(data_dir / f"{name}.csv.gz")
-    out = run_eskf(flight)
-    found = attitude_scores(flight, out[:, :4])
+    out = scores.run_eskf(flight)
+    found = scores.attitude_scores(flight, out[:, :4])
     limits = LIMITS[name]
     if "pos" in limits:
-        found["pos"] = rms(position_errors_m(flight, out)[flight.counts])
+        found["pos"] = scores.rms(scores.position_errors_m(flight, out)[flight.counts])
     for key, length_s in (("out10", 10.0), ("out30", 30.0)):
         if key in limits:
-            found[key] = outage_score(flight, run_eskf, length_s)
+            found[key] = scores.outage_score(flight, scores.run_eskf, length_s)
     assert {key: found[key] for key in limits if found[key] > limits[key]} == {}
-    shares = share_scores(flight, out)
+    shares = scores.share_scores(flight, out)
     assert {key: share for key, share in shares.items() if share < SHARE} == {}
 
 
@@ -52,7 +45,7 @@ def test_magnetic_disturbances_are_handled_better_than_by_vqf(data_dir: Path) ->
     names = ("broad_30_disturbed_stationary_magnet_C", "broad_33_disturbed_attached_magnet_2cm")
     for name in names:
         flight = read_flight(data_dir / f"{name}.csv.gz")
-        own = attitude_scores(flight, run_eskf(flight)[:, :4])
-        vqf = attitude_scores(flight, run_vqf(flight))
+        own = scores.attitude_scores(flight, scores.run_eskf(flight)[:, :4])
+        vqf = scores.attitude_scores(flight, run_vqf(flight))
         assert own["total"] < 1.25 * vqf["total"]
         assert own["inclination"] < 1.25 * vqf["inclination"]

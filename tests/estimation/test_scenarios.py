@@ -9,20 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateway.estimation.columns import (
-    ACCEL,
-    ACCEL_UNCALIBRATED,
-    CLIPPED,
-    FLAG,
-    GPS_LAT,
-    GPS_VEL,
-    GYRO,
-    GYRO_UNCALIBRATED,
-    IMU_COLUMNS,
-    MAG,
-    NAV_ATTITUDE_STD,
-    NAV_FLAGS,
-)
+from gateway.estimation import columns as col
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.geometry.geodesy import radii_m
 from tests.estimation.samples import G, log_of
@@ -44,7 +31,7 @@ def hard_iron(flight: Flight) -> Spoilt:
     """Leave 20 uT of hard iron uncalibrated."""
 
     def change(imu: np.ndarray, _: np.ndarray) -> None:
-        imu[:, MAG : MAG + 3] += (15.0, -10.0, 8.0)
+        imu[:, col.MAG : col.MAG + 3] += (15.0, -10.0, 8.0)
 
     return Spoilt(with_imu(flight, change), 60.0)
 
@@ -54,8 +41,8 @@ def vibration(flight: Flight) -> Spoilt:
     rng = np.random.default_rng(7)
 
     def change(imu: np.ndarray, _: np.ndarray) -> None:
-        imu[:, GYRO : GYRO + 3] += rng.normal(0.0, 0.3, (len(imu), 3))
-        imu[:, ACCEL : ACCEL + 3] += rng.normal(0.0, 5.0, (len(imu), 3))
+        imu[:, col.GYRO : col.GYRO + 3] += rng.normal(0.0, 0.3, (len(imu), 3))
+        imu[:, col.ACCEL : col.ACCEL + 3] += rng.normal(0.0, 5.0, (len(imu), 3))
 
     return Spoilt(with_imu(flight, change), 30.0)
 
@@ -64,7 +51,11 @@ def swapped_compass(flight: Flight) -> Spoilt:
     """Swap two axes of the compass and reverse one."""
 
     def change(imu: np.ndarray, _: np.ndarray) -> None:
-        imu[:, MAG : MAG + 3] = imu[:, [MAG + 1, MAG, MAG + 2]] * (1.0, 1.0, -1.0)
+        imu[:, col.MAG : col.MAG + 3] = imu[:, [col.MAG + 1, col.MAG, col.MAG + 2]] * (
+            1.0,
+            1.0,
+            -1.0,
+        )
 
     return Spoilt(with_imu(flight, change), 90.0)
 
@@ -74,8 +65,8 @@ def clipped_gyro(flight: Flight) -> Spoilt:
     limit = math.radians(40.0)
 
     def change(imu: np.ndarray, _: np.ndarray) -> None:
-        imu[:, CLIPPED] = np.abs(imu[:, GYRO : GYRO + 3]).max(axis=1) > limit
-        imu[:, GYRO : GYRO + 3] = imu[:, GYRO : GYRO + 3].clip(-limit, limit)
+        imu[:, col.CLIPPED] = np.abs(imu[:, col.GYRO : col.GYRO + 3]).max(axis=1) > limit
+        imu[:, col.GYRO : col.GYRO + 3] = imu[:, col.GYRO : col.GYRO + 3].clip(-limit, limit)
 
     return Spoilt(with_imu(flight, change), 60.0)
 
@@ -84,7 +75,7 @@ def relocated(flight: Flight) -> Spoilt:
     """Move all later fixes by 1 km: the filter relocks on them."""
     gps, time_s = flight.log.gps.copy(), flight.log.gps_time_us * 1e-6
     moved = time_s > 80.0
-    gps[moved, GPS_LAT] += math.degrees(1000.0 / radii_m(flight.origin_deg[0], 0.0)[0])
+    gps[moved, col.GPS_LAT] += math.degrees(1000.0 / radii_m(flight.origin_deg[0], 0.0)[0])
     pos = flight.pos_ne_m.copy()
     pos[flight.log.imu_time_us > 80e6, 0] += 1000.0
     return Spoilt(replace(flight, pos_ne_m=pos, log=replace(flight.log, gps=gps)), 95.0)
@@ -101,7 +92,7 @@ def held_fixes(flight: Flight) -> Spoilt:
 def zero_velocities(flight: Flight) -> Spoilt:
     """Let the receiver report velocities of exactly zero."""
     gps = flight.log.gps.copy()
-    gps[:, GPS_VEL : GPS_VEL + 3] = 0.0
+    gps[:, col.GPS_VEL : col.GPS_VEL + 3] = 0.0
     return Spoilt(replace(flight, log=replace(flight.log, gps=gps)), 60.0)
 
 
@@ -158,8 +149,8 @@ def test_errors_are_small_again_after_a_disturbance(flight: Flight, name: str) -
 
 
 def test_swapped_compass_axes_are_reported(flight: Flight) -> None:
-    flags = run_eskf(swapped_compass(flight).flight)[-1, NAV_FLAGS].astype(int)
-    assert flags & FLAG.MAG_MISPLACED
+    flags = run_eskf(swapped_compass(flight).flight)[-1, col.NAV_FLAGS].astype(int)
+    assert flags & col.FLAG.MAG_MISPLACED
 
 
 @pytest.mark.parametrize("rate_hz", [1, 2, 5, 20, 1000])
@@ -167,26 +158,26 @@ def test_every_imu_rate_levels_at_rest(rate_hz: int) -> None:
     """Rest on the side, with a gyroscope that is off by 1.7 deg/s about the vertical."""
     rng = np.random.default_rng(3)
     count = max(rate_hz * 60, 60)
-    imu = np.zeros((count, IMU_COLUMNS))
-    imu[:, ACCEL : ACCEL + 3] = rng.normal((0.0, 0.8 * -G, 0.6 * -G), 0.02, (count, 3))
-    imu[:, GYRO : GYRO + 3] = rng.normal((0.0, 0.0, 0.03), 0.001, (count, 3))
-    imu[:, MAG : MAG + 3] = math.nan
+    imu = np.zeros((count, col.IMU_COLUMNS))
+    imu[:, col.ACCEL : col.ACCEL + 3] = rng.normal((0.0, 0.8 * -G, 0.6 * -G), 0.02, (count, 3))
+    imu[:, col.GYRO : col.GYRO + 3] = rng.normal((0.0, 0.0, 0.03), 0.001, (count, 3))
+    imu[:, col.MAG : col.MAG + 3] = math.nan
     estimator: Any = make_estimator(EstimationSettings())
     out = estimator.run(log_of(imu, rate_hz))
     late = out[3 * count // 4 :]
     w, x, y, z = late[:, :4].T
     roll = np.degrees(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
     assert np.abs(roll - math.degrees(math.atan2(0.8, 0.6))).max() < 1.0
-    assert np.degrees(late[:, NAV_ATTITUDE_STD]).max() < 3.0
+    assert np.degrees(late[:, col.NAV_ATTITUDE_STD]).max() < 3.0
 
 
 def test_gyroscope_without_calibration_is_measured_at_rest() -> None:
     rng = np.random.default_rng(4)
-    imu = np.zeros((3000, IMU_COLUMNS))
-    imu[:, ACCEL : ACCEL + 3] = rng.normal((0.0, 0.0, -G), 0.02, (3000, 3))
-    imu[:, GYRO : GYRO + 3] = rng.normal(np.radians((14.0, -9.0, 4.0)), 0.002, (3000, 3))
-    imu[:, MAG : MAG + 3] = rng.normal((21.0, 0.0, 43.0), 0.3, (3000, 3))
-    imu[:, [GYRO_UNCALIBRATED, ACCEL_UNCALIBRATED]] = 1.0
+    imu = np.zeros((3000, col.IMU_COLUMNS))
+    imu[:, col.ACCEL : col.ACCEL + 3] = rng.normal((0.0, 0.0, -G), 0.02, (3000, 3))
+    imu[:, col.GYRO : col.GYRO + 3] = rng.normal(np.radians((14.0, -9.0, 4.0)), 0.002, (3000, 3))
+    imu[:, col.MAG : col.MAG + 3] = rng.normal((21.0, 0.0, 43.0), 0.3, (3000, 3))
+    imu[:, [col.GYRO_UNCALIBRATED, col.ACCEL_UNCALIBRATED]] = 1.0
     estimator: Any = make_estimator(EstimationSettings())
     estimator.run(log_of(imu, 100))
     found = np.degrees(estimator.state.gyro_bias_b)
@@ -195,7 +186,7 @@ def test_gyroscope_without_calibration_is_measured_at_rest() -> None:
 
 def test_magnetic_heading_without_declination_is_not_valid(flight: Flight) -> None:
     alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))
-    assert not (run_eskf(alone)[:, NAV_FLAGS].astype(int) & FLAG.HEADING_VALID).any()
+    assert not (run_eskf(alone)[:, col.NAV_FLAGS].astype(int) & col.FLAG.HEADING_VALID).any()
 
 
 @pytest.mark.slow

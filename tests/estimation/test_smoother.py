@@ -7,16 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from gateway.estimation.columns import (
-    FLAG,
-    GPS_LAT,
-    HEADING_VALID_RAD,
-    NAV_ATTITUDE_STD,
-    NAV_COLUMNS,
-    NAV_FLAGS,
-    NAV_LAT,
-    NAV_POS_STD,
-)
+from gateway.estimation import columns as col
 from gateway.estimation.eskf.filter import COMPASS_RAD
 from gateway.estimation.eskf.state import STATES
 from gateway.estimation.reference import NO_DECLINATION_RAD
@@ -64,19 +55,19 @@ def test_backward_pass_equals_joint_least_squares() -> None:
 @pytest.mark.slow
 def test_smoothing_halves_the_error_of_outages(flight: Flight) -> None:
     filtered, smoothed = run_eskf(flight), run_smoothed(flight)
-    assert smoothed.shape == (len(flight.log.imu), NAV_COLUMNS)
+    assert smoothed.shape == (len(flight.log.imu), col.NAV_COLUMNS)
     assert (
         attitude_scores(flight, smoothed[:, :4])["yaw"]
         < attitude_scores(flight, filtered[:, :4])["yaw"]
     )
     assert outage_score(flight, run_smoothed, 10.0) < 2.0
     assert outage_score(flight, run_smoothed, 10.0) < 0.5 * outage_score(flight, run_eskf, 10.0)
-    std = slice(NAV_ATTITUDE_STD, NAV_ATTITUDE_STD + 3)
+    std = slice(col.NAV_ATTITUDE_STD, col.NAV_ATTITUDE_STD + 3)
     use = flight.counts
     expected = np.sqrt(smoothed[use, std] ** 2 - AXES_RAD**2)
     assert (expected <= 1.05 * filtered[use, std]).mean() > 0.95
     np.testing.assert_allclose(np.linalg.norm(smoothed[:, :4], axis=1), 1.0, atol=1e-9)
-    same = smoothed[use, NAV_FLAGS] == filtered[use, NAV_FLAGS]
+    same = smoothed[use, col.NAV_FLAGS] == filtered[use, col.NAV_FLAGS]
     assert same.mean() > 0.95
 
 
@@ -113,7 +104,7 @@ def test_smoothing_reduces_the_error_without_gps(flight: Flight) -> None:
         errors["smoothed"].append(attitude_scores(alone, smoothed[:, :4]))
         assert share_scores(alone, smoothed)["tilt_2s"] > 0.8
         # Without a fix the declination is not known, and smoothing does not estimate it.
-        heading_std = smoothed[each.counts, NAV_ATTITUDE_STD + 2]
+        heading_std = smoothed[each.counts, col.NAV_ATTITUDE_STD + 2]
         assert (heading_std > NO_DECLINATION_RAD).all()
     for part in ("inclination", "heading"):
         before, after = (rms(np.array([s[part] for s in found])) for found in errors.values())
@@ -127,12 +118,15 @@ def test_position_restart_keeps_the_attitude_smoothed(flight: Flight) -> None:
     Their velocities are right, and keep it level meanwhile.
     """
     gps, half = flight.log.gps.copy(), len(flight.log.gps) // 2
-    gps[half:, GPS_LAT] += np.degrees(1000.0 / 6.4e6)
+    gps[half:, col.GPS_LAT] += np.degrees(1000.0 / 6.4e6)
     moved = replace(flight, log=replace(flight.log, gps=gps))
     filtered, smoothed = run_eskf(moved), run_smoothed(moved)
-    relock = int(np.nanargmax(np.diff(filtered[:, NAV_LAT])))
-    assert np.degrees(500.0 / 6.4e6) < np.diff(smoothed[:, NAV_LAT])[relock]
-    before, std = slice(relock - 100, relock - 20), slice(NAV_ATTITUDE_STD, NAV_ATTITUDE_STD + 3)
+    relock = int(np.nanargmax(np.diff(filtered[:, col.NAV_LAT])))
+    assert np.degrees(500.0 / 6.4e6) < np.diff(smoothed[:, col.NAV_LAT])[relock]
+    before, std = (
+        slice(relock - 100, relock - 20),
+        slice(col.NAV_ATTITUDE_STD, col.NAV_ATTITUDE_STD + 3),
+    )
     assert (smoothed[before, std] < np.array([1.1, 1.1, 1.0]) * filtered[before, std]).all()
     assert (filtered[before, std][:, :2] < math.radians(0.6)).all()
 
@@ -151,9 +145,9 @@ def test_position_without_heading_is_that_of_filter(flight: Flight) -> None:
     """Without a heading, on the ground without a compass, later fixes correct no position."""
     blind = no_mag(flight).flight
     live, smoothed = run_eskf(blind), run_smoothed(blind)
-    before = np.isfinite(live[:, NAV_LAT]) & np.isnan(live[:, NAV_POS_STD])
+    before = np.isfinite(live[:, col.NAV_LAT]) & np.isnan(live[:, col.NAV_POS_STD])
     assert before.sum() > 500
-    position = slice(NAV_LAT, NAV_LAT + 3)
+    position = slice(col.NAV_LAT, col.NAV_LAT + 3)
     np.testing.assert_allclose(smoothed[before, position], live[before, position], rtol=1e-8)
 
 
@@ -177,13 +171,15 @@ def test_smoothing_reduces_errors_of_real_car(data_dir) -> None:
     fixes_s = flight.log.gps_time_us * 1e-6
     gap = flight.with_gps(np.abs(fixes_s - fixes_s.mean()) > 40.0)
     live, smoothed = run_eskf(gap), run_smoothed(gap)
-    valid = [out[:, NAV_FLAGS].astype(int) & FLAG.HEADING_VALID != 0 for out in (live, smoothed)]
+    valid = [
+        out[:, col.NAV_FLAGS].astype(int) & col.FLAG.HEADING_VALID != 0 for out in (live, smoothed)
+    ]
     assert valid[1].sum() > valid[0].sum()
-    sure = smoothed[:, NAV_ATTITUDE_STD + 2] < HEADING_VALID_RAD
+    sure = smoothed[:, col.NAV_ATTITUDE_STD + 2] < col.HEADING_VALID_RAD
     np.testing.assert_array_equal(valid[1], sure)
 
 
 @pytest.mark.slow
 def test_smoothing_does_not_average_out_lasting_errors_of_the_compass(flight: Flight) -> None:
-    std_rad = run_smoothed(flight)[flight.counts, NAV_ATTITUDE_STD + 2]
+    std_rad = run_smoothed(flight)[flight.counts, col.NAV_ATTITUDE_STD + 2]
     assert std_rad.min() > COMPASS_RAD

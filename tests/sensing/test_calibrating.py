@@ -12,34 +12,7 @@ from gateway.geometry.geomagnetism import MagneticField
 from gateway.geometry.quaternion import from_euler, rotate_inverse
 from gateway.geometry.rotation import Matrix3
 from gateway.records import ImuFlags, ImuRaw, NodeId
-from gateway.sensing.calibrating import (
-    FIELD_SIDES,
-    IN_BODY_AXES,
-    MAX_GYRO_BIAS_RADPS,
-    STILL_ACCEL_MPS2,
-    STILL_GYRO_RADPS,
-    CalibrationError,
-    MoreNeeded,
-    NodeSamples,
-    calibrate_accelerometer,
-    calibrate_gyro,
-    calibrate_level,
-    calibrate_magnetometer,
-    calibrate_magnetometer_by_yaw,
-    calibrate_mounting,
-    corrected_by,
-    distinct_poses,
-    field_sides,
-    gyro_at_rest,
-    node_samples,
-    remove_tilt,
-    rest_spans,
-    sides_of,
-    solve_accelerometer,
-    solve_magnetometer,
-    solve_mounting,
-    still_windows,
-)
+from gateway.sensing import calibrating as solver
 from gateway.sensing.calibration import FACE_UP, IDENTITY3, Correction, NodeCalibration
 
 G = 9.80665
@@ -55,7 +28,7 @@ def sphere(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
 def test_six_sides_give_bias_and_scale(seed: int) -> None:
     rng = np.random.default_rng(seed)
     bias, scale = rng.normal(0, 0.3, 3), 1.0 + rng.normal(0, 0.02, 3)
-    fit = solve_accelerometer(SIDES / scale + bias)
+    fit = solver.solve_accelerometer(SIDES / scale + bias)
     np.testing.assert_allclose(fit.bias, bias, atol=1e-6)
     np.testing.assert_allclose(np.diag(fit.matrix), scale, atol=1e-7)
     assert fit.residual < 1e-6
@@ -68,15 +41,15 @@ def test_eighteen_poses_determine_bias_and_misalignment(seed: int) -> None:
     matrix = np.eye(3) + 0.5 * (skew + skew.T)
     bias = rng.normal(0, 0.3, 3)
     poses = np.vstack([SIDES, sphere(rng, 12, G)])
-    fit = solve_accelerometer(poses @ np.linalg.inv(matrix).T + bias)
+    fit = solver.solve_accelerometer(poses @ np.linalg.inv(matrix).T + bias)
     np.testing.assert_allclose(fit.matrix, matrix, atol=1e-6)
     np.testing.assert_allclose(fit.bias, bias, atol=1e-5)
 
 
 @pytest.mark.parametrize("poses", [SIDES[:5], np.vstack([SIDES[:4], SIDES[:4]])])
 def test_missing_sides_are_refused(poses: np.ndarray) -> None:
-    with pytest.raises(CalibrationError, match="side"):
-        solve_accelerometer(poses)
+    with pytest.raises(solver.CalibrationError, match="side"):
+        solver.solve_accelerometer(poses)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -86,7 +59,7 @@ def test_magnetometer_ellipsoid_gives_hard_and_soft_iron(seed: int) -> None:
     soft = np.eye(3) + 0.5 * (spread + spread.T)
     hard = rng.normal(0, 20.0, 3)
     raw = sphere(rng, 600, 45.0) @ np.linalg.inv(soft).T + hard + rng.normal(0, 0.2, (600, 3))
-    fit = solve_magnetometer(raw, 45.0)
+    fit = solver.solve_magnetometer(raw, 45.0)
     np.testing.assert_allclose(fit.bias, hard, atol=0.2)
     np.testing.assert_allclose(fit.matrix, soft, atol=0.01)
     assert fit.residual == pytest.approx(0.2, rel=0.2)
@@ -94,7 +67,7 @@ def test_magnetometer_ellipsoid_gives_hard_and_soft_iron(seed: int) -> None:
 
 def test_magnetometer_without_known_strength_keeps_the_mean() -> None:
     raw = sphere(np.random.default_rng(1), 300, 50.0) + 10.0
-    fit = solve_magnetometer(raw)
+    fit = solver.solve_magnetometer(raw)
     assert np.linalg.norm((raw - fit.bias) @ np.array(fit.matrix), axis=1).mean() == pytest.approx(
         50.0, rel=1e-3
     )
@@ -103,12 +76,12 @@ def test_magnetometer_without_known_strength_keeps_the_mean() -> None:
 def test_magnetometer_that_was_only_turned_flat_is_refused() -> None:
     angle = np.linspace(0, 6.28, 300)
     flat = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), np.full(300, 20.0)])
-    with pytest.raises(CalibrationError, match="turn the aircraft"):
-        solve_magnetometer(flat)
-    with pytest.raises(CalibrationError, match="10 samples"):
-        solve_magnetometer(flat[:10])
-    with pytest.raises(CalibrationError, match="1 sample where"):
-        solve_magnetometer(flat[:1])
+    with pytest.raises(solver.CalibrationError, match="turn the aircraft"):
+        solver.solve_magnetometer(flat)
+    with pytest.raises(solver.CalibrationError, match="10 samples"):
+        solver.solve_magnetometer(flat[:10])
+    with pytest.raises(solver.CalibrationError, match="1 sample where"):
+        solver.solve_magnetometer(flat[:1])
 
 
 @pytest.mark.parametrize("pitch_deg", [20.0, 45.0, 90.0])
@@ -118,17 +91,17 @@ def test_level_and_nose_up_poses_give_the_mounting(seed: int, pitch_deg: float) 
     pitch = np.radians(pitch_deg)
     level_s = mounting.T @ np.array([0.0, 0.0, -G])
     raised_s = mounting.T @ np.array([G * np.sin(pitch), 0.0, -G * np.cos(pitch)])
-    found = solve_mounting(tuple(level_s), tuple(raised_s))
+    found = solver.solve_mounting(tuple(level_s), tuple(raised_s))
     np.testing.assert_allclose(found, mounting, atol=1e-9)
 
 
 def test_face_up_board_is_the_default_mounting() -> None:
-    np.testing.assert_allclose(solve_mounting((0, 0, G), (5.0, 0, 8.0)), FACE_UP, atol=1e-12)
+    np.testing.assert_allclose(solver.solve_mounting((0, 0, G), (5.0, 0, 8.0)), FACE_UP, atol=1e-12)
 
 
 def test_nose_that_was_not_raised_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="nose"):
-        solve_mounting((0, 0, G), (0.1, 0, G))
+    with pytest.raises(solver.CalibrationError, match="nose"):
+        solver.solve_mounting((0, 0, G), (0.1, 0, G))
 
 
 @pytest.mark.parametrize(
@@ -140,8 +113,8 @@ def test_nose_that_was_not_raised_is_refused() -> None:
     ],
 )
 def test_implausible_accelerometer_error_is_refused(poses: np.ndarray, reason: str) -> None:
-    with pytest.raises(CalibrationError, match=f"{reason}.*still"):
-        solve_accelerometer(poses)
+    with pytest.raises(solver.CalibrationError, match=f"{reason}.*still"):
+        solver.solve_accelerometer(poses)
 
 
 @pytest.mark.parametrize(
@@ -158,25 +131,27 @@ def test_implausible_accelerometer_error_is_refused(poses: np.ndarray, reason: s
     ],
 )
 def test_field_outside_the_range_of_the_earth_is_refused(field: np.ndarray, reason: str) -> None:
-    with pytest.raises(CalibrationError, match=f"{reason}.*steel"):
-        solve_magnetometer(field)
+    with pytest.raises(solver.CalibrationError, match=f"{reason}.*steel"):
+        solver.solve_magnetometer(field)
 
 
 def test_compass_at_rest_is_to_be_turned(rng: np.random.Generator) -> None:
     noise = np.array([22.0, 5.0, 40.0]) + rng.normal(0.0, 0.5, (300, 3))
-    with pytest.raises(MoreNeeded, match="turn the aircraft about all its axes"):
-        solve_magnetometer(noise)
+    with pytest.raises(solver.MoreNeeded, match="turn the aircraft about all its axes"):
+        solver.solve_magnetometer(noise)
 
 
 BIAS = np.array([0.2, -0.1, 0.3])
 
 
-def pose(force: np.ndarray, seed: int = 0, rate: float = 0.0, shaking: float = 0.02) -> NodeSamples:
+def pose(
+    force: np.ndarray, seed: int = 0, rate: float = 0.0, shaking: float = 0.02
+) -> solver.NodeSamples:
     """Five seconds in one pose, as a node would read them."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(0, 5, 0.01)
     n = len(time_s)
-    return NodeSamples(
+    return solver.NodeSamples(
         time_s=time_s,
         accel=force + BIAS + rng.normal(0, shaking, (n, 3)),
         gyro=rate + rng.normal(0, 0.1 * shaking, (n, 3)),
@@ -186,9 +161,9 @@ def pose(force: np.ndarray, seed: int = 0, rate: float = 0.0, shaking: float = 0
     )
 
 
-def joined(*parts: NodeSamples) -> NodeSamples:
+def joined(*parts: solver.NodeSamples) -> solver.NodeSamples:
     begins = np.cumsum([0.0, *(part.time_s[-1] + 0.01 for part in parts)])
-    return NodeSamples(
+    return solver.NodeSamples(
         time_s=np.concatenate([p.time_s + t for p, t in zip(parts, begins, strict=False)]),
         accel=np.vstack([p.accel for p in parts]),
         gyro=np.vstack([p.gyro for p in parts]),
@@ -199,44 +174,44 @@ def joined(*parts: NodeSamples) -> NodeSamples:
 
 
 def test_mean_rate_at_rest_is_the_gyro_bias() -> None:
-    after = calibrate_gyro(pose(SIDES[4], rate=0.05), NodeCalibration())
+    after = solver.calibrate_gyro(pose(SIDES[4], rate=0.05), NodeCalibration())
     assert after.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
     assert 0.001 < after.gyro_residual_radps < 0.003
 
 
 def test_moved_gyro_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="still"):
-        calibrate_gyro(pose(SIDES[4], shaking=3.0), NodeCalibration())
+    with pytest.raises(solver.CalibrationError, match="still"):
+        solver.calibrate_gyro(pose(SIDES[4], shaking=3.0), NodeCalibration())
 
 
 def test_six_poses_one_by_one_give_the_accelerometer_bias() -> None:
     held = [pose(side, k) for k, side in enumerate(SIDES)]
-    assert sides_of([]) == set()
-    assert sides_of([held[0], held[0]]) == {0}
-    assert sides_of(held[1:]) == {1, 2, 3, 4, 5}
-    assert sides_of(held) == set(range(6))
-    after = calibrate_accelerometer(held, NodeCalibration())
+    assert solver.sides_of([]) == set()
+    assert solver.sides_of([held[0], held[0]]) == {0}
+    assert solver.sides_of(held[1:]) == {1, 2, 3, 4, 5}
+    assert solver.sides_of(held) == set(range(6))
+    after = solver.calibrate_accelerometer(held, NodeCalibration())
     assert after.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.01)
     assert after.accel_residual_mps2 < 0.01
 
 
 def test_six_poses_in_one_log_give_the_accelerometer_bias() -> None:
     whole = joined(*(pose(side, k) for k, side in enumerate(SIDES)))
-    after = calibrate_accelerometer([whole], NodeCalibration())
+    after = solver.calibrate_accelerometer([whole], NodeCalibration())
     assert after.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.01)
 
 
 def test_tilted_pose_is_no_side() -> None:
     half = np.sin(np.pi / 4)
-    assert sides_of([pose(G * np.array([half, half, 0.0]))]) == set()
+    assert solver.sides_of([pose(G * np.array([half, half, 0.0]))]) == set()
 
 
 def test_pose_in_motion_is_not_counted() -> None:
     shaken = pose(SIDES[0], shaking=3.0)
-    assert not still_windows(shaken)
-    assert sides_of([shaken, pose(SIDES[1])]) == {1}
-    with pytest.raises(CalibrationError, match="1 pose where 6 are needed"):
-        calibrate_accelerometer([shaken, pose(SIDES[1])], NodeCalibration())
+    assert not solver.still_windows(shaken)
+    assert solver.sides_of([shaken, pose(SIDES[1])]) == {1}
+    with pytest.raises(solver.CalibrationError, match="1 pose where 6 are needed"):
+        solver.calibrate_accelerometer([shaken, pose(SIDES[1])], NodeCalibration())
 
 
 def test_mounting_turns_the_magnetometer_along() -> None:
@@ -244,7 +219,7 @@ def test_mounting_turns_the_magnetometer_along() -> None:
     level = pose(mounting.T @ [0, 0, -G])
     raised = pose(mounting.T @ [G * np.sin(0.8), 0, -G * np.cos(0.8)], 1)
     before = NodeCalibration(accel_bias_mps2=tuple(BIAS))
-    after = calibrate_mounting(level, raised, before)
+    after = solver.calibrate_mounting(level, raised, before)
     np.testing.assert_allclose(after.mounting, mounting, atol=2e-3)
     np.testing.assert_allclose(after.mag_mounting, after.mounting, atol=1e-12)
 
@@ -254,7 +229,7 @@ def test_level_calibration_removes_a_small_tilt(tilt_deg: tuple[float, float]) -
     before = NodeCalibration(accel_bias_mps2=tuple(BIAS))
     tilt = Rotation.from_euler("xy", tilt_deg, degrees=True).as_matrix()
     force_s = np.linalg.solve(np.array(before.mounting), tilt.T @ [0, 0, -G])
-    after = calibrate_level(pose(force_s), before)
+    after = solver.calibrate_level(pose(force_s), before)
     level = Correction(after.mounting, after.accel_matrix, after.accel_bias_mps2)
     assert level.apply(tuple(force_s + BIAS)) == pytest.approx((0, 0, -G), abs=0.02)
 
@@ -279,12 +254,12 @@ def test_magnetometer_is_calibrated_from_raw_records() -> None:
         )
         for k, row in enumerate(counts.tolist())
     ]
-    samples = node_samples(raws)
+    samples = solver.node_samples(raws)
     assert samples.mag.shape == (200, 3)
     np.testing.assert_allclose(samples.mag_time_s[:3], [0.0, 0.02, 0.04])
     assert not samples.moving.any()
     assert samples.accel[0] == pytest.approx((0, 0, G))
-    after = calibrate_magnetometer(samples, NodeCalibration())
+    after = solver.calibrate_magnetometer(samples, NodeCalibration())
     assert after.mag_hard_iron_ut == pytest.approx((8.0, -4.0, 2.0), abs=0.05)
     assert after.mag_residual_ut < 0.1
 
@@ -301,7 +276,7 @@ def lying(
     accel_noise: float = 0.04,
     bias: np.ndarray = BIAS,
     seed: int = 0,
-) -> NodeSamples:
+) -> solver.NodeSamples:
     """A board face up, turning about the vertical, in the field of mid latitudes."""
     rng = np.random.default_rng(seed)
     time_s = np.arange(0.0, seconds, 0.01)
@@ -309,7 +284,7 @@ def lying(
     heading = np.radians(turn_degps) * mag_time_s
     field = np.column_stack([20 * np.cos(heading), -20 * np.sin(heading), 0 * heading + 40.0])
     n = len(time_s)
-    return NodeSamples(
+    return solver.NodeSamples(
         time_s=time_s,
         accel=SIDES[4] + rng.normal(0, accel_noise, (n, 3)),
         gyro=bias + np.array([0, 0, np.radians(turn_degps)]) + rng.normal(0, gyro_noise, (n, 3)),
@@ -322,63 +297,63 @@ def lying(
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("mag_hz", [0.0, 15.0, 75.0])
 def test_rest_gives_the_gyro_bias(seed: int, mag_hz: float) -> None:
-    gyro = gyro_at_rest(lying(10.0, mag_hz=mag_hz, seed=seed))
+    gyro = solver.gyro_at_rest(lying(10.0, mag_hz=mag_hz, seed=seed))
     assert gyro.mean(axis=0) == pytest.approx(BIAS, abs=2e-4)
 
 
 @pytest.mark.parametrize("turn_degps", [-2.8, 2.8, 1.0])
 def test_steady_turn_is_no_rest(turn_degps: float) -> None:
     turn = lying(20.0, turn_degps)
-    assert len(still_windows(turn)) >= 19, "as quiet as on a table"
-    with pytest.raises(CalibrationError, match="3 s of rest"):
-        gyro_at_rest(turn)
+    assert len(solver.still_windows(turn)) >= 19, "as quiet as on a table"
+    with pytest.raises(solver.CalibrationError, match="3 s of rest"):
+        solver.gyro_at_rest(turn)
 
 
 def test_rest_is_found_among_the_turns_of_a_log() -> None:
     log = joined(lying(20.0, 2.8), lying(8.0, seed=1), lying(30.0, -2.8))
-    after = calibrate_gyro(log, NodeCalibration())
+    after = solver.calibrate_gyro(log, NodeCalibration())
     assert after.gyro_bias_radps == pytest.approx(tuple(BIAS), abs=5e-4)
     assert after.gyro_residual_radps < 0.003
 
 
 def test_contradicting_rests_are_refused_without_a_magnetometer() -> None:
     log = joined(lying(8.0, mag_hz=0.0), lying(8.0, 2.8, mag_hz=0.0))
-    with pytest.raises(CalibrationError, match=r"2.8 °/s: .*turned steadily"):
-        gyro_at_rest(log)
+    with pytest.raises(solver.CalibrationError, match=r"2.8 °/s: .*turned steadily"):
+        solver.gyro_at_rest(log)
 
 
 def test_samples_in_motion_by_gps_are_no_rest() -> None:
     flown = lying(10.0, 2.8, mag_hz=0.0)
-    assert rest_spans(flown)
+    assert solver.rest_spans(flown)
     flown.moving[:] = True
-    assert still_windows(flown) == []
+    assert solver.still_windows(flown) == []
 
 
 @pytest.mark.parametrize(
     ("shape", "is_still"),
     [
-        ({"gyro_noise": 0.8 * STILL_GYRO_RADPS}, True),
-        ({"gyro_noise": 1.2 * STILL_GYRO_RADPS}, False),
-        ({"accel_noise": 0.8 * STILL_ACCEL_MPS2}, True),
-        ({"accel_noise": 1.2 * STILL_ACCEL_MPS2}, False),
-        ({"bias": np.array([0.95 * MAX_GYRO_BIAS_RADPS, 0, 0])}, True),
-        ({"bias": np.array([1.05 * MAX_GYRO_BIAS_RADPS, 0, 0])}, False),
+        ({"gyro_noise": 0.8 * solver.STILL_GYRO_RADPS}, True),
+        ({"gyro_noise": 1.2 * solver.STILL_GYRO_RADPS}, False),
+        ({"accel_noise": 0.8 * solver.STILL_ACCEL_MPS2}, True),
+        ({"accel_noise": 1.2 * solver.STILL_ACCEL_MPS2}, False),
+        ({"bias": np.array([0.95 * solver.MAX_GYRO_BIAS_RADPS, 0, 0])}, True),
+        ({"bias": np.array([1.05 * solver.MAX_GYRO_BIAS_RADPS, 0, 0])}, False),
     ],
 )
 def test_noise_and_bias_limit_stillness(shape: dict[str, float], is_still: bool) -> None:
-    assert bool(still_windows(lying(5.0, **shape))) == is_still
+    assert bool(solver.still_windows(lying(5.0, **shape))) == is_still
 
 
 @pytest.mark.parametrize(("scale", "is_still"), [(1.0, True), (1.14, True), (1.17, False)])
 def test_specific_force_of_a_banked_turn_is_not_still(scale: float, is_still: bool) -> None:
     turn = lying(5.0, mag_hz=0.0)
     turn.accel[:] *= scale
-    assert bool(still_windows(turn)) == is_still
+    assert bool(solver.still_windows(turn)) == is_still
 
 
 def test_rest_lasts_at_least_three_seconds() -> None:
-    assert rest_spans(lying(2.9)) == []
-    assert rest_spans(lying(3.5)) != []
+    assert solver.rest_spans(lying(2.9)) == []
+    assert solver.rest_spans(lying(3.5)) != []
 
 
 def test_still_windows_and_poses_of_a_log() -> None:
@@ -387,7 +362,7 @@ def test_still_windows_and_poses_of_a_log() -> None:
     side = SIDES[(time_s // 6).astype(int) % 6]
     turning = (time_s % 6) > 4
     n = len(time_s)
-    samples = NodeSamples(
+    samples = solver.NodeSamples(
         time_s,
         accel=side + rng.normal(0, np.where(turning, 3.0, 0.02)[:, None], (n, 3)),
         gyro=rng.normal(0, np.where(turning, 1.0, 0.002)[:, None], (n, 3)),
@@ -395,9 +370,9 @@ def test_still_windows_and_poses_of_a_log() -> None:
         mag=np.empty((0, 3)),
         moving=np.zeros(n, np.bool_),
     )
-    windows = still_windows(samples)
+    windows = solver.still_windows(samples)
     assert 20 <= len(windows) <= 28
-    poses = distinct_poses(samples.accel, windows)
+    poses = solver.distinct_poses(samples.accel, windows)
     assert len(poses) == 6
     np.testing.assert_allclose(np.sort(poses[:, 0]), np.sort(SIDES[:, 0]), atol=0.05)
 
@@ -430,7 +405,7 @@ def test_joined_calibrations_equal_one_after_the_other(seed: int) -> None:
         return tuple(map(tuple, rows))
 
     correction = msgspec.structs.replace(
-        IN_BODY_AXES,
+        solver.IN_BODY_AXES,
         mounting=tuple(map(tuple, Rotation.random(random_state=seed).as_matrix().tolist())),
         accel_bias_mps2=ERROR,
         accel_matrix=near_identity(),
@@ -439,7 +414,7 @@ def test_joined_calibrations_equal_one_after_the_other(seed: int) -> None:
         mag_soft_iron=near_identity(),
         mag_residual_ut=0.5,
     )
-    joined = corrected_by(CALIBRATION, correction)
+    joined = solver.corrected_by(CALIBRATION, correction)
     raw = tuple(rng.normal(size=3).tolist())
     for sensor, both in corrections(joined).items():
         first = corrections(CALIBRATION)[sensor].apply(raw)
@@ -448,7 +423,9 @@ def test_joined_calibrations_equal_one_after_the_other(seed: int) -> None:
 
 
 def test_correction_of_one_sensor_leaves_the_others_to_the_last_bit() -> None:
-    joined = corrected_by(CALIBRATION, msgspec.structs.replace(IN_BODY_AXES, gyro_bias_radps=ERROR))
+    joined = solver.corrected_by(
+        CALIBRATION, msgspec.structs.replace(solver.IN_BODY_AXES, gyro_bias_radps=ERROR)
+    )
     changed = {n for n in joined.__struct_fields__ if getattr(joined, n) != getattr(CALIBRATION, n)}
     assert changed == {"gyro_bias_radps"}
 
@@ -462,7 +439,9 @@ def test_known_heading_gives_the_hard_iron(yaw_deg: float) -> None:
     samples = pose(np.array(rotate_inverse(q_nb, (0.0, 0.0, -G))) - BIAS)
     offset = np.array([9.0, 8.0, 7.0])
     samples = replace(samples, mag_time_s=samples.time_s, mag=np.tile(field_b, (500, 1)) + offset)
-    found = calibrate_magnetometer_by_yaw(samples, IN_BODY_AXES, math.radians(yaw_deg), field)
+    found = solver.calibrate_magnetometer_by_yaw(
+        samples, solver.IN_BODY_AXES, math.radians(yaw_deg), field
+    )
     assert found.mag_hard_iron_ut == pytest.approx((9.0, 8.0, 7.0), abs=0.05)
 
 
@@ -471,7 +450,7 @@ def test_measured_tilt_is_removed() -> None:
     tilt = (0.1, -0.05, 0.0)
     seen = rotate_inverse(from_euler(*tilt), level)
     raw = np.array(CALIBRATION.mounting).T @ np.array(seen)
-    turned = remove_tilt(CALIBRATION, tilt)
+    turned = solver.remove_tilt(CALIBRATION, tilt)
     assert np.array(turned.mounting) @ raw == pytest.approx(np.array(level), abs=1e-12)
     by = np.array(turned.mounting) @ np.array(CALIBRATION.mounting).T
     assert np.array(turned.mag_mounting) == pytest.approx(by @ CALIBRATION.mag_mounting, abs=1e-12)
@@ -485,12 +464,14 @@ def test_field_sides_count_directions_about_the_hard_iron() -> None:
 
     def seen(field: np.ndarray) -> int:
         none = np.empty((0, 3))
-        return field_sides(NodeSamples(np.empty(0), none, none, np.empty(0), field, np.empty(0)))
+        return solver.field_sides(
+            solver.NodeSamples(np.empty(0), none, none, np.empty(0), field, np.empty(0))
+        )
 
     assert seen(np.empty((0, 3))) == 0
     assert seen(np.tile(offset, (50, 1))) <= 1
-    assert seen(all_sides + offset) == FIELD_SIDES
+    assert seen(all_sides + offset) == solver.FIELD_SIDES
     flat = all_sides * [1.0, 1.0, 0.05]
-    assert seen(flat + offset) < FIELD_SIDES // 4
+    assert seen(flat + offset) < solver.FIELD_SIDES // 4
     half = all_sides[all_sides[:, 0] > 0.0]
-    assert seen(half + offset) < 0.8 * FIELD_SIDES
+    assert seen(half + offset) < 0.8 * solver.FIELD_SIDES

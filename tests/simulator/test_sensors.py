@@ -4,20 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gateway.simulator.sensors import (
-    FACE_UP,
-    MAG_OVERFLOW,
-    Bmp180,
-    Hmc5883l,
-    Mpu6050,
-    Walk,
-    Wander,
-    errors_of,
-    mag_counts,
-    pressure_at,
-    temperature_counts,
-    to_int16,
-)
+from gateway.simulator import sensors
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import Truth
 
@@ -45,17 +32,19 @@ def still(size: int = SIZE, accel: tuple[float, ...] = (0.0, 0.0, -9.80665)) -> 
 
 class TestMpu6050:
     def test_calibrated_rest_reads_gravity(self, rng: np.random.Generator) -> None:
-        imu = Mpu6050(SETTINGS, rng)
-        errors = errors_of(imu, Hmc5883l(SETTINGS, rng))
+        imu = sensors.Mpu6050(SETTINGS, rng)
+        errors = sensors.errors_of(imu, sensors.Hmc5883l(SETTINGS, rng))
         counts = imu.sample(still(2000))
         accel_s = counts.accel * (8 * 9.80665 / 32768)
-        accel_b = (accel_s - errors.accel_bias_mps2) @ np.transpose(errors.accel_matrix) * FACE_UP
+        accel_b = (
+            (accel_s - errors.accel_bias_mps2) @ np.transpose(errors.accel_matrix) * sensors.FACE_UP
+        )
         np.testing.assert_allclose(accel_b.mean(axis=0), [0.0, 0.0, -9.80665], atol=0.01)
         gyro_s = np.radians(counts.gyro / 32.8)
         np.testing.assert_allclose(gyro_s.mean(axis=0), errors.gyro_bias_radps, atol=3e-3)
 
     def test_noise_has_the_density_of_the_data_sheet(self, rng: np.random.Generator) -> None:
-        counts = Mpu6050(SETTINGS, rng).sample(still(3000))
+        counts = sensors.Mpu6050(SETTINGS, rng).sample(still(3000))
         # 100 Hz see 50 Hz of noise; the walk adds little in 30 s, rounding 0.3 counts.
         accel_sigma = np.diff(counts.accel, axis=0).std(axis=0) / np.sqrt(2.0)
         gyro_sigma = np.diff(counts.gyro, axis=0).std(axis=0) / np.sqrt(2.0)
@@ -63,13 +52,13 @@ class TestMpu6050:
         np.testing.assert_allclose(gyro_sigma, 0.005 * np.sqrt(50.0) * 32.8, rtol=0.08)
 
     def test_readings_beyond_the_range_are_clipped(self, rng: np.random.Generator) -> None:
-        counts = Mpu6050(SETTINGS, rng).sample(still(100, (200.0, 0.0, -9.8)))
+        counts = sensors.Mpu6050(SETTINGS, rng).sample(still(100, (200.0, 0.0, -9.8)))
         assert (counts.accel[:, 0] == 32767).all()
         assert counts.accel_clipped.all()
         assert not counts.gyro_clipped.any()
 
     def test_temperature_rises_after_the_start(self, rng: np.random.Generator) -> None:
-        counts = Mpu6050(SETTINGS, rng).sample(still())
+        counts = sensors.Mpu6050(SETTINGS, rng).sample(still())
         degc = counts.temperature / 340 + 36.53
         assert degc[0] == pytest.approx(29.0, abs=0.01)
         assert degc[-1] > 32.0
@@ -77,33 +66,33 @@ class TestMpu6050:
 
 class TestHmc5883l:
     def test_calibration_brings_the_field_back(self, rng: np.random.Generator) -> None:
-        mag = Hmc5883l(SETTINGS, rng)
-        errors = errors_of(Mpu6050(SETTINGS, rng), mag)
+        mag = sensors.Hmc5883l(SETTINGS, rng)
+        errors = sensors.errors_of(sensors.Mpu6050(SETTINGS, rng), mag)
         attitudes = Rotation.random(2000, rng=rng)
         counts = mag.sample(attitudes.as_quat(scalar_first=True))
         measured_ut = counts * (100.0 / 1090)
         field_b = (measured_ut - errors.mag_hard_iron_ut) @ np.transpose(errors.mag_soft_iron)
-        off = field_b * FACE_UP - attitudes.inv().apply(mag.field_n_ut)
+        off = field_b * sensors.FACE_UP - attitudes.inv().apply(mag.field_n_ut)
         assert np.abs(off.mean(axis=0)).max() < 0.05
         assert 0.2 < off.std() < 0.35
 
     def test_field_of_the_default_home_is_that_of_java(self, rng: np.random.Generator) -> None:
-        north, east, down = Hmc5883l(SETTINGS, rng).field_n_ut
+        north, east, down = sensors.Hmc5883l(SETTINGS, rng).field_n_ut
         assert np.degrees(np.arctan2(east, north)) == pytest.approx(0.8, abs=0.3)
         assert down < -15.0, "the field points up south of the magnetic equator"
         assert np.linalg.norm([north, east, down]) == pytest.approx(45.0, abs=1.5)
 
     def test_field_beyond_the_range_reads_as_overflow(self) -> None:
-        assert mag_counts(np.array([[187.0, -190.0, 190.0]]), 1).tolist() == [
-            [2038, MAG_OVERFLOW, MAG_OVERFLOW]
+        assert sensors.mag_counts(np.array([[187.0, -190.0, 190.0]]), 1).tolist() == [
+            [2038, sensors.MAG_OVERFLOW, sensors.MAG_OVERFLOW]
         ]
 
 
 class TestBmp180:
     def test_pressure_corresponds_to_the_height(self, rng: np.random.Generator) -> None:
-        baro = Bmp180(SETTINGS, rng)
+        baro = sensors.Bmp180(SETTINGS, rng)
         pressure_pa, temperature_degc = baro.sample(still(2000))
-        expected = pressure_at(np.array([110.0]), baro.sea_level_pa)[0]
+        expected = sensors.pressure_at(np.array([110.0]), baro.sea_level_pa)[0]
         assert pressure_pa.mean() == pytest.approx(expected, abs=25.0)
         assert 2.5 < np.diff(pressure_pa).std() / np.sqrt(2.0) < 3.5
         assert (pressure_pa == np.rint(pressure_pa)).all()
@@ -115,30 +104,35 @@ class TestBmp180:
     def test_pressure_is_that_of_the_standard_atmosphere(
         self, alt_m: float, pressure_pa: float
     ) -> None:
-        assert pressure_at(np.array([alt_m]), 101325.0)[0] == pytest.approx(pressure_pa, rel=2e-5)
+        assert sensors.pressure_at(np.array([alt_m]), 101325.0)[0] == pytest.approx(
+            pressure_pa, rel=2e-5
+        )
 
 
 def test_words() -> None:
-    counts, clipped = to_int16(np.array([[0.4, -0.6, 1.0], [40000.0, 0.0, 0.0]]))
+    counts, clipped = sensors.to_int16(np.array([[0.4, -0.6, 1.0], [40000.0, 0.0, 0.0]]))
     assert counts.tolist() == [[0, -1, 1], [32767, 0, 0]]
     assert clipped.tolist() == [False, True]
-    assert temperature_counts(np.array([36.53, 25.0])).tolist() == [0, -3920]
+    assert sensors.temperature_counts(np.array([36.53, 25.0])).tolist() == [0, -3920]
 
 
 class TestNoise:
     def test_wander_keeps_its_spread_and_memory(self, rng: np.random.Generator) -> None:
-        values = Wander(rng, 2.0, 10.0, 0.1).draw(200_000)
+        values = sensors.Wander(rng, 2.0, 10.0, 0.1).draw(200_000)
         np.testing.assert_allclose(values.std(axis=0), 2.0, rtol=0.1)
         lag = 100
         memory = (values[lag:] * values[:-lag]).mean() / values.var()
         assert memory == pytest.approx(np.exp(-1.0), abs=0.05)
 
     def test_walk_grows_with_the_root_of_time(self) -> None:
-        ends = [Walk(np.random.default_rng(seed), 0.5, 0.01).draw(400)[-1] for seed in range(300)]
+        ends = [
+            sensors.Walk(np.random.default_rng(seed), 0.5, 0.01).draw(400)[-1]
+            for seed in range(300)
+        ]
         assert np.std(ends) == pytest.approx(0.5 * 2.0, rel=0.1)
 
     @pytest.mark.parametrize(
-        "make", [lambda r: Wander(r, 1.0, 5.0, 0.1), lambda r: Walk(r, 1.0, 0.1)]
+        "make", [lambda r: sensors.Wander(r, 1.0, 5.0, 0.1), lambda r: sensors.Walk(r, 1.0, 0.1)]
     )
     def test_pieces_equal_the_whole(self, make) -> None:
         whole = make(np.random.default_rng(3)).draw(1000)

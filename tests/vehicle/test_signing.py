@@ -8,34 +8,24 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.vehicle.service import LogWarning
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
-from gateway.wire.mavlink_signing import (
-    EPOCH_2015_US,
-    KEY_BYTES,
-    MAX_KEYS,
-    MAX_STREAMS,
-    RESERVE_TICKS,
-    SigningClock,
-    SigningTimestamps,
-    Verifier,
-    key_from_passphrase,
-)
+from gateway.wire import mavlink_signing as signing
 from tests.conftest import ManualClock
 from tests.kit.ground_station import GroundStation, of_kind
 from tests.kit.mavlink import packed
 
 NOW_UNIX_US = 1_790_000_000_000_000
-KEY = key_from_passphrase("correct horse")
+KEY = signing.key_from_passphrase("correct horse")
 SET = mavlink.MAVLink_param_set_message(1, 1, b"RATE_ATT", 5.0, mavlink.MAV_PARAM_TYPE_REAL32)
 
 
 def ticks(unix_us: int) -> int:
-    return (unix_us - EPOCH_2015_US) // 10
+    return (unix_us - signing.EPOCH_2015_US) // 10
 
 
 @pytest.fixture
 def vehicle() -> Vehicle:
     settings = VehicleSettings(signing_passphrase="correct horse")
-    return Vehicle(settings, 1, clock=SigningClock(NOW_UNIX_US))
+    return Vehicle(settings, 1, clock=signing.SigningClock(NOW_UNIX_US))
 
 
 def sign(station: GroundStation, key: bytes = KEY, at_us: int = NOW_UNIX_US) -> None:
@@ -48,7 +38,7 @@ def changed(found: list[Any]) -> bool:
 
 
 def test_key_is_the_hash_of_the_passphrase() -> None:
-    assert len(KEY) == KEY_BYTES
+    assert len(KEY) == signing.KEY_BYTES
     assert KEY.hex().startswith("4104d36f"), "sha256sum of the passphrase"
 
 
@@ -72,7 +62,7 @@ def test_signature_does_not_make_a_client_trusted(station: GroundStation) -> Non
 
 
 def test_frame_signed_with_another_key_is_dropped(station: GroundStation) -> None:
-    sign(station, key_from_passphrase("wrong"))
+    sign(station, signing.key_from_passphrase("wrong"))
     assert station.send(SET) == []
     assert station.vehicle.faults["bad signature"] == 1
 
@@ -105,7 +95,7 @@ def test_refused_signature_is_listed_and_logged_with_its_reason(
 ) -> None:
     for _ in range(30):
         sent_us = NOW_UNIX_US + station.clock.now_us - behind_s * 1_000_000
-        sign(station, key_from_passphrase(key), sent_us)
+        sign(station, signing.key_from_passphrase(key), sent_us)
         assert station.send(SET) == []
         station.clock.now_us += 1_000_000
     (entry,) = station.vehicle.requests.entries
@@ -116,7 +106,7 @@ def test_refused_signature_is_listed_and_logged_with_its_reason(
 
 
 def test_forged_frame_does_not_lock_out_the_true_sender(station: GroundStation) -> None:
-    sign(station, key_from_passphrase("wrong"), at_us=NOW_UNIX_US + 10**15)
+    sign(station, signing.key_from_passphrase("wrong"), at_us=NOW_UNIX_US + 10**15)
     station.send(SET)
     sign(station)
     assert changed(station.send(SET))
@@ -148,9 +138,9 @@ def test_changed_passphrase_takes_effect_at_once(station: GroundStation) -> None
     old = station.frame(SET)
     change(station, "another horse")
     assert station.send_bytes(old) == []
-    sign(station, key_from_passphrase("another horse"))
+    sign(station, signing.key_from_passphrase("another horse"))
     assert changed(station.send(SET))
-    assert station.vehicle.signing_key == key_from_passphrase("another horse")
+    assert station.vehicle.signing_key == signing.key_from_passphrase("another horse")
     change(station, "")
     station.mav.signing.sign_outgoing = False
     assert changed(station.send(SET))
@@ -158,17 +148,17 @@ def test_changed_passphrase_takes_effect_at_once(station: GroundStation) -> None
 
 
 def test_number_of_streams_is_bounded() -> None:
-    verifier = Verifier(KEY, SigningClock(NOW_UNIX_US))
+    verifier = signing.Verifier(KEY, signing.SigningClock(NOW_UNIX_US))
     accepted = sum(
         verifier.accepts(ping(sender=(number % 256, 1 + number // 256)), 0)
-        for number in range(2 * MAX_STREAMS)
+        for number in range(2 * signing.MAX_STREAMS)
     )
-    assert accepted == MAX_STREAMS
+    assert accepted == signing.MAX_STREAMS
 
 
 def test_short_key_raises_value_error() -> None:
     with pytest.raises(ValueError, match="31 bytes"):
-        Verifier(bytes(31), SigningClock(0))
+        signing.Verifier(bytes(31), signing.SigningClock(0))
 
 
 def ping(at_us: int = NOW_UNIX_US, sender: tuple[int, int] = (255, 190)) -> bytes:
@@ -178,23 +168,23 @@ def ping(at_us: int = NOW_UNIX_US, sender: tuple[int, int] = (255, 190)) -> byte
 
 @pytest.mark.parametrize("orderly", [True, False])
 def test_frame_is_not_accepted_again_after_a_restart(orderly: bool) -> None:
-    clock, timestamps = SigningClock(NOW_UNIX_US), SigningTimestamps()
-    verifier, kept = Verifier(KEY, clock, timestamps), timestamps.to_keep()
+    clock, timestamps = signing.SigningClock(NOW_UNIX_US), signing.SigningTimestamps()
+    verifier, kept = signing.Verifier(KEY, clock, timestamps), timestamps.to_keep()
     taken = [ping(NOW_UNIX_US + n * 100_000) for n in range(100)]
     for frame in taken:
         assert verifier.accepts(frame, 0)
         if timestamps.is_due:
             kept = timestamps.to_keep()
-    again = SigningTimestamps(timestamps.exact() if orderly else kept)
-    verifier = Verifier(KEY, SigningClock(NOW_UNIX_US - 86_400_000_000), again)
+    again = signing.SigningTimestamps(timestamps.exact() if orderly else kept)
+    verifier = signing.Verifier(KEY, signing.SigningClock(NOW_UNIX_US - 86_400_000_000), again)
     assert not any(verifier.accepts(frame, 0) for frame in taken)
-    reserve_us = 0 if orderly else RESERVE_TICKS * 10
+    reserve_us = 0 if orderly else signing.RESERVE_TICKS * 10
     assert verifier.accepts(ping(NOW_UNIX_US + 10_000_000 + reserve_us), 0)
 
 
 def test_timestamps_of_a_busy_stream_are_written_every_few_seconds() -> None:
-    timestamps = SigningTimestamps()
-    verifier, written = Verifier(KEY, SigningClock(NOW_UNIX_US), timestamps), 0
+    timestamps = signing.SigningTimestamps()
+    verifier, written = signing.Verifier(KEY, signing.SigningClock(NOW_UNIX_US), timestamps), 0
     for n in range(600):
         assert verifier.accepts(ping(NOW_UNIX_US + n * 100_000), 0)
         if timestamps.is_due:
@@ -217,18 +207,23 @@ def test_replayed_frame_is_dropped_after_a_passphrase_was_changed_and_restored(
 
 def test_old_recording_is_rejected_once_gps_time_is_known() -> None:
     day_us = 86_400_000_000
-    clock = SigningClock(NOW_UNIX_US - day_us)
-    assert Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)
+    clock = signing.SigningClock(NOW_UNIX_US - day_us)
+    assert signing.Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)
     clock.set_gps_time(NOW_UNIX_US)
-    assert not Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)
-    assert Verifier(KEY, clock).accepts(ping(NOW_UNIX_US), 0)
+    assert not signing.Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)
+    assert signing.Verifier(KEY, clock).accepts(ping(NOW_UNIX_US), 0)
 
 
 def test_oldest_key_is_discarded_beyond_the_limit() -> None:
-    timestamps = SigningTimestamps()
-    for n in range(2 * MAX_KEYS):
+    timestamps = signing.SigningTimestamps()
+    for n in range(2 * signing.MAX_KEYS):
         assert timestamps.accept(f"{n}", "0.1.1", n, oldest=0)
-    assert list(timestamps.exact()) == [f"{n}" for n in range(MAX_KEYS, 2 * MAX_KEYS)]
-    again, newest = SigningTimestamps(timestamps.to_keep()), MAX_KEYS + RESERVE_TICKS
-    assert not again.accept(f"{MAX_KEYS}", "0.1.1", newest, oldest=0)
-    assert again.accept(f"{MAX_KEYS}", "0.1.1", newest + 1, oldest=0)
+    assert list(timestamps.exact()) == [
+        f"{n}" for n in range(signing.MAX_KEYS, 2 * signing.MAX_KEYS)
+    ]
+    again, newest = (
+        signing.SigningTimestamps(timestamps.to_keep()),
+        signing.MAX_KEYS + signing.RESERVE_TICKS,
+    )
+    assert not again.accept(f"{signing.MAX_KEYS}", "0.1.1", newest, oldest=0)
+    assert again.accept(f"{signing.MAX_KEYS}", "0.1.1", newest + 1, oldest=0)
