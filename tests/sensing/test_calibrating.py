@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from gateway.geometry.geomagnetism import MagneticField
 from gateway.geometry.quaternion import from_euler, rotate_inverse
 from gateway.geometry.rotation import Matrix3
-from gateway.records import ImuFlags, ImuRaw, NodeId
+from gateway.records import ImuFlags
 from gateway.sensing import calibrating as solver
 from gateway.sensing.calibration import FACE_UP, IDENTITY3, Correction, NodeCalibration
+from tests.kit.records import raw_at
 
 G = 9.80665
 SIDES = G * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
@@ -22,6 +23,15 @@ SIDES = G * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [
 def sphere(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
     points = rng.normal(size=(count, 3))
     return radius * points / np.linalg.norm(points, axis=1)[:, None]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sphere_fit_finds_centre_and_radius(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    centre, radius = rng.normal(scale=20.0, size=3), float(rng.uniform(20.0, 60.0))
+    found, found_radius = solver.fit_sphere(sphere(rng, 200, radius) + centre)
+    assert found == pytest.approx(tuple(centre), abs=1e-9)
+    assert found_radius == pytest.approx(radius)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -68,20 +78,16 @@ def test_magnetometer_ellipsoid_gives_hard_and_soft_iron(seed: int) -> None:
 def test_magnetometer_without_known_strength_keeps_the_mean() -> None:
     raw = sphere(np.random.default_rng(1), 300, 50.0) + 10.0
     fit = solver.solve_magnetometer(raw)
-    assert np.linalg.norm((raw - fit.bias) @ np.array(fit.matrix), axis=1).mean() == pytest.approx(
-        50.0, rel=1e-3
-    )
+    strengths = np.linalg.norm((raw - fit.bias) @ np.array(fit.matrix), axis=1)
+    assert strengths.mean() == pytest.approx(50.0, rel=1e-3)
 
 
 def test_magnetometer_that_was_only_turned_flat_is_refused() -> None:
     angle = np.linspace(0, 6.28, 300)
     flat = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), np.full(300, 20.0)])
-    with pytest.raises(solver.CalibrationError, match="turn the aircraft"):
-        solver.solve_magnetometer(flat)
-    with pytest.raises(solver.CalibrationError, match="10 samples"):
-        solver.solve_magnetometer(flat[:10])
-    with pytest.raises(solver.CalibrationError, match="1 sample where"):
-        solver.solve_magnetometer(flat[:1])
+    for count, why in ((300, "turn the aircraft"), (10, "10 samples"), (1, "1 sample where")):
+        with pytest.raises(solver.CalibrationError, match=why):
+            solver.solve_magnetometer(flat[:count])
 
 
 @pytest.mark.parametrize("pitch_deg", [20.0, 45.0, 90.0])
@@ -141,7 +147,18 @@ def test_compass_at_rest_is_to_be_turned(rng: np.random.Generator) -> None:
         solver.solve_magnetometer(noise)
 
 
-BIAS = np.array([0.2, -0.1, 0.3])
+ACCEL_BIAS = np.array([0.2, -0.1, 0.3])
+GYRO_BIAS = np.array([0.02, -0.03, 0.01])
+NO_TIMES, NO_VECTORS = np.empty(0), np.empty((0, 3))
+
+
+def samples(
+    accel: np.ndarray, gyro: np.ndarray, mag_time_s: np.ndarray = NO_TIMES,
+    mag: np.ndarray = NO_VECTORS,
+) -> solver.NodeSamples:  # fmt: skip
+    """Return samples of 100 Hz."""
+    still = np.zeros(len(accel), np.bool_)
+    return solver.NodeSamples(0.01 * np.arange(len(accel)), accel, gyro, mag_time_s, mag, still)
 
 
 def pose(
@@ -149,27 +166,17 @@ def pose(
 ) -> solver.NodeSamples:
     """Five seconds in one pose, as a node would read them."""
     rng = np.random.default_rng(seed)
-    time_s = np.arange(0, 5, 0.01)
-    n = len(time_s)
-    return solver.NodeSamples(
-        time_s=time_s,
-        accel=force + BIAS + rng.normal(0, shaking, (n, 3)),
-        gyro=rate + rng.normal(0, 0.1 * shaking, (n, 3)),
-        mag_time_s=np.empty(0),
-        mag=np.empty((0, 3)),
-        moving=np.zeros(n, np.bool_),
-    )
+    accel = force + ACCEL_BIAS + rng.normal(0, shaking, (500, 3))
+    return samples(accel, rate + rng.normal(0, 0.1 * shaking, (500, 3)))
 
 
 def joined(*parts: solver.NodeSamples) -> solver.NodeSamples:
     begins = np.cumsum([0.0, *(part.time_s[-1] + 0.01 for part in parts)])
-    return solver.NodeSamples(
-        time_s=np.concatenate([p.time_s + t for p, t in zip(parts, begins, strict=False)]),
-        accel=np.vstack([p.accel for p in parts]),
-        gyro=np.vstack([p.gyro for p in parts]),
-        mag_time_s=np.concatenate([p.mag_time_s + t for p, t in zip(parts, begins, strict=False)]),
-        mag=np.vstack([p.mag for p in parts]),
-        moving=np.concatenate([p.moving for p in parts]),
+    return samples(
+        np.vstack([p.accel for p in parts]),
+        np.vstack([p.gyro for p in parts]),
+        np.concatenate([p.mag_time_s + t for p, t in zip(parts, begins, strict=False)]),
+        np.vstack([p.mag for p in parts]),
     )
 
 
@@ -191,14 +198,14 @@ def test_six_poses_one_by_one_give_the_accelerometer_bias() -> None:
     assert solver.sides_of(held[1:]) == {1, 2, 3, 4, 5}
     assert solver.sides_of(held) == set(range(6))
     after = solver.calibrate_accelerometer(held, NodeCalibration())
-    assert after.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.01)
+    assert after.accel_bias_mps2 == pytest.approx(tuple(ACCEL_BIAS), abs=0.01)
     assert after.accel_residual_mps2 < 0.01
 
 
 def test_six_poses_in_one_log_give_the_accelerometer_bias() -> None:
     whole = joined(*(pose(side, k) for k, side in enumerate(SIDES)))
     after = solver.calibrate_accelerometer([whole], NodeCalibration())
-    assert after.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.01)
+    assert after.accel_bias_mps2 == pytest.approx(tuple(ACCEL_BIAS), abs=0.01)
 
 
 def test_tilted_pose_is_no_side() -> None:
@@ -218,7 +225,7 @@ def test_mounting_turns_the_magnetometer_along() -> None:
     mounting = Rotation.from_euler("zyx", [90, 10, 180], degrees=True).as_matrix()
     level = pose(mounting.T @ [0, 0, -G])
     raised = pose(mounting.T @ [G * np.sin(0.8), 0, -G * np.cos(0.8)], 1)
-    before = NodeCalibration(accel_bias_mps2=tuple(BIAS))
+    before = NodeCalibration(accel_bias_mps2=tuple(ACCEL_BIAS))
     after = solver.calibrate_mounting(level, raised, before)
     np.testing.assert_allclose(after.mounting, mounting, atol=2e-3)
     np.testing.assert_allclose(after.mag_mounting, after.mounting, atol=1e-12)
@@ -226,45 +233,30 @@ def test_mounting_turns_the_magnetometer_along() -> None:
 
 @pytest.mark.parametrize("tilt_deg", [(3.0, -2.0), (-5.0, 4.0), (0.0, 0.0)])
 def test_level_calibration_removes_a_small_tilt(tilt_deg: tuple[float, float]) -> None:
-    before = NodeCalibration(accel_bias_mps2=tuple(BIAS))
+    before = NodeCalibration(accel_bias_mps2=tuple(ACCEL_BIAS))
     tilt = Rotation.from_euler("xy", tilt_deg, degrees=True).as_matrix()
     force_s = np.linalg.solve(np.array(before.mounting), tilt.T @ [0, 0, -G])
     after = solver.calibrate_level(pose(force_s), before)
     level = Correction(after.mounting, after.accel_matrix, after.accel_bias_mps2)
-    assert level.apply(tuple(force_s + BIAS)) == pytest.approx((0, 0, -G), abs=0.02)
+    assert level.apply(tuple(force_s + ACCEL_BIAS)) == pytest.approx((0, 0, -G), abs=0.02)
 
 
 def test_magnetometer_is_calibrated_from_raw_records() -> None:
     rng = np.random.default_rng(4)
-    points = rng.normal(size=(400, 3))
-    counts = np.rint(500 * points / np.linalg.norm(points, axis=1)[:, None] + [80, -40, 20])
+    counts = np.rint(sphere(rng, 400, 500.0) + np.array([80, -40, 20])).astype(int).tolist()
+    flags = ImuFlags.MAG_NEW, ImuFlags(0)
     raws = [
-        ImuRaw(
-            time_us=10_000 * k,
-            node=NodeId(1, 0),
-            node_time_us=0,
-            accel_raw=(0, 0, 4096),
-            gyro_raw=(0, 0, 0),
-            mag_raw=tuple(int(c) for c in row),
-            temperature_raw=0,
-            accel_range_g=8,
-            gyro_range_dps=1000,
-            mag_lsb_per_gauss=1000,
-            flags=ImuFlags.MAG_NEW if k % 2 == 0 else ImuFlags(0),
-        )
-        for k, row in enumerate(counts.tolist())
+        raw_at(10_000 * k, mag_raw=tuple(row), mag_lsb_per_gauss=1000, flags=flags[k % 2])
+        for k, row in enumerate(counts)
     ]
-    samples = solver.node_samples(raws)
-    assert samples.mag.shape == (200, 3)
-    np.testing.assert_allclose(samples.mag_time_s[:3], [0.0, 0.02, 0.04])
-    assert not samples.moving.any()
-    assert samples.accel[0] == pytest.approx((0, 0, G))
-    after = solver.calibrate_magnetometer(samples, NodeCalibration())
+    read = solver.node_samples(raws)
+    assert read.mag.shape == (200, 3)
+    np.testing.assert_allclose(read.mag_time_s[:3], [0.0, 0.02, 0.04])
+    assert not read.moving.any()
+    assert read.accel[0] == pytest.approx((0, 0, G))
+    after = solver.calibrate_magnetometer(read, NodeCalibration())
     assert after.mag_hard_iron_ut == pytest.approx((8.0, -4.0, 2.0), abs=0.05)
     assert after.mag_residual_ut < 0.1
-
-
-BIAS = np.array([0.02, -0.03, 0.01])
 
 
 def lying(
@@ -274,23 +266,20 @@ def lying(
     mag_hz: float = 75.0,
     gyro_noise: float = 0.002,
     accel_noise: float = 0.04,
-    bias: np.ndarray = BIAS,
+    bias: np.ndarray = GYRO_BIAS,
     seed: int = 0,
 ) -> solver.NodeSamples:
     """A board face up, turning about the vertical, in the field of mid latitudes."""
     rng = np.random.default_rng(seed)
-    time_s = np.arange(0.0, seconds, 0.01)
+    n = round(100 * seconds)
     mag_time_s = np.arange(0.0, seconds if mag_hz else 0.0, 1.0 / (mag_hz or 1.0))
     heading = np.radians(turn_degps) * mag_time_s
     field = np.column_stack([20 * np.cos(heading), -20 * np.sin(heading), 0 * heading + 40.0])
-    n = len(time_s)
-    return solver.NodeSamples(
-        time_s=time_s,
-        accel=SIDES[4] + rng.normal(0, accel_noise, (n, 3)),
-        gyro=bias + np.array([0, 0, np.radians(turn_degps)]) + rng.normal(0, gyro_noise, (n, 3)),
-        mag_time_s=mag_time_s,
-        mag=field + rng.normal(0, 0.5, field.shape) + [10.0, -5.0, 3.0],
-        moving=np.zeros(n, np.bool_),
+    return samples(
+        SIDES[4] + rng.normal(0, accel_noise, (n, 3)),
+        bias + np.array([0, 0, np.radians(turn_degps)]) + rng.normal(0, gyro_noise, (n, 3)),
+        mag_time_s,
+        field + rng.normal(0, 0.5, field.shape) + [10.0, -5.0, 3.0],
     )
 
 
@@ -298,7 +287,7 @@ def lying(
 @pytest.mark.parametrize("mag_hz", [0.0, 15.0, 75.0])
 def test_rest_gives_the_gyro_bias(seed: int, mag_hz: float) -> None:
     gyro = solver.gyro_at_rest(lying(10.0, mag_hz=mag_hz, seed=seed))
-    assert gyro.mean(axis=0) == pytest.approx(BIAS, abs=2e-4)
+    assert gyro.mean(axis=0) == pytest.approx(GYRO_BIAS, abs=2e-4)
 
 
 @pytest.mark.parametrize("turn_degps", [-2.8, 2.8, 1.0])
@@ -312,7 +301,7 @@ def test_steady_turn_is_no_rest(turn_degps: float) -> None:
 def test_rest_is_found_among_the_turns_of_a_log() -> None:
     log = joined(lying(20.0, 2.8), lying(8.0, seed=1), lying(30.0, -2.8))
     after = solver.calibrate_gyro(log, NodeCalibration())
-    assert after.gyro_bias_radps == pytest.approx(tuple(BIAS), abs=5e-4)
+    assert after.gyro_bias_radps == pytest.approx(tuple(GYRO_BIAS), abs=5e-4)
     assert after.gyro_residual_radps < 0.003
 
 
@@ -361,18 +350,11 @@ def test_still_windows_and_poses_of_a_log() -> None:
     time_s = np.arange(0, 40, 0.01)
     side = SIDES[(time_s // 6).astype(int) % 6]
     turning = (time_s % 6) > 4
-    n = len(time_s)
-    samples = solver.NodeSamples(
-        time_s,
-        accel=side + rng.normal(0, np.where(turning, 3.0, 0.02)[:, None], (n, 3)),
-        gyro=rng.normal(0, np.where(turning, 1.0, 0.002)[:, None], (n, 3)),
-        mag_time_s=np.empty(0),
-        mag=np.empty((0, 3)),
-        moving=np.zeros(n, np.bool_),
-    )
-    windows = solver.still_windows(samples)
+    accel = side + rng.normal(0, np.where(turning, 3.0, 0.02)[:, None], side.shape)
+    gyro = rng.normal(0, np.where(turning, 1.0, 0.002)[:, None], side.shape)
+    windows = solver.still_windows(samples(accel, gyro))
     assert 20 <= len(windows) <= 28
-    poses = solver.distinct_poses(samples.accel, windows)
+    poses = solver.distinct_poses(accel, windows)
     assert len(poses) == 6
     np.testing.assert_allclose(np.sort(poses[:, 0]), np.sort(SIDES[:, 0]), atol=0.05)
 
@@ -436,7 +418,7 @@ def test_known_heading_gives_the_hard_iron(yaw_deg: float) -> None:
     q_nb = from_euler(0.1, -0.2, math.radians(yaw_deg))
     north = 48.0 * math.cos(math.radians(64.0)) * np.array([math.cos(0.05236), math.sin(0.05236)])
     field_b = rotate_inverse(q_nb, (*north, 48.0 * math.sin(math.radians(64.0))))
-    samples = pose(np.array(rotate_inverse(q_nb, (0.0, 0.0, -G))) - BIAS)
+    samples = pose(np.array(rotate_inverse(q_nb, (0.0, 0.0, -G))) - ACCEL_BIAS)
     offset = np.array([9.0, 8.0, 7.0])
     samples = replace(samples, mag_time_s=samples.time_s, mag=np.tile(field_b, (500, 1)) + offset)
     found = solver.calibrate_magnetometer_by_yaw(
@@ -446,10 +428,8 @@ def test_known_heading_gives_the_hard_iron(yaw_deg: float) -> None:
 
 
 def test_measured_tilt_is_removed() -> None:
-    level = (0.0, 0.0, -9.80665)
-    tilt = (0.1, -0.05, 0.0)
-    seen = rotate_inverse(from_euler(*tilt), level)
-    raw = np.array(CALIBRATION.mounting).T @ np.array(seen)
+    level, tilt = (0.0, 0.0, -G), (0.1, -0.05, 0.0)
+    raw = np.array(CALIBRATION.mounting).T @ rotate_inverse(from_euler(*tilt), level)
     turned = solver.remove_tilt(CALIBRATION, tilt)
     assert np.array(turned.mounting) @ raw == pytest.approx(np.array(level), abs=1e-12)
     by = np.array(turned.mounting) @ np.array(CALIBRATION.mounting).T
@@ -457,21 +437,14 @@ def test_measured_tilt_is_removed() -> None:
 
 
 def test_field_sides_count_directions_about_the_hard_iron() -> None:
-    rng = np.random.default_rng(1)
-    all_sides = rng.normal(size=(4000, 3))
-    all_sides *= 45.0 / np.linalg.norm(all_sides, axis=1)[:, None]
+    all_sides = sphere(np.random.default_rng(1), 4000, 45.0)
     offset = np.array([40.0, -25.0, 10.0])
 
     def seen(field: np.ndarray) -> int:
-        none = np.empty((0, 3))
-        return solver.field_sides(
-            solver.NodeSamples(np.empty(0), none, none, np.empty(0), field, np.empty(0))
-        )
+        return solver.field_sides(samples(NO_VECTORS, NO_VECTORS, NO_TIMES, field))
 
-    assert seen(np.empty((0, 3))) == 0
+    assert seen(NO_VECTORS) == 0
     assert seen(np.tile(offset, (50, 1))) <= 1
     assert seen(all_sides + offset) == solver.FIELD_SIDES
-    flat = all_sides * [1.0, 1.0, 0.05]
-    assert seen(flat + offset) < solver.FIELD_SIDES // 4
-    half = all_sides[all_sides[:, 0] > 0.0]
-    assert seen(half + offset) < 0.8 * solver.FIELD_SIDES
+    assert seen(all_sides * [1.0, 1.0, 0.05] + offset) < solver.FIELD_SIDES // 4
+    assert seen(all_sides[all_sides[:, 0] > 0.0] + offset) < 0.8 * solver.FIELD_SIDES

@@ -48,10 +48,7 @@ def test_correction_is_mounting_times_matrix_times_unbiased(seed: int) -> None:
 
 
 def test_calibration_is_read_from_toml() -> None:
-    text = b"""
-    gyro_bias_radps = [0.01, -0.02, 0.03]
-    mounting = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
-    """
+    text = "gyro_bias_radps = [0.01, -0.02, 0.03]\nmounting = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]"
     calibration = msgspec.toml.decode(text, type=cal.NodeCalibration)
     assert calibration.gyro_bias_radps == (0.01, -0.02, 0.03)
     assert calibration.mounting[0] == (0.0, 1.0, 0.0)

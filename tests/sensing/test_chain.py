@@ -1,27 +1,17 @@
+import functools
 import math
+import operator
 
 import pytest
 from msgspec.structs import replace
 
 from gateway.geometry.atmosphere import pressure_altitude_m
-from gateway.records import BaroRaw, ImuFlags, ImuRaw, NodeId
+from gateway.records import BaroRaw, ImuFlags, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
+from tests.kit.records import IMU_NODE, RAW
 
-NODE = NodeId(1, 0)
-LEVEL = ImuRaw(
-    time_us=0,
-    node=NODE,
-    node_time_us=0,
-    accel_raw=(0, 0, 4096),
-    gyro_raw=(0, 0, 0),
-    mag_raw=(218, 0, -436),
-    temperature_raw=0,
-    accel_range_g=8,
-    gyro_range_dps=1000,
-    mag_lsb_per_gauss=1090,
-    flags=ImuFlags.MAG_NEW,
-)
+LEVEL = replace(RAW, mag_raw=(218, 0, -436), temperature_raw=0)
 
 
 @pytest.fixture
@@ -38,18 +28,14 @@ def test_sample_of_a_level_board_is_in_si_and_body_axes(chain: SensorChain) -> N
 
 def test_sensors_without_a_calibration_are_marked(chain: SensorChain) -> None:
     missing = chain.imu(LEVEL).flags ^ ImuFlags.MAG_NEW
-    compass, gyroscope, accelerometer = (
-        missing ^ SensorChain(calibration).imu(LEVEL).flags ^ ImuFlags.MAG_NEW
-        for calibration in (
-            NodeCalibration(mag_hard_iron_ut=(3.0, 0.0, 0.0)),
-            NodeCalibration(gyro_bias_radps=(0.0, 0.0, 0.01)),
-            NodeCalibration(accel_bias_mps2=(0.0, 0.1, 0.0)),
-        )
-    )
-    assert compass == ImuFlags.MAG_UNCALIBRATED
-    assert gyroscope == ImuFlags.GYRO_UNCALIBRATED
-    assert accelerometer == ImuFlags.ACCEL_UNCALIBRATED
-    assert missing == compass | gyroscope | accelerometer
+    marks = {
+        ImuFlags.MAG_UNCALIBRATED: NodeCalibration(mag_hard_iron_ut=(3.0, 0.0, 0.0)),
+        ImuFlags.GYRO_UNCALIBRATED: NodeCalibration(gyro_bias_radps=(0.0, 0.0, 0.01)),
+        ImuFlags.ACCEL_UNCALIBRATED: NodeCalibration(accel_bias_mps2=(0.0, 0.1, 0.0)),
+    }
+    for mark, calibration in marks.items():
+        assert missing ^ SensorChain(calibration).imu(LEVEL).flags == mark | ImuFlags.MAG_NEW
+    assert missing == functools.reduce(operator.or_, marks)
 
 
 @pytest.mark.parametrize(
@@ -83,6 +69,6 @@ def test_pressure_altitude_is_that_of_the_standard_atmosphere(
 
 
 def test_pressure_altitude_is_unknown_without_a_pressure(chain: SensorChain) -> None:
-    raw = BaroRaw(time_us=5, node=NODE, node_time_us=5, pressure_pa=0.0, temperature_degc=20.0)
+    raw = BaroRaw(time_us=5, node=IMU_NODE, node_time_us=5, pressure_pa=0.0, temperature_degc=20.0)
     assert math.isnan(chain.baro(raw).alt_pressure_m)
     assert chain.baro(replace(raw, pressure_pa=101_325.0)).alt_pressure_m == 0.0

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from gateway.records import ImuFlags, ImuRaw, NodeId
+from gateway.records import ImuFlags, ImuRaw
 from gateway.sensing.calibration import MAG_OVERFLOW, NodeCalibration
 from gateway.sensing.chain import ImuLog, SensorChain
+from tests.kit.records import raw_at
 
-NODE = NodeId(1, 0)
 CALIBRATION = NodeCalibration(
     accel_bias_mps2=(0.1, -0.2, 0.3),
     accel_matrix=((1.01, 0.02, 0.0), (0.0, 0.99, 0.01), (0.03, 0.0, 1.02)),
@@ -24,13 +24,12 @@ def payloads(seed: int) -> list[ImuRaw]:
         time_us += int(rng.choice([10_000, 10_000, 10_000, 20_000, 0, -5_000, 700_000]))
         blank = rng.random() < 0.03
         mag = tuple(rng.choice([-300, 200, 5, MAG_OVERFLOW], 3, p=[0.4, 0.3, 0.25, 0.05]).tolist())
+        inertial = rng.integers(-32768, 32768, (2, 3)).tolist()
         found.append(
-            ImuRaw(
-                time_us=time_us,
-                node=NODE,
-                node_time_us=time_us,
-                accel_raw=(0, 0, 0) if blank else tuple(rng.integers(-32768, 32768, 3).tolist()),
-                gyro_raw=tuple(rng.integers(-32768, 32768, 3).tolist()),
+            raw_at(
+                time_us,
+                accel_raw=(0, 0, 0) if blank else tuple(inertial[0]),
+                gyro_raw=tuple(inertial[1]),
                 mag_raw=(0, 0, 0) if blank else mag,
                 temperature_raw=int(rng.integers(-4000, 4000)),
                 accel_range_g=int(rng.choice([2, 4, 8, 16])),

@@ -8,7 +8,6 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.geometry.quaternion import from_euler, rotate_inverse
 from gateway.records import Outgoing, Vec3
-from gateway.sensing.calibrating import fit_sphere
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.service import CalibrationMeasured
 from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW
@@ -269,14 +268,3 @@ def test_heartbeat_reports_a_running_calibration(station: GroundStation) -> None
     station.command(CALIBRATE, *GYRO)
     beats = of_kind(station.wait(1.5), "HEARTBEAT")
     assert beats[-1].system_status == mavlink.MAV_STATE_CALIBRATING
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_sphere_fit_finds_centre_and_radius(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    centre, radius = rng.normal(scale=20.0, size=3), float(rng.uniform(20.0, 60.0))
-    points = rng.normal(size=(200, 3))
-    points = centre + radius * points / np.linalg.norm(points, axis=1, keepdims=True)
-    found, found_radius = fit_sphere(points)
-    assert found == pytest.approx(tuple(centre), abs=1e-9)
-    assert found_radius == pytest.approx(radius)
