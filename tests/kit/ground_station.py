@@ -6,7 +6,7 @@ verbs, such as the one of the end-to-end tests.
 
 import math
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -17,6 +17,7 @@ from gateway.vehicle.service import Action
 from gateway.vehicle.services.ftp import ACK, Opcode, Packet, decode_packet
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
+from tests.kit.records import sample_at, state_at
 
 OWN_MESSAGES = {
     300: ("PROTOCOL_VERSION", 217),
@@ -141,6 +142,7 @@ class GroundStation:
         return self.receive(self.vehicle.handle(incoming, self.clock.now_us))
 
     def receive(self, actions: Iterable[Action]) -> list[Any]:
+        actions = list(actions)
         frames = [action for action in actions if isinstance(action, Outgoing)]
         self.actions += [action for action in actions if not isinstance(action, Outgoing)]
         self.frames += frames
@@ -158,6 +160,29 @@ class GroundStation:
             found += self.receive(self.vehicle.poll(self.clock.now_us))
         self.clock.now_us = end_us
         return found
+
+    def fly(
+        self,
+        seconds: float,
+        rate_hz: float = 200.0,
+        motion: Callable[[float], dict[str, Any]] = lambda _: {},
+        only: Container[int] = range(1 << 24),
+        **state: Any,
+    ) -> list[Any]:
+        """Feed the vehicle IMU samples; return the messages that reach this client.
+
+        `motion` returns what differs in a sample at a time in s; `only` has the numbers of the
+        messages that are decoded, `state` what differs in the estimator's output.
+        """
+        found: list[Action] = []
+        for _ in range(round(seconds * rate_hz)):
+            now_us = self.clock.advance(1.0 / rate_hz)
+            sample = sample_at(now_us, **motion(now_us * 1e-6))
+            found += self.vehicle.on_state(state_at(now_us, **state), sample, now_us)
+            found += self.vehicle.poll(now_us)
+        return self.receive(
+            each for each in found if not isinstance(each, Outgoing) or each.message_id in only
+        )
 
     def ask(self, message: Any, *kinds: str, retries: int = 5, timeout_s: float = 1.0) -> list[Any]:
         """Send until one of the kinds comes back, as ground stations do; the answers since."""
@@ -391,6 +416,6 @@ def ftp_message(packet: Packet, target: tuple[int, int] = (1, 1)) -> Any:
     return mavlink.MAVLink_file_transfer_protocol_message(0, *target, packet.encode())
 
 
-def ftp_request(opcode: int, data: bytes) -> Any:
+def ftp_request(opcode: int, data: bytes = b"", offset: int = 0) -> Any:
     """Return a first request, such as to open a file."""
-    return ftp_message(Packet(1, 0, opcode, len(data), 0, 0, 0, data))
+    return ftp_message(Packet(1, 0, opcode, len(data), 0, 0, offset, data))

@@ -7,12 +7,11 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.geometry.quaternion import from_euler, rotate_inverse
-from gateway.records import Outgoing, Vec3
+from gateway.records import Vec3
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.service import CalibrationMeasured
 from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW
 from tests.kit.ground_station import GroundStation, of_kind, results, texts
-from tests.kit.records import sample_at, state_at
 
 G = 9.80665
 DOWN = np.array((0.0, 0.0, -G))
@@ -24,22 +23,13 @@ SIX_SIDES, LEVEL, SIMPLE = (0, 0, 0, 0, 1), (0, 0, 0, 0, 2), (0, 0, 0, 0, 4)
 Motion = Callable[[float], dict[str, Any]]
 
 
-def run(
-    station: GroundStation, seconds: float, motion: Motion, vel_n_mps: Vec3 = (0.0, 0.0, 0.0)
-) -> list[Any]:
+def run(station: GroundStation, seconds: float, motion: Motion, **state: Any) -> list[Any]:
     """Feed samples at 100 Hz; acknowledgements and texts."""
-    found = []
-    for _ in range(round(seconds * 100)):
-        now_us = station.clock.advance(0.01)
-        sample = sample_at(now_us, **motion(now_us * 1e-6))
-        state = state_at(now_us, vel_n_mps=vel_n_mps)
-        found += station.vehicle.on_state(state, sample, now_us) + station.vehicle.poll(now_us)
     messages = (mavlink.MAVLINK_MSG_ID_COMMAND_ACK, mavlink.MAVLINK_MSG_ID_STATUSTEXT)
-    others = [f for f in found if not isinstance(f, Outgoing) or f.message_id in messages]
-    return station.receive(others)
+    return station.fly(seconds, 100.0, motion, messages, **state)
 
 
-def fly(station: GroundStation) -> list[Any]:
+def take_off(station: GroundStation) -> list[Any]:
     return run(station, 3.0, lambda _: {}, vel_n_mps=(20.0, 0.0, 0.0))
 
 
@@ -51,11 +41,8 @@ def rest(gyro: Vec3 = (0.0, 0.0, 0.0), accel: Vec3 = (0.0, 0.0, -G), noise: floa
     rng = np.random.default_rng(1)
 
     def motion(_time_s: float) -> dict[str, Any]:
-        jitter = rng.normal(scale=noise, size=(2, 3))
-        return {
-            "gyro_b_radps": tuple((np.array(gyro) + jitter[0]).tolist()),
-            "accel_b_mps2": tuple((np.array(accel) + jitter[1]).tolist()),
-        }
+        rates, forces = (np.array((gyro, accel)) + rng.normal(scale=noise, size=(2, 3))).tolist()
+        return {"gyro_b_radps": tuple(rates), "accel_b_mps2": tuple(forces)}
 
     return motion
 
@@ -128,18 +115,17 @@ def tumble(centre: Vec3, radius: float) -> Motion:
     return motion
 
 
-def test_magnetometer_calibration_measures_the_hard_iron(station: GroundStation) -> None:
+def test_magnetometer_calibration_measures_hard_and_soft_iron(station: GroundStation) -> None:
     station.command(CALIBRATE, *MAG)
-    found = run(station, 30.0, tumble((12.0, -7.0, 30.0), 48.0))
-    assert results(found)[-1] == ACCEPTED
-    assert correction(station).mag_hard_iron_ut == pytest.approx((12.0, -7.0, 30.0), abs=0.1)
+    around, centre = tumble((0.0, 0.0, 0.0), 48.0), np.array((12.0, -7.0, 30.0))
 
+    def motion(time_s: float) -> dict[str, Any]:
+        return {"mag_b_ut": tuple(around(time_s)["mag_b_ut"] * np.array((1.2, 1, 1)) + centre)}
 
-def test_magnetometer_fit_corrects_soft_iron_too(station: GroundStation) -> None:
-    station.command(CALIBRATE, *MAG)
-    around = tumble((0.0, 0.0, 0.0), 48.0)
-    run(station, 30.0, lambda t: {"mag_b_ut": tuple(np.array(around(t)["mag_b_ut"]) * (1.2, 1, 1))})
-    matrix = np.array(correction(station).mag_soft_iron)
+    assert results(run(station, 30.0, motion))[-1] == ACCEPTED
+    found = correction(station)
+    assert found.mag_hard_iron_ut == pytest.approx(tuple(centre), abs=0.1)
+    matrix = np.array(found.mag_soft_iron)
     assert matrix[1, 1] / matrix[0, 0] == pytest.approx(1.2, rel=1e-3)
 
 
@@ -163,7 +149,7 @@ def test_movement_fails_a_calibration_at_rest(
 
 @pytest.mark.parametrize("params", [GYRO, MAG, SIX_SIDES, LEVEL, SIMPLE])
 def test_calibration_is_denied_in_flight(station: GroundStation, params: tuple[int, ...]) -> None:
-    fly(station)
+    take_off(station)
     found = station.command(CALIBRATE, *params)
     assert (results(found), cal_texts(found)) == ([DENIED], ["calibration failed: in flight"])
     assert results(station.command(CALIBRATE)) == [ACCEPTED], "what runs may be cancelled"
@@ -174,11 +160,7 @@ def test_take_off_fails_a_running_calibration(
     station: GroundStation, params: tuple[int, ...]
 ) -> None:
     station.command(CALIBRATE, *params)
-    assert_failed(station, fly(station), "in flight")
-
-
-def turned_level(time_s: float) -> dict[str, Any]:
-    return {"mag_b_ut": (20.0 * math.cos(time_s), 20.0 * math.sin(time_s), 40.0)}
+    assert_failed(station, take_off(station), "in flight")
 
 
 @pytest.mark.parametrize(
@@ -187,10 +169,10 @@ def turned_level(time_s: float) -> dict[str, Any]:
         (GYRO, 4.0, rest(gyro=(0.0, 0.0, 0.36))),
         (SIMPLE, 4.0, rest(accel=(2.1, 0.0, -9.5))),
         (LEVEL, 4.0, rest(accel=(5.2, 0.0, -8.3))),
-        (MAG, 40.0, lambda t: tumble((0.0, 210.0, 0.0), 48.0)(t)),
-        (MAG, 40.0, lambda t: tumble((0.0, 0.0, 0.0), 110.0)(t)),
+        (MAG, 40.0, tumble((0.0, 210.0, 0.0), 48.0)),
+        (MAG, 40.0, tumble((0.0, 0.0, 0.0), 110.0)),
         (MAG, 40.0, lambda t: tumble((0.0, 0.0, 0.0), 48.0 * (1.0 + 0.3 * math.sin(50.0 * t)))(t)),
-        (MAG, 61.0, turned_level),
+        (MAG, 61.0, lambda t: {"mag_b_ut": (20.0 * math.cos(t), 20.0 * math.sin(t), 40.0)}),
     ],
 )
 def test_calibration_without_evidence_fails(
@@ -213,11 +195,8 @@ def turn(rate_degps: float) -> Motion:
 
 
 def shake(noise_mps2: float) -> Motion:
-    noise = np.random.default_rng(3)
-    still = {"gyro_b_radps": (0.0, 0.0, 0.0)}
-    return lambda _: (
-        still | {"accel_b_mps2": tuple((DOWN + noise.normal(0, noise_mps2, 3)).tolist())}
-    )
+    noise, still = np.random.default_rng(3), {"gyro_b_radps": (0.0, 0.0, 0.0)}
+    return lambda _: still | {"accel_b_mps2": tuple(DOWN + noise.normal(0, noise_mps2, 3))}
 
 
 @pytest.mark.parametrize(

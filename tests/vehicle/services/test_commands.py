@@ -4,7 +4,6 @@ No acknowledgement of a recording says more than is true.
 """
 
 import math
-import struct
 from typing import Any
 
 import pytest
@@ -101,13 +100,7 @@ def test_command_with_extreme_parameters_is_acknowledged_once(
 
 @pytest.mark.parametrize(
     "location",
-    [
-        (90.1, 0.0, 0.0),
-        (0.0, 180.1, 0.0),
-        (math.nan, 8.0, 0.0),
-        (47.0, 8.0, 1e30),
-        (47.0, 8.0, -1001),
-    ],
+    [(90.1, 0.0, 0.0), (0.0, 180.1, 0.0), (math.nan, 8.0, 0.0), (47.0, 8.0, 1e30), (47, 8, -1001)],
 )
 def test_mark_with_invalid_coordinates_or_height_raises_value_error(
     vehicle: Vehicle, location: tuple[float, float, float]
@@ -180,43 +173,51 @@ def test_each_station_that_starts_a_recording_gets_its_own_answer(station: Groun
     assert [results(each.receive(actions)) for each in stations[:3]] == [[], [ACCEPTED], [ACCEPTED]]
 
 
-@pytest.mark.parametrize(
-    ("message", "request_text", "outcome"),
-    [
-        (command(512, 12_345), "COMMAND_LONG REQUEST_MESSAGE 12345", "UNSUPPORTED"),
-        (
-            mavlink.MAVLink_param_request_read_message(1, 1, b"[red]\x1b\n", -1),
-            "PARAM_REQUEST_READ ?red??",
-            "DOES_NOT_EXIST",
-        ),
-        (
-            mavlink.MAVLink_mission_request_list_message(1, 1, 7),
-            "MISSION_REQUEST_LIST",
-            "UNSUPPORTED",
-        ),
-        (
-            ftp_request(4, b"/nothing"),
-            "FILE_TRANSFER_PROTOCOL OPENFILERO /nothing",
-            "FILENOTFOUND",
-        ),
-        (
-            mavlink.MAVLink_set_home_position_message(1, 0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0),
-            "SET_HOME_POSITION",
-            "no answer",
-        ),
-        (command(400, 1), "COMMAND_LONG COMPONENT_ARM_DISARM", "DENIED"),
-    ],
+SET_HOME_POSITION = mavlink.MAVLink_set_home_position_message(
+    1, 0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0
 )
-def test_failed_request_is_logged_once_with_a_count(
-    station: GroundStation, message: Any, request_text: str, outcome: str
-) -> None:
+FTP = "FILE_TRANSFER_PROTOCOL"
+REQUESTS: dict[str, tuple[Any, tuple[str, str] | None]] = {
+    "message": (
+        command(512, 12_345), ("COMMAND_LONG REQUEST_MESSAGE 12345", "UNSUPPORTED"),
+    ),
+    "name": (
+        mavlink.MAVLink_param_request_read_message(1, 1, b"[red]\x1b\n", -1),
+        ("PARAM_REQUEST_READ ?red??", "DOES_NOT_EXIST"),
+    ),
+    "list": (
+        mavlink.MAVLink_mission_request_list_message(1, 1, 7),
+        ("MISSION_REQUEST_LIST", "UNSUPPORTED"),
+    ),
+    "no such file": (
+        ftp_request(4, b"/nothing"), (f"{FTP} OPENFILERO /nothing", "FILENOTFOUND"),
+    ),
+    "home": (SET_HOME_POSITION, ("SET_HOME_POSITION", "no answer")),
+    "arm": (command(400, 1), ("COMMAND_LONG COMPONENT_ARM_DISARM", "DENIED")),
+    "joystick": (
+        mavlink.MAVLink_rc_channels_override_message(1, 1, *[1500] * 8),
+        ("RC_CHANNELS_OVERRIDE", "no answer"),
+    ),
+    # The normal end of a protocol is no failure.
+    "end of list": (ftp_request(mavlink.MAV_FTP_OPCODE_LISTDIRECTORY, b"/", offset=1000), None),
+    "end of session": (ftp_request(mavlink.MAV_FTP_OPCODE_TERMINATESESSION), None),
+    "end of logs": (mavlink.MAVLink_log_request_end_message(1, 1), None),
+    "answer": (mavlink.MAVLink_command_ack_message(32100, 0, 0, 0, 1, 1), None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REQUESTS)
+def test_failed_request_is_logged_once_with_a_count(station: GroundStation, name: str) -> None:
+    message, logged = REQUESTS[name]
     for _ in range(3):
         station.clock.advance(1.0)
         station.send(message)
-    [entry] = station.vehicle.requests.entries
-    assert (entry.request, entry.outcome, entry.count) == (request_text, outcome, 3)
-    assert (entry.vehicle_id, entry.system_id, entry.component_id) == (1, 255, 190)
-    assert entry.time_us == station.clock.now_us
+    entries = station.vehicle.requests.entries
+    found = [(entry.request, entry.outcome, entry.count) for entry in entries]
+    assert found == ([(*logged, 3)] if logged else [])
+    for entry in entries:
+        assert (entry.vehicle_id, entry.system_id, entry.component_id) == (1, 255, 190)
+        assert entry.time_us == station.clock.now_us
 
 
 def test_only_failed_requests_are_logged(station: GroundStation) -> None:
@@ -228,38 +229,6 @@ def test_only_failed_requests_are_logged(station: GroundStation) -> None:
     station.set_parameter("RATE_ATT", 7.0)
     [entry] = station.vehicle.requests.entries
     assert (entry.request, entry.outcome) == ("PARAM_SET RATE_ATT", f"refused: {NOT_TRUSTED}")
-
-
-def ftp(opcode: int, data: bytes = b"", offset: int = 0) -> Any:
-    """Return a request of the file transfer; sessions are 0."""
-    payload = struct.pack("<HBBBBBBI", 1, 0, opcode, len(data), 0, 0, 0, offset) + data
-    return mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, payload.ljust(251, b"\0"))
-
-
-@pytest.mark.parametrize(
-    ("message", "logged"),
-    [
-        (ftp(mavlink.MAV_FTP_OPCODE_LISTDIRECTORY, b"/", offset=1000), []),
-        (ftp(mavlink.MAV_FTP_OPCODE_TERMINATESESSION), []),
-        (
-            ftp(mavlink.MAV_FTP_OPCODE_OPENFILERO, b"/none"),
-            [("FILE_TRANSFER_PROTOCOL OPENFILERO /none", "FILENOTFOUND")],
-        ),
-        (mavlink.MAVLink_log_request_end_message(1, 1), []),
-        (mavlink.MAVLink_command_ack_message(32100, 0, 0, 0, 1, 1), []),
-        (
-            mavlink.MAVLink_rc_channels_override_message(1, 1, *[1500] * 8),
-            [("RC_CHANNELS_OVERRIDE", "no answer")],
-        ),
-    ],
-    ids=["end of list", "end of session", "no such file", "end of logs", "answer", "joystick"],
-)
-def test_normal_end_of_a_protocol_is_no_failed_request(
-    station: GroundStation, message: Any, logged: list[tuple[str, str]]
-) -> None:
-    station.send(message)
-    found = [(entry.request, entry.outcome) for entry in station.vehicle.requests.entries]
-    assert found == logged
 
 
 def test_request_log_is_bounded_and_keeps_the_newest(station: GroundStation) -> None:
