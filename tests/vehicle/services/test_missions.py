@@ -29,7 +29,7 @@ from tests.kit.records import FIX, STATE
 
 GLOBAL_INT, RELATIVE_INT, LOCAL_NED, MISSION_FRAME = 5, 6, 1, 2
 WAYPOINT = 16
-ACCEPTED = mavlink.MAV_MISSION_ACCEPTED
+ACCEPTED, CANCELLED = mavlink.MAV_MISSION_ACCEPTED, mavlink.MAV_MISSION_OPERATION_CANCELLED
 REQUESTS = ("MISSION_REQUEST_INT", "MISSION_REQUEST")
 
 
@@ -55,11 +55,6 @@ def set_current(seq: int) -> Any:
     return mavlink.MAVLink_mission_set_current_message(1, 1, seq)
 
 
-def asked_in(station: GroundStation, seconds: float) -> list[int]:
-    """Let time pass; the items that are asked for meanwhile."""
-    return [m.seq for m in of_kind(station.wait(seconds), *REQUESTS)]
-
-
 @pytest.mark.parametrize("seed", range(10))
 def test_items_are_uploaded_and_downloaded_over_a_lossy_link(
     station: GroundStation, seed: int
@@ -81,9 +76,9 @@ def test_client_without_the_int_form_is_asked_and_answered_in_the_older_one(
     [second] = station.send(old_item(47.1))
     assert (second.get_type(), second.seq) == ("MISSION_REQUEST", 1)
     assert kinds(station.send(old_item(48.1, 1)))[0] == "MISSION_ACK"
-    [first] = station.send(old_request(1))
-    assert (first.get_type(), first.frame) == ("MISSION_ITEM", 3)
-    assert (first.x, first.y, first.z) == pytest.approx((48.1, -8.7, 50.0), abs=1e-5)
+    [found] = station.send(old_request(1))
+    assert (found.get_type(), found.frame) == ("MISSION_ITEM", 3)
+    assert (found.x, found.y, found.z) == pytest.approx((48.1, -8.7, 50.0), abs=1e-5)
     assert kinds(station.send(count(1))) == ["MISSION_REQUEST"], "the form is stored"
 
 
@@ -118,32 +113,16 @@ def test_item_with_invalid_float_coordinates_is_refused(station: GroundStation, 
     assert station.send(old_item(bad, lon=bad))[0].type == mavlink.MAV_MISSION_INVALID_PARAM5_X
 
 
-def test_items_are_requested_in_order_and_at_once(station: GroundStation) -> None:
-    for seq in range(3):
-        [wanted] = station.send(count(3) if seq == 0 else item(seq - 1))
-        assert (wanted.get_type(), wanted.seq) == ("MISSION_REQUEST_INT", seq)
-    [end] = station.send(item(2))
-    assert (end.get_type(), end.type, end.mission_type) == ("MISSION_ACK", ACCEPTED, MISSION)
-    assert (end.target_system, end.target_component) == (255, 190)
-    assert asked_in(station, 5.0) == [], "nothing was lost"
-
-
-def test_lost_item_is_requested_again_for_five_seconds(station: GroundStation) -> None:
-    station.send(count(2))
-    station.send(item(0))
-    assert asked_in(station, 4.9) == [1] * 12
-    [end] = of_kind(station.wait(0.4), "MISSION_ACK")
-    assert end.type == mavlink.MAV_MISSION_OPERATION_CANCELLED
-    assert asked_in(station, 4.0) == []
-    assert download(station) == []
-
-
 ITEM = [item(seq) for seq in range(6)]
 
 
 @pytest.mark.parametrize(
     "steps",
     [
+        # Items are requested in order and at once.
+        [(count(3), [0]), (ITEM[0], [1]), (ITEM[1], [2]), (ITEM[2], "accepted"), (5.0, [])],
+        # A lost item is requested again for five seconds.
+        [(count(2), [0]), (ITEM[0], [1]), (4.9, [1] * 12), (0.4, "cancelled"), (4.0, [])],
         # One out of order is dropped, and the right one asked for; it is asked for already.
         [(count(3), [0]), (ITEM[2], [0]), (ITEM[0], [1]), (ITEM[0], [])],
         # A client that went back for a late request is taken from there.
@@ -172,17 +151,20 @@ ITEM = [item(seq) for seq in range(6)]
         ],
         # A late end of a download ends no upload; a cancelled upload asks for nothing.
         [(count(2), [0]), (ack(ACCEPTED), []), (ITEM[0], [1])],
-        [(count(3), [0]), (ack(mavlink.MAV_MISSION_OPERATION_CANCELLED), []), (2.0, [])],
+        [(count(3), [0]), (ack(CANCELLED), []), (2.0, [])],
     ],
 )  # fmt: skip
 def test_upload_continues_after_lost_late_or_repeated_messages(
     station: GroundStation, steps: list[tuple[Any, list[int] | str]]
 ) -> None:
     """Each step is a message or a time in s, and the items asked for then, or its ACK."""
-    acks = {ACCEPTED: "accepted", mavlink.MAV_MISSION_ERROR: "error"}
+    results = {ACCEPTED: "accepted", mavlink.MAV_MISSION_ERROR: "error", CANCELLED: "cancelled"}
     for number, (step, expected) in enumerate(steps):
         found = station.wait(step) if isinstance(step, float) else station.send(step)
-        ended = [acks[m.type] for m in of_kind(found, "MISSION_ACK")]
+        acks = of_kind(found, "MISSION_ACK")
+        ended = [results[m.type] for m in acks]
+        assert {m.mission_type for m in acks} <= {MISSION}
+        assert {(m.target_system, m.target_component) for m in acks} <= {(255, 190)}
         asked = [m.seq for m in of_kind(found, *REQUESTS)]
         assert (ended or asked) == ([expected] if isinstance(expected, str) else expected), number
 
@@ -222,7 +204,7 @@ def test_invalid_item_is_refused_with_its_result(
 def test_too_many_items_are_refused(station: GroundStation, kind: int, number: int) -> None:
     [end] = station.send(count(number or MAX_ITEMS[kind] + 1, kind))
     assert (end.type, end.mission_type) == (mavlink.MAV_MISSION_NO_SPACE, kind)
-    assert asked_in(station, 20.0) == []
+    assert of_kind(station.wait(20.0), *REQUESTS) == []
     assert kinds(station.send(count(MAX_ITEMS[kind], kind))) == ["MISSION_REQUEST_INT"]
 
 
@@ -346,11 +328,8 @@ def test_empty_mission_of_ardupilot_is_home(
     station = GroundStation(Vehicle(VehicleSettings(autopilot=autopilot), 1), clock)
     assert download(station) == [], "home is not known yet"
     station.vehicle.on_gps(FIX, clock.now_us)
-    found = download(station)
-    assert len(found) == size
-    for home in found:
-        assert (home.seq, home.command, home.frame) == (0, WAYPOINT, 0)
-        assert (home.x, home.y) == (FIX.lat_dege7, FIX.lon_dege7)
+    found = [(m.seq, m.command, m.frame, m.x, m.y) for m in download(station)]
+    assert found == [(0, WAYPOINT, 0, FIX.lat_dege7, FIX.lon_dege7)] * size
     assert station.vehicle.plan.missions.items[MISSION] == ()
     assert upload(station, [item(0)]) == ACCEPTED
     assert [content(each) for each in download(station)] == [content(item(0))]

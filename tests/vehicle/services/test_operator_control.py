@@ -1,5 +1,7 @@
 """Operator control: which station may change things, and how control passes on."""
 
+from typing import Any
+
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -32,6 +34,14 @@ def control(station: GroundStation, action: int = REQUEST, takeover: int = 0) ->
     return results(found)[0]
 
 
+def notified(first: GroundStation, second: GroundStation, *params: float) -> Any:
+    """Let the second station request control; return what the first is sent."""
+    frame = second.frame(command(REQUEST_CONTROL, *params))
+    actions = second.vehicle.handle(Incoming(second.client_id, frame, trusted=True), 0)
+    [notice] = decode(a for a in actions if a.client_id == first.client_id)
+    return notice
+
+
 def changes(station: GroundStation) -> bool:
     return "PARAM_ERROR" not in kinds(station.set_parameter("RATE_ATT", 7.0))
 
@@ -49,8 +59,10 @@ def test_station_without_control_changes_nothing(
     assert control(first) == ACCEPTED
     assert changes(first)
     assert not changes(second)
-    reported = "".join(texts(second.inbox))
-    assert "Refused PARAM_SET of system 254: system 255 is in control" in reported
+    reason = "of system 254: system 255 is in control"
+    assert f"Refused PARAM_SET {reason}" in "".join(texts(second.inbox))
+    found = second.command(mavlink.MAV_CMD_LOGGING_START)
+    assert (results(found), texts(found)) == ([NOT_IN_CONTROL], [f"Refused LOGGING_START {reason}"])
     assert second.command(512, 148)[0].result == ACCEPTED, "reading stays free"
 
 
@@ -58,9 +70,7 @@ def test_takeover_needs_the_consent_of_the_station_in_control(
     first: GroundStation, second: GroundStation
 ) -> None:
     control(first)
-    frame = second.frame(command(REQUEST_CONTROL, REQUEST, 1, 10, 254))
-    actions = second.vehicle.handle(Incoming(second.client_id, frame, trusted=True), 0)
-    [notice] = decode(a for a in actions if a.client_id == first.client_id)
+    notice = notified(first, second, REQUEST, 1, 10, 254)
     assert (notice.get_type(), notice.command) == ("COMMAND_LONG", REQUEST_CONTROL)
     assert (notice.target_system, notice.target_component) == (255, 190)
     assert (notice.param1, notice.param2, notice.param3, notice.param4) == (1, 1, 10, 254)
@@ -140,6 +150,7 @@ def test_untrusted_client_cannot_take_control_or_act_for_another(
 ) -> None:
     second.trusted = False
     assert control(second) == DENIED
+    assert texts(second.inbox) == [f"Refused control to system 254: {NOT_TRUSTED}"]
     second.trusted = True
     assert results(second.command(REQUEST_CONTROL, REQUEST, 0, 10, 255)) == [DENIED]
 
@@ -197,30 +208,16 @@ def test_request_that_both_definitions_allow_is_read_by_the_present_one(
 
 
 @pytest.mark.parametrize(
-    ("request_of_first", "params"), [(FORMER, (254, 1, 1, 20)), ((1, 0, 10, 255), (1, 1, 20, 254))]
+    ("asked", "params"), [(FORMER, (254, 1, 1, 20)), ((1, 0, 10, 255), (1, 1, 20, 254))]
 )
 def test_station_in_control_is_notified_in_its_own_order(
-    first: GroundStation,
-    second: GroundStation,
-    request_of_first: tuple[float, ...],
-    params: tuple[float, ...],
+    first: GroundStation, second: GroundStation, asked: tuple[float, ...], params: tuple[int, ...]
 ) -> None:
-    first.command(REQUEST_CONTROL, *request_of_first)
-    frame = second.frame(command(REQUEST_CONTROL, REQUEST, 1, 20, 254))
-    actions = second.vehicle.handle(Incoming(second.client_id, frame, trusted=True), 0)
-    [notice] = decode(a for a in actions if a.client_id == first.client_id)
+    first.command(REQUEST_CONTROL, *asked)
+    notice = notified(first, second, REQUEST, 1, 20, 254)
     assert (notice.param1, notice.param2, notice.param3, notice.param4) == params
     first.send(mavlink.MAVLink_command_ack_message(REQUEST_CONTROL, 0, 0, 0, 1, 1))
     assert "no answer" not in [entry.outcome for entry in first.vehicle.requests.entries]
-
-
-def test_command_of_a_station_without_control_is_answered_with_the_reason(
-    first: GroundStation, second: GroundStation
-) -> None:
-    control(first)
-    found = second.command(mavlink.MAV_CMD_LOGGING_START)
-    assert results(found) == [NOT_IN_CONTROL]
-    assert texts(found) == ["Refused LOGGING_START of system 254: system 255 is in control"]
 
 
 @pytest.mark.parametrize("trusted", [False, True])
@@ -245,11 +242,3 @@ def test_station_uses_control_by_the_link_that_requested_it_last(first: GroundSt
     assert control(other) == ACCEPTED
     assert changes(other)
     assert not changes(first)
-
-
-def test_refused_request_of_control_has_a_reason(
-    first: GroundStation, second: GroundStation
-) -> None:
-    second.trusted = False
-    found = second.command(REQUEST_CONTROL, REQUEST, 0, 10, 254)
-    assert texts(found) == [f"Refused control to system 254: {NOT_TRUSTED}"]
