@@ -1,6 +1,7 @@
 """Each message, decoded by pymavlink, against the units and signs of the definition."""
 
 import math
+from itertools import product
 from typing import Any
 
 import pytest
@@ -33,6 +34,32 @@ def named(names: str, values: Any) -> dict[str, Any]:
     return dict(zip(names.split(), values, strict=True))
 
 
+SEARCHING = replace(
+    FIX, fix_type=GpsFixType.NONE, fix_ok=False, h_acc_m=4_294_967.295, v_acc_m=3_750_000.0
+)
+"""A u-blox receiver before its first fix."""
+
+
+def summary(
+    state: NavState | None, fix: GpsFix | None, now_us: int = 1_500_000, *, inertial: bool = True
+) -> Any:
+    """Return HIGH_LATENCY2 of an aircraft that has just sent a fix, and samples if it has any."""
+    health = Health(1, 2.0)
+    if inertial:
+        health.on_state(STATE, SAMPLE)
+        health.on_baro(BARO)
+    if fix is not None:
+        health.on_gps(fix)
+    return messages.high_latency2(mavlink.MAV_TYPE_FIXED_WING, 0, state, fix, health, now_us)
+
+
+SENSOR_FAILURES = (
+    mavlink.HL_FAILURE_FLAG_ABSOLUTE_PRESSURE
+    | mavlink.HL_FAILURE_FLAG_3D_ACCEL
+    | mavlink.HL_FAILURE_FLAG_3D_GYRO
+    | mavlink.HL_FAILURE_FLAG_3D_MAG
+    | mavlink.HL_FAILURE_FLAG_GPS
+)
 VALUES = {
     "attitude-quaternion": (
         messages.attitude_quaternion(STATE),
@@ -173,6 +200,32 @@ VALUES = {
         messages.system_time(2_000_000, 1_790_000_000_123_456),
         {"time_unix_usec": 1_790_000_000_123_456, "time_boot_ms": 2000},
     ),
+    # In steps of 0.2 m/s for the speed, and 0.1 m or m/s for the others.
+    "high-latency": (
+        summary(STATE, FIX),
+        named("latitude longitude altitude heading", (471_234_567, -87_654_321, 523, 272 // 2))
+        | named("groundspeed climb_rate eph epv", (25, 12, 12, 25))
+        | named("timestamp battery failure_flags", (1500, -1, 0)),
+    ),
+    **{
+        f"high-latency-before-a-fix-{number}": (
+            summary(state, fix, inertial=False),
+            named("latitude longitude groundspeed eph epv", (0, 0, 0, 255, 255))
+            | {"failure_flags": SENSOR_FAILURES},
+        )
+        for number, (state, fix) in enumerate(
+            product((None, NOTHING), (None, SEARCHING, replace(FIX, fix_ok=False)))
+        )
+    },
+    "high-latency-by-barometer": (
+        summary(replace(NOTHING, alt_amsl_m=523.456), SEARCHING),
+        named("latitude longitude altitude", (0, 0, 523)),
+    ),
+    "high-latency-lost": (
+        summary(STATE, FIX, FIX.time_us + 60_000_000),
+        named("latitude longitude eph epv", (471_234_567, -87_654_321, 255, 255))
+        | {"failure_flags": SENSOR_FAILURES},
+    ),
 }  # fmt: skip
 
 
@@ -257,61 +310,10 @@ def test_boot_time_wraps_after_49_days() -> None:
     assert messages.boot_ms(2**32 * 1000 + 5_000) == 5
 
 
-def summary(
-    state: NavState | None, fix: GpsFix | None, health: Health, now_us: int = 1_500_000
-) -> Any:
-    kind = mavlink.MAV_TYPE_FIXED_WING
-    return through_the_wire(messages.high_latency2(kind, 0, state, fix, health, now_us))
-
-
-def test_high_latency2_contains_state_and_fix(health: Health) -> None:
-    message = summary(STATE, FIX, health)
-    assert (message.latitude, message.longitude) == (471_234_567, -87_654_321)
-    assert (message.altitude, message.heading * 2) == (523, 272)
-    assert message.groundspeed / 5 == 5.0
-    assert message.climb_rate / 10 == pytest.approx(1.25, abs=0.06)
-    assert message.eph == round(FIX.h_acc_m * 10)
-    assert (message.timestamp, message.battery) == (1500, -1)
-    assert message.failure_flags & mavlink.HL_FAILURE_FLAG_3D_GYRO == 0
-
-
-SEARCHING = replace(
-    FIX, fix_type=GpsFixType.NONE, fix_ok=False, h_acc_m=4_294_967.295, v_acc_m=3_750_000.0
-)
-"""A u-blox receiver before its first fix."""
-
-
-@pytest.mark.parametrize("state", [None, NOTHING])
-@pytest.mark.parametrize("fix", [None, SEARCHING, replace(FIX, fix_ok=False)])
-def test_no_position_is_reported_before_the_first_fix(
-    state: NavState | None, fix: GpsFix | None
-) -> None:
-    health = Health(1, 2.0)
-    if fix is not None:
-        health.on_gps(fix)
-    message = summary(state, fix, health)
-    assert (message.latitude, message.longitude, message.groundspeed) == (0, 0, 0)
-    assert (message.eph, message.epv) == (255, 255)
-    assert message.failure_flags & mavlink.HL_FAILURE_FLAG_GPS
-    assert message.failure_flags & mavlink.HL_FAILURE_FLAG_3D_ACCEL
-
-
-def test_barometric_altitude_is_reported_before_the_first_fix(health: Health) -> None:
-    message = summary(replace(NOTHING, alt_amsl_m=523.456), SEARCHING, health)
-    assert (message.latitude, message.longitude, message.altitude) == (0, 0, 523)
-
-
-def test_accuracy_is_unknown_after_the_gps_receiver_is_lost(health: Health) -> None:
-    message = summary(STATE, FIX, health, now_us=FIX.time_us + 60_000_000)
-    assert (message.latitude, message.longitude) == (471_234_567, -87_654_321)
-    assert (message.eph, message.epv) == (255, 255)
-    assert message.failure_flags & mavlink.HL_FAILURE_FLAG_GPS
-
-
 @pytest.mark.parametrize("value", [math.inf, -math.inf, 1e30, -1e30])
-def test_extreme_values_of_high_latency2_are_saturated(health: Health, value: float) -> None:
+def test_extreme_values_of_high_latency2_are_saturated(value: float) -> None:
     wild = replace(STATE, lat_deg=value, alt_amsl_m=value, vel_n_mps=(value, value, value))
-    found = summary(wild, replace(FIX, h_acc_m=abs(value)), health)
+    found = through_the_wire(summary(wild, replace(FIX, h_acc_m=abs(value))))
     assert (found.groundspeed, found.eph) == (255, 254)
     ends = (32767, -127) if value > 0.0 else (-32768, 127)
     assert (found.altitude, found.climb_rate) == ends
