@@ -23,12 +23,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 import serial
 
 from gateway.live.part import TLOG
 from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports, open_port
 from gateway.printable import reason_of
-from gateway.sources.recorded_bytes import tunnelled
+from gateway.sources.recorded_bytes import TUNNEL_ID, tunnelled
 from gateway.sources.source import PolledDecoder, SourceInput
 from gateway.wire.framing import Fault
 
@@ -278,7 +279,8 @@ class SourcePort:
             while block := file.read(READ_SIZE):
                 # It may hold gigabytes of other messages.
                 await asyncio.sleep(0)
-                for record in scanner.feed(block).records():
+                batch = scanner.feed(block)
+                for record in batch.records(np.flatnonzero(batch.message_ids == TUNNEL_ID)):
                     data = tunnelled(record.frame, self._source.node)
                     if not data:
                         continue

@@ -34,7 +34,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.recordings.status_texts import text_of
 from gateway.recordings.tlog import DAY_US, Batch, fields_of
 from gateway.recordings.tlog_scan import TIME_SIZE
-from gateway.units import US_PER_S
+from gateway.units import DEGE7_PER_DEG, US_PER_S
 from gateway.vehicle.plan import GLOBAL_FRAMES
 from gateway.wire.frame_editing import FLAGS, edit_frame
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_NAMES, layout_of
@@ -42,15 +42,16 @@ from gateway.wire.mavlink_splitter import SIGNED, START_V2, frame_of
 
 BoolArray = NDArray[np.bool_]
 
-DEGE7: Final = 1e7
 OTHER_COORDINATES: Final[dict[str, tuple[tuple[str, str, float], ...]]] = {
     "SIM_STATE": (("lat", "lon", 1.0),),
     "FENCE_POINT": (("lat", "lng", 1.0),),
     "FW_SOARING_DATA": (("xLat", "xLon", 1.0),),
 }
 """Latitude, longitude, and their unit in 1/deg, where the unit in the dialect is not degE7."""
-LOCATED: Final = {"MISSION_ITEM": 1.0, "MISSION_ITEM_INT": DEGE7, "COMMAND_INT": DEGE7,
-                  "COMMAND_INT_STAMPED": DEGE7, "ORBIT_EXECUTION_STATUS": DEGE7}  # fmt: skip
+LOCATED: Final = {"MISSION_ITEM": 1.0, **dict.fromkeys(
+    ("MISSION_ITEM_INT", "COMMAND_INT", "COMMAND_INT_STAMPED", "ORBIT_EXECUTION_STATUS"),
+    DEGE7_PER_DEG,
+)}  # fmt: skip
 """Messages whose x and y are coordinates in a global frame, and their unit in 1/deg."""
 PLAIN: Final = frozenset({
     "param_id", "mode_name", "tune", "tune2", "busname", "mode_str", "band_str",
@@ -185,7 +186,7 @@ def _plan_of(message_id: int) -> _Plan:
     types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
     scaled = [field for field in kind.fieldnames if units.get(field) == "degE7"]
     pairs = [
-        (lat, next(f for f in scaled if f in (lon, lon.replace("lon", "lng"))), DEGE7)
+        (lat, next(f for f in scaled if f in (lon, lon.replace("lon", "lng"))), DEGE7_PER_DEG)
         for lat in scaled
         if (lon := longitude_of(lat)) != lat
     ]

@@ -4,7 +4,7 @@ import heapq
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Final
 
@@ -113,7 +113,7 @@ class FlightToWrite:
 
     def tlog(self) -> Iterator[bytes]:
         """Yield the MAVLink as a tlog, with the edits."""
-        sources, edits = self._open(), self._edits
+        sources, edits = self._sources, self._edits
         if edits.anonymity is not None:
             self.anonymiser = Anonymiser(edits.anonymity, first_position(sources))
             edits = replace(edits, frames=(self.anonymiser, *edits.frames))
@@ -124,15 +124,16 @@ class FlightToWrite:
         """Yield the MAVLink that is kept, of all messages, not edited."""
         choice = replace(self._edits.choice, messages=frozenset())
         editor = TlogEditor(replace(self._edits, choice=choice), self._limits, self.remark)
-        return editor.chosen(self._batches(editor, self._open()), self.senders)
+        return editor.chosen(self._batches(editor, self._sources), self.senders)
 
     def _batches(self, editor: TlogEditor, sources: list[TlogSource]) -> Iterator[Batch]:
         if self.is_mavlink:
             return editor.joined(sources, self.options.progress)
         return batched(self._sent())
 
-    def _open(self) -> list[TlogSource]:
-        """Open the files that are MAVLink; their senders are known then."""
+    @cached_property
+    def _sources(self) -> list[TlogSource]:
+        """The files that are MAVLink, opened once; their senders are known then."""
         if not self.is_mavlink:
             return []
         sources = [open_tlog(file) for file in self.files]

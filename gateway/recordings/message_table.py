@@ -26,13 +26,13 @@ import msgspec
 
 from gateway.geometry.quaternion import from_euler, to_euler
 from gateway.records import NAN
-from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
+from gateway.units import DEG_PER_DEGE7, RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 from gateway.vehicle.encoding import MessagePacker
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
 
 UNITS: Final[dict[str, tuple[str, float]]] = {
     "rad": ("angle", 1.0), "deg": ("angle", RAD_PER_DEG), "cdeg": ("angle", RAD_PER_DEG * 1e-2),
-    "degE7": ("angle", RAD_PER_DEG * 1e-7), "degE5": ("angle", RAD_PER_DEG * 1e-5),
+    "degE7": ("angle", RAD_PER_DEG * DEG_PER_DEGE7), "degE5": ("angle", RAD_PER_DEG * 1e-5),
     "degheading": ("angle", RAD_PER_DEG), "deglatitude": ("angle", RAD_PER_DEG),
     "deglongitude": ("angle", RAD_PER_DEG),
     "rad/s": ("rate", 1.0), "deg/s": ("rate", RAD_PER_DEG), "mrad/s": ("rate", 1e-3),

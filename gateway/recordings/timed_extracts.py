@@ -15,7 +15,7 @@ from gateway.recordings.positions import GroundDistance, Position
 from gateway.recordings.tlog import HEARTBEAT_ID
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.records import NAN
-from gateway.units import US_PER_S
+from gateway.units import DEGE7_PER_DEG, US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES
 
 REACHED_ID: Final = MESSAGE_IDS["MISSION_ITEM_REACHED"]
@@ -87,17 +87,16 @@ def images(messages: Iterable[VehicleMessage]) -> str:
     for message in messages:
         fields, at = message.fields, iso_time(message.time_us)
         if message.message_id == CAMERA_FEEDBACK_ID:
-            found.append((
-                at, message.system_id, fields["img_idx"], "", fields["lat"] / 1e7,
-                fields["lng"] / 1e7, fields["alt_msl"], fields["alt_rel"], fields["roll"],
-                fields["pitch"], fields["yaw"],
-            ))  # fmt: skip
+            lat_deg, lon_deg = fields["lat"] / DEGE7_PER_DEG, fields["lng"] / DEGE7_PER_DEG
+            angles = fields["roll"], fields["pitch"], fields["yaw"]
+            located = fields["img_idx"], "", lat_deg, lon_deg, fields["alt_msl"], fields["alt_rel"]
+            found.append((at, message.system_id, *located, *angles))
         elif message.message_id == CAPTURED_ID and fields["capture_result"] == 1:
             name = fields["file_url"].decode("utf-8", "replace")
-            found.append((
-                at, message.system_id, fields["image_index"], name, fields["lat"] / 1e7,
-                fields["lon"] / 1e7, fields["alt"] / 1e3, fields["relative_alt"] / 1e3, "", "", "",
-            ))  # fmt: skip
+            lat_deg, lon_deg = fields["lat"] / DEGE7_PER_DEG, fields["lon"] / DEGE7_PER_DEG
+            heights = fields["alt"] / 1e3, fields["relative_alt"] / 1e3
+            located = fields["image_index"], name, lat_deg, lon_deg, *heights
+            found.append((at, message.system_id, *located, "", "", ""))
     columns = ("time", "system", "image", "file", "lat_deg", "lon_deg", "alt_amsl_m",
                "alt_home_m", "roll_deg", "pitch_deg", "yaw_deg")  # fmt: skip
     return csv_lines([columns, *found])

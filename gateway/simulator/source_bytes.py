@@ -16,7 +16,7 @@ from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.simulator.trajectory import FLIGHT_S, Truth
-from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.units import DEG_PER_DEGE7, DEGE7_PER_DEG, STANDARD_GRAVITY_MPS2, US_PER_S
 from gateway.wire.link import Link
 
 RADIO: Final = 0xEA
@@ -65,7 +65,7 @@ def _attitude(truth: Truth, k: int) -> bytes:
 def _position(truth: Truth, k: int) -> bytes:
     north, east, _ = truth.vel_n_mps[k].tolist()
     course = round(math.degrees(math.atan2(east, north)) % 360.0 * 100.0) % 36_000
-    place = round(truth.lat_deg[k] * 1e7), round(truth.lon_deg[k] * 1e7)
+    place = round(truth.lat_deg[k] * DEGE7_PER_DEG), round(truth.lon_deg[k] * DEGE7_PER_DEG)
     speed, height = round(math.hypot(north, east) * KMH10), round(truth.alt_amsl_m[k] + 1000.0)
     return crsf_frame(0x02, struct.pack(">iiHHHB", *place, speed, course, height, 14))
 
@@ -181,8 +181,8 @@ def _readings(record: RawRecord, start_unix_us: int) -> Iterator[dict[str, objec
             north, east, _ = record.vel_n_mps
             yield reading(
                 "location",
-                latitude=record.lat_dege7 * 1e-7,
-                longitude=record.lon_dege7 * 1e-7,
+                latitude=record.lat_dege7 * DEG_PER_DEGE7,
+                longitude=record.lon_dege7 * DEG_PER_DEGE7,
                 altitudeAboveMeanSeaLevel=record.alt_amsl_m,
                 speed=math.hypot(north, east),
                 bearing=math.degrees(math.atan2(east, north)) % 360.0,

@@ -48,7 +48,7 @@ from gateway.sources.flight_modes import (
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import SourceUrl
 from gateway.sources.source import CheckedFrames
-from gateway.units import M_PER_CM, RAD_PER_DEG, STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.units import DEG_PER_DEGE7, M_PER_CM, RAD_PER_DEG, STANDARD_GRAVITY_MPS2, US_PER_S
 from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
 
@@ -183,8 +183,8 @@ class CrsfDecoder(CheckedFrames):
         self._fix = fix_at(
             arrival_us,
             self._node,
-            lat * 1e-7,
-            lon * 1e-7,
+            lat * DEG_PER_DEGE7,
+            lon * DEG_PER_DEGE7,
             height - 1000.0,
             vel_n_mps=vel,
             satellites=satellites,
@@ -288,7 +288,7 @@ class CrsfDecoder(CheckedFrames):
         fix = self._fix
         if fix is not None and fix.fix_ok and arrival_us - fix.time_us <= EXTRA_AGE_US:
             bearing = (value >> 25 & 0x7F) * 3.0 * RAD_PER_DEG
-            lat_deg, lon_deg = fix.lat_dege7 * 1e-7, fix.lon_dege7 * 1e-7
+            lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
             per_m = math.degrees(1.0 / 6_371_000.0)
             shrink = max(math.cos(math.radians(lat_deg)), 1e-3)
             home_lat = lat_deg + distance_m * math.cos(bearing) * per_m

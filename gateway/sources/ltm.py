@@ -13,7 +13,7 @@ from gateway.sources.flight_modes import FIXED_WING, QUADROTOR, wanted_type
 from gateway.sources.sampling import fix_at, velocity
 from gateway.sources.settings import SourceUrl
 from gateway.sources.source import CheckedFrames
-from gateway.units import M_PER_CM, RAD_PER_DEG
+from gateway.units import DEG_PER_DEGE7, M_PER_CM, RAD_PER_DEG
 from gateway.wire.framing import Fault
 
 START: Final = b"$T"
@@ -67,7 +67,7 @@ class LtmDecoder(CheckedFrames):
             lat, lon, alt_cm, _, fix = struct.unpack("<iiiBB", payload)
             self._home_alt_m = alt_cm * M_PER_CM
             if fix:
-                parts = {"home": (lat * 1e-7, lon * 1e-7, self._home_alt_m)}
+                parts = {"home": (lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, self._home_alt_m)}
         return [VehicleReport(time_us=time_us, node=self._node, **parts)] if parts else []
 
     def _gps(self, payload: bytes, time_us: int) -> list[Any]:
@@ -77,8 +77,8 @@ class LtmDecoder(CheckedFrames):
         fix = fix_at(
             time_us,
             self._node,
-            lat * 1e-7,
-            lon * 1e-7,
+            lat * DEG_PER_DEGE7,
+            lon * DEG_PER_DEGE7,
             self._home_alt_m + height_m,
             vel_n_mps=velocity(float(speed), self._course_deg),
             satellites=state >> 2,

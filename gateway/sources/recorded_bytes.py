@@ -6,8 +6,9 @@ from typing import Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import NodeId
-from gateway.wire.mavlink_splitter import message_id_of
+from gateway.wire.mavlink_messages import MESSAGE_IDS
 
+TUNNEL_ID: Final = MESSAGE_IDS["TUNNEL"]
 FIRST_TYPE: Final = 0x8000
 """Payload types from here on are free for any program; the node's id is added."""
 PIECE: Final = 128
@@ -31,9 +32,7 @@ class TunnelWriter:
 
 
 def tunnelled(frame: bytes, node: NodeId) -> bytes:
-    """Return the bytes of a source that a frame holds; none if it is another's, or damaged."""
-    if message_id_of(frame) != mavlink.MAVLINK_MSG_ID_TUNNEL:
-        return b""
+    """Return the bytes of a source in a TUNNEL frame; none if it is another's, or damaged."""
     try:
         message = mavlink.MAVLink(None).decode(bytearray(frame))
     except mavlink.MAVError:

@@ -9,7 +9,7 @@ import math
 from typing import Final
 
 from gateway.records import NAN, GpsFix, GpsFixType, ImuFlags, ImuRaw, Int3, NodeId, Vec3
-from gateway.units import US_PER_S
+from gateway.units import DEGE7_PER_DEG, US_PER_S
 from gateway.wire.timesync import WRAP_MASK, ClockTracker
 
 ACCEL_RANGE_G: Final = 2
@@ -132,8 +132,8 @@ def fix_at(
         fix_type=fix_type,
         fix_ok=located,
         satellites=max(0, min(satellites, 255)),
-        lat_dege7=round(lat_deg * 1e7),
-        lon_dege7=round(lon_deg * 1e7),
+        lat_dege7=round(lat_deg * DEGE7_PER_DEG),
+        lon_dege7=round(lon_deg * DEGE7_PER_DEG),
         alt_amsl_m=alt_amsl_m,
         vel_n_mps=vel_n_mps,
         alt_ellipsoid_m=NAN,

@@ -8,6 +8,7 @@ from typing import Final
 from gateway.records import BaroRaw, GpsFix, ImuFlags, ImuRaw, VehicleReport
 from gateway.sources.sampling import COUNTS_PER_DPS, COUNTS_PER_MPS2, COUNTS_PER_UT
 from gateway.sources.source import SourceRecord
+from gateway.units import DEG_PER_DEGE7, DEGE7_PER_DEG
 from gateway.wire.framing import Fault
 
 GUESSES: Final = (
@@ -48,7 +49,7 @@ def describe(event: SourceRecord | Fault) -> str:
         case BaroRaw():
             return f"barometer {event.pressure_pa / 100.0:.2f} hPa"
         case GpsFix():
-            place = f"{event.lat_dege7 * 1e-7:.6f} {event.lon_dege7 * 1e-7:.6f}"
+            place = f"{event.lat_dege7 * DEG_PER_DEGE7:.6f} {event.lon_dege7 * DEG_PER_DEGE7:.6f}"
             fix = f"fix {place} {event.alt_amsl_m:.1f} m" if event.fix_ok else "no fix"
             return f"GPS {fix}, {event.satellites} satellites"
         case VehicleReport():
@@ -138,6 +139,6 @@ def suggested_map(header: str) -> list[str]:
     for cell in cells:
         ours = next((name for pattern, name in GUESSES if re.match(pattern, cell.lower())), None)
         if ours is not None and ours not in found:
-            scale = 1e7 if ours in DEGE7 else 1000.0 if ours == "time_us" else 1.0
+            scale = DEGE7_PER_DEG if ours in DEGE7 else 1000.0 if ours == "time_us" else 1.0
             found[ours] = f'{ours} = {{ column = "{cell}", scale = {scale:g} }}'
     return ["[columns]", *found.values()] if "time_us" in found and len(found) > 1 else []
