@@ -26,6 +26,7 @@ from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION
 from gateway.recordings.tlog import fields_of
 from gateway.records import NAN, UNKNOWN_VEC3, Quat, Vec3
 from gateway.units import M_PER_CM, M_PER_MM, MV_PER_V, US_PER_S
+from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAMES, ids_of
 from gateway.wire.mavlink_splitter import MavFrame
 
@@ -55,18 +56,6 @@ STATE_IDS: Final = frozenset(RANKS) | ids_of(
     "RADIO_STATUS",
 )
 """The messages from which the state is taken."""
-PX4_MODES: Final = {
-    1: "MANUAL", 2: "ALTCTL", 3: "POSCTL", 4: "AUTO", 5: "ACRO", 6: "OFFBOARD", 7: "STABILIZED",
-}  # fmt: skip
-PX4_AUTO_MODES: Final = {
-    1: "READY", 2: "TAKEOFF", 3: "LOITER", 4: "MISSION", 5: "RTL", 6: "LAND", 8: "FOLLOW",
-    9: "PRECLAND",
-}  # fmt: skip
-ARDUPILOT_MODES: Final = {
-    **dict.fromkeys((2, 3, 4, 13, 14, 15, 29, 35), "COPTER_MODE"),
-    **dict.fromkeys((10, 11), "ROVER_MODE"), 12: "SUB_MODE", 5: "TRACKER_MODE",
-}  # fmt: skip
-"""Enumeration of the modes by MAV_TYPE; of others it is that of aeroplanes."""
 
 
 class VehicleComponents:
@@ -257,17 +246,6 @@ class NewestState:
         is_half = "base_mode" not in beat and beat["autopilot"] == mavlink.MAV_AUTOPILOT_PX4
         number = beat["custom_mode"] << 16 if is_half else beat["custom_mode"]
         return mode_name(beat["autopilot"], beat["type"], number)
-
-
-def mode_name(autopilot: int, mav_type: int, number: int) -> str:
-    """Return the custom mode of a vehicle in the words of its autopilot; empty if unknown."""
-    if autopilot == mavlink.MAV_AUTOPILOT_PX4:
-        return PX4_AUTO_MODES.get(number >> 24, "") or PX4_MODES.get(number >> 16 & 0xFF, "")
-    if autopilot != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
-        return ""
-    words = ARDUPILOT_MODES.get(mav_type, "PLANE_MODE")
-    entry = mavlink.enums[words].get(number)
-    return "" if entry is None else str(entry.name).removeprefix(f"{words}_")
 
 
 def _accuracy_m(accuracy_mm: int) -> float:

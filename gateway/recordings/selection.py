@@ -17,9 +17,9 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, time_us_of
-from gateway.recordings.newest import mode_name
 from gateway.recordings.senders import Senders
 from gateway.recordings.tlog import HEARTBEAT_ID, Batch, columns_of
+from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 BoolArray = NDArray[np.bool_]

@@ -10,6 +10,7 @@ from typing import Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.sources.settings import SourceUrl
+from gateway.wire.flight_modes import mode_name
 
 FIXED_WING: Final[int] = mavlink.MAV_TYPE_FIXED_WING
 QUADROTOR: Final[int] = mavlink.MAV_TYPE_QUADROTOR
@@ -30,14 +31,6 @@ OF_BETAFLIGHT: Final = frozenset({"ANGL", "HOR", "AIR", "RTH", "WAIT", "OK", "!E
 NOT_ARMED: Final = frozenset({"OK", "WAIT", "!ERR"})
 FAILSAFE: Final = "!FS!"
 MARKS: Final = "*!?"
-VTOL_TYPES: Final = range(19, 26)
-"""The MAV_TYPEs of aircraft that take off vertically, which fly with the modes of aeroplanes."""
-_CLASSES: Final = (
-    ("PLANE_MODE", {FIXED_WING, *VTOL_TYPES}),
-    ("ROVER_MODE", {mavlink.MAV_TYPE_GROUND_ROVER, mavlink.MAV_TYPE_SURFACE_BOAT}),
-    ("SUB_MODE", {mavlink.MAV_TYPE_SUBMARINE}),
-    ("TRACKER_MODE", {mavlink.MAV_TYPE_ANTENNA_TRACKER}),
-)
 
 
 def wanted_type(url: SourceUrl) -> int | None:
@@ -81,6 +74,4 @@ def ardupilot_mode(vehicle_type: int | None, number: int) -> str:
     """Name a mode of ArduPilot; of a type that is not known yet, by its number."""
     if vehicle_type is None:
         return f"MODE {number}"
-    kind = next((name for name, types in _CLASSES if vehicle_type in types), "COPTER_MODE")
-    entry = mavlink.enums.get(kind, {}).get(number)
-    return f"MODE {number}" if entry is None else str(entry.name).removeprefix(f"{kind}_")
+    return mode_name(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, vehicle_type, number) or f"MODE {number}"

@@ -25,6 +25,7 @@ from gateway.recordings.autopilot_record import (
     Mode,
     Text,
 )
+from gateway.recordings.extracts import CIRCLES
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats.dataflash import (
     KINDS,
@@ -67,7 +68,6 @@ FENCE_COMMANDS: Final = {
     98: mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION,
 }
 """By the type in FNCE."""
-CIRCLES: Final = {FENCE_COMMANDS[92], FENCE_COMMANDS[93]}
 RALLY_HAS_FRAME: Final = 4
 """Bit of the flags in RALY; two bits above it are the frame."""
 RALLY_FRAMES: Final = {
