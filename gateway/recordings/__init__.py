@@ -1,4 +1,4 @@
-"""Recordings: their formats, and what is done with them.
+"""Recordings: their formats, and the operations on them.
 
 A flight of any format is rows of one table (`columns`, `table`), MAVLink is records of a tlog
 (`tlog`); `reading` opens any file as either. `fuse` fuses a flight again, `convert` writes it in

@@ -1,21 +1,22 @@
-"""Recordings without the coordinates, dates and names of those who flew.
+"""Remove the coordinates, dates and names of the people who flew from recordings.
 
-All coordinates are moved by one offset. Distances stay: longitudes are scaled by the cosines of the
-two latitudes. Dates are moved by whole days. Texts and identifiers become numbered ones, the same
-for the same original. Messages that may hold anything are left out.
+All coordinates are moved by one offset. Distances are preserved: longitudes are scaled by the ratio
+of the cosines of the two latitudes. Dates are moved by whole days. Texts and identifiers are
+replaced by numbered ones, the same for the same original. Messages with arbitrary content are left
+out.
 
 | found by                                  | fields                                         |
 | ----------------------------------------- | ---------------------------------------------- |
-| unit degE7 in the dialect                 | latitudes, and longitudes                      |
+| unit degE7 in the dialect                 | latitudes and longitudes                       |
 | `OTHER_COORDINATES`                       | coordinates in degrees, or without a unit      |
 | the meaning of the command's parameters   | coordinates of commands and items of missions  |
-| type char in the dialect, less `PLAIN`    | texts and names                                |
+| type char in the dialect, except `PLAIN`  | texts and names                                |
 | `IDENTIFIERS`                             | numbers and bytes that identify something      |
 | integers whose value is a date since 2000 | times                                          |
-| `OPAQUE`                                  | messages with a content that cannot be known   |
+| `OPAQUE`                                  | messages of unknown content                    |
 
-Heights stay, as do values relative to another one. Tests check every field of the dialect against
-these lists.
+Heights and values relative to another one are unchanged. Tests check every field of the dialect
+against these lists.
 """
 
 import math
@@ -56,11 +57,11 @@ LOCATED: Final = {"MISSION_ITEM": 1.0, **dict.fromkeys(
 PLAIN: Final = frozenset({
     "param_id", "mode_name", "tune", "tune2", "busname", "mode_str", "band_str",
 })  # fmt: skip
-"""Names of character fields that identify nobody."""
+"""Names of character fields that do not identify anybody."""
 PLAIN_OF: Final = frozenset({"NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "NAMED_VALUE_STRING",
                              "GIMBAL_DEVICE_INFORMATION.vendor_name",
                              "GIMBAL_DEVICE_INFORMATION.model_name"})  # fmt: skip
-"""Messages whose `name` is that of a quantity, and the names of products."""
+"""Fields that contain the name of a quantity or of a product."""
 IDENTIFIERS: Final[dict[str, tuple[str, ...]]] = {
     "AUTOPILOT_VERSION": ("uid", "uid2"),
     "FLIGHT_INFORMATION": ("flight_uuid",),
@@ -91,36 +92,36 @@ OPAQUE: Final = frozenset({
     "AUTH_KEY", "AIRLINK_AUTH", "CHANGE_OPERATOR_CONTROL", "MOUNT_CONTROL", "CUBEPILOT_RAW_RC",
     "LED_CONTROL",
 })  # fmt: skip
-"""Left out: files, logs, raw data of devices, keys, and old messages with one of many meanings."""
+"""Messages left out: files, logs, raw device data, keys, and old messages of ambiguous meaning."""
 COMMANDS: Final = frozenset({
     "COMMAND_LONG", "COMMAND_LONG_STAMPED", "COMMAND_INT", "COMMAND_INT_STAMPED",
 })  # fmt: skip
-"""Messages with a command; those of a vendor are left out."""
+"""Messages that contain a command; those with a command of a vendor are left out."""
 NAMED_VALUES: Final = {"PARAM_VALUE": "param_id", "PARAM_SET": "param_id",
                        "PARAM_EXT_VALUE": "param_id", "PARAM_EXT_SET": "param_id",
                        "PARAM_EXT_ACK": "param_id", "NAMED_VALUE_FLOAT": "name",
                        "NAMED_VALUE_INT": "name"}  # fmt: skip
-"""Messages with a value whose meaning is in its name."""
+"""Messages with a value that is named by another field: that field, by message."""
 PRIVATE_NAME: Final = re.compile(
     r"(?<![A-Z])(LAT|LON|LNG|LATITUDE|LONGITUDE)(?![A-Z])|ICAO|SERIAL_?N|SQUAWK|PASS|SSID|UUID",
     re.IGNORECASE,
 )
-"""Names of values that are left out."""
+"""Pattern of the names of values that are left out."""
 TIME_UNITS: Final = {"s": 1, "ms": 1000, "us": 1_000_000, "ns": 1_000_000_000}
-"""Units of times, per second."""
+"""Ticks per second of each unit of time."""
 UNITLESS_TIMES: Final = frozenset({"utc_time", "vehicle_timestamp", "time_usec", "timestamp"})
 GPS_WEEKS: Final = {"GPS_RTK": ("wn", "tow"), "GPS2_RTK": ("wn", "tow"),
                     "GPS_INPUT": ("time_week", "time_week_ms")}  # fmt: skip
 WEEK_MS: Final = 7 * 86_400_000
 DRONE_ID_TIMES: Final = frozenset({"OPEN_DRONE_ID_SYSTEM", "OPEN_DRONE_ID_SYSTEM_UPDATE"})
-"""Their timestamp counts seconds since 2019."""
+"""Messages whose timestamp counts seconds since 2019."""
 FIRST_CIVIL_S: Final = 946_684_800
 LAST_CIVIL_S: Final = 4_102_444_800
-"""2000 to 2100; other values are no dates."""
+"""2100 in s since 1970; times are dates from 2000 up to it."""
 MAX_NAMES: Final = 60_000
-"""Different identifiers that are numbered; the others share a number."""
+"""Identifiers that get a number of their own; all later ones share one number."""
 MAX_PLACE_DEG: Final = 80.0
-"""Greatest latitude of the place: nearer to a pole, a flight would not fit between meridians."""
+"""Greatest latitude to move to: nearer to a pole, a flight would not fit between meridians."""
 _COMMAND_FIELDS: Final[dict[int, dict[str, int]]] = {
     number: axes
     for number, entry in mavlink.enums["MAV_CMD"].items()
@@ -132,29 +133,29 @@ _COMMAND_FIELDS: Final[dict[int, dict[str, int]]] = {
         }
     )
 }
-"""By command: parameters that are coordinates, latitude 0 or longitude 1."""
+"""Parameters that are coordinates, by command; value: 0 for latitude, 1 for longitude."""
 _SIZES: Final = np.full(1 << 16, -1, np.int64)
 """Size of each known message's payload, by id."""
 _CHANGED: Final = np.zeros(1 << 16, np.bool_)
-"""Whether a message may have to change."""
+"""Whether a message can contain fields to change, by id."""
 _SPECIAL: Final = {*OPAQUE, *LOCATED, *NAMED_VALUES, *GPS_WEEKS, *DRONE_ID_TIMES,
                    *COMMANDS}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class Anonymity:
-    """The place and day to which recordings are moved."""
+    """The location and day to which recordings are moved."""
 
     lat_deg: float = 0.0
     lon_deg: float = 0.0
     day: date = date(2020, 1, 1)
     keep_unknown: bool = False
-    """Keep messages that are not in the dialect, or longer than there."""
+    """Keep messages that are not in the dialect, or longer than the dialect defines them."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """The fields of a message that may have to change."""
+    """The fields of a message that may be changed."""
 
     coordinates: tuple[tuple[str, str, float], ...]
     identifiers: tuple[str, ...]
@@ -166,7 +167,7 @@ class _Plan:
 
 
 def is_plain(message: str, field: str) -> bool:
-    """Return whether a field of characters identifies nobody."""
+    """Return whether a character field does not identify anybody."""
     return (
         field in PLAIN
         or f"{message}.{field}" in PLAIN_OF
@@ -175,7 +176,7 @@ def is_plain(message: str, field: str) -> bool:
 
 
 def longitude_of(latitude: str) -> str:
-    """Return the beginning of the name of the longitude that belongs to a latitude."""
+    """Return the prefix of the name of the longitude that belongs to a latitude."""
     return latitude.replace("latitude", "longitude").replace("Lat", "Lon").replace("lat", "lon")
 
 
@@ -210,26 +211,26 @@ for _message_id, _name in MESSAGE_NAMES.items():
 
 
 class Anonymiser:
-    """Change the frames of a recording; the reference is its first position.
+    """Anonymise the frames of a recording.
 
     Parameters
     ----------
     anonymity : Anonymity
-        Where and when to.
+        Target location and day.
     reference : tuple of float, optional
-        Latitude and longitude that get to the place, deg; by default the first ones that come.
+        Latitude and longitude that are moved to the target, deg; default: the first ones found.
     """
 
     def __init__(self, anonymity: Anonymity, reference: tuple[float, float] | None = None) -> None:
         self._anonymity = anonymity
         self.reference = reference
         self.changed: Counter[tuple[str, str]] = Counter()
-        """How many fields were changed, by message and field."""
+        """Number of changed fields, by message and field."""
         self._names: dict[bytes, int] = {}
         self._days: int | None = None
 
     def shift_us(self, batch: Batch) -> int:
-        """Return what is added to the recorded times; the first batch sets it."""
+        """Return the shift of the recorded times; the first batch determines it."""
         if self._days is None and len(batch):
             first = datetime.fromtimestamp(max(int(batch.time_us[0]), 0) / US_PER_S, UTC)
             self._days = (self._anonymity.day - first.date()).days
@@ -245,7 +246,7 @@ class Anonymiser:
         return found
 
     def edit(self, frame: bytes) -> bytes | None:
-        """Return a frame without anything that identifies; None if it must be left out."""
+        """Return the anonymised frame; None if it must be left out."""
         read = frame_of(frame)
         message_id, name = read.message_id, MESSAGE_NAMES.get(read.message_id)
         if name is None or frame[1] > _SIZES[message_id]:
@@ -279,7 +280,7 @@ class Anonymiser:
     def _moved(
         self, fields: Mapping[str, Any], lat: str, lon: str, unit: float
     ) -> dict[str, float]:
-        """Move a latitude and a longitude; 0, 0 and values out of range mean unknown."""
+        """Move a latitude and a longitude; 0, 0 and values out of range mean unknown and stay."""
         lat_deg, lon_deg = fields[lat] / unit, fields[lon] / unit
         moved: dict[str, float] = {}
         if not lat_deg and not lon_deg:
@@ -291,7 +292,7 @@ class Anonymiser:
         if unit != 1.0:
             moved = {field: round(value * unit) for field, value in moved.items()}
         if not any(moved.values()):
-            # One centimetre: 0, 0 would mean unknown.
+            # One unit (1 cm for degE7) off, because 0, 0 would mean unknown.
             moved = dict.fromkeys(moved, 1 / unit if unit == 1.0 else 1)
         return moved
 
@@ -307,7 +308,7 @@ class Anonymiser:
         return _wrapped(place.lon_deg + _wrapped(offset_deg) * scale)
 
     def _command(self, name: str, fields: Mapping[str, Any]) -> dict[str, float]:
-        """Move the coordinates of a command or an item of a mission."""
+        """Move the coordinates of a command or of a mission item."""
         if name in LOCATED:
             is_global = fields["frame"] in GLOBAL_FRAMES or (
                 fields["frame"] == mavlink.MAV_FRAME_MISSION
@@ -321,7 +322,7 @@ class Anonymiser:
         return self._moved(fields, pairs[0], pairs[-1], 1.0) if len(pairs) > 1 else {}
 
     def _numbered(self, message_id: int, field: str, value: Any) -> Any:
-        """Return a numbered identifier in place of another; an empty one stays empty."""
+        """Return a numbered identifier in place of the original; an empty one stays empty."""
         kind = layout_of(message_id)[field]
         if isinstance(value, bytes):
             number = self._number(value.rstrip(b"\0"))
@@ -333,7 +334,7 @@ class Anonymiser:
         return np.frombuffer(number.to_bytes(len(original), "little"), np.uint8)
 
     def _number(self, original: bytes) -> int:
-        """Return the number of an identifier, from 1; 0 of an empty one."""
+        """Return the number of an identifier, from 1; 0 for an empty one."""
         if not original:
             return 0
         if len(self._names) >= MAX_NAMES:

@@ -1,8 +1,8 @@
-"""Answers of foreign vehicles on slow links, kept for further ground stations.
+"""Cache of the answers of foreign vehicles on slow links, for further ground stations.
 
 The first station loads parameters, missions and metadata over the link; the answers that pass are
-kept, and others are answered from them. A vehicle that signs is answered for only if the gateway
-has its key: requests must be signed by it too, and the answers are.
+kept, and further stations are answered from them. For a vehicle that signs, this requires that the
+gateway has its key: requests must be signed with it, and the answers are signed with it too.
 """
 
 from dataclasses import dataclass
@@ -22,24 +22,24 @@ from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
 MAX_VEHICLES: Final = 16
-"""Of `MAX_BYTES` each; the one that was heard longest ago gives way."""
+"""Vehicles of `MAX_BYTES` each; the one received longest ago is removed for a new one."""
 CHECK_US: Final = 10 * US_PER_S
-"""Time limit of the answer that checks a list; a link delays it by some seconds."""
+"""Timeout of the vehicle's answer to a checksum request; slow links delay it by seconds."""
 
 
 @dataclass(slots=True)
 class _Entry:
-    """One vehicle."""
+    """The kept answers of one vehicle."""
 
     live: LiveAnswers
     vehicle: CachedVehicle
     heard_us: int = 0
     sequence: int = 0
-    """Of the next answer."""
+    """Sequence number of the next answer."""
     key: bytes | None = b""
-    """With which it signs: empty if it does not, None if the gateway does not have it."""
+    """Key with which it signs: empty if it does not sign, None if the gateway lacks the key."""
     checked: tuple[int, int, MavFrame] | None = None
-    """When a list was answered while its checksum was requested, the client, and its request."""
+    """Set while the checksum of an answered list is requested: time, client, original request."""
 
 
 class AnswerCache:
@@ -51,11 +51,11 @@ class AnswerCache:
 
     @staticmethod
     def reads(message_id: int) -> bool:
-        """Return whether a message without a target is read here."""
+        """Return whether this cache evaluates a message without a target."""
         return message_id in NOTED_IDS
 
     def add(self, frame: MavFrame, now_us: int) -> MavFrame | None:
-        """Process a frame of a vehicle; return a request that must be sent to it after all."""
+        """Process a frame of a vehicle; return a request that must still be sent to it."""
         system, component = frame.origin
         if component != AUTOPILOT:
             entry = self._entries.get(system)
@@ -65,7 +65,7 @@ class AnswerCache:
         entry = self._entry(system)
         key = self._signer.key_of(frame) if frame.signed else b""
         if key != entry.key:
-            # Without signatures anybody could have sent it before.
+            # The kept answers were not signed with this key, so anybody could have sent them.
             entry.live.clear()
             entry.key = key
         entry.heard_us = now_us
@@ -80,9 +80,9 @@ class AnswerCache:
     def handle(
         self, client_id: int, frame: MavFrame, now_us: int, *, may_answer: bool
     ) -> tuple[list[Outgoing], MavFrame | None]:
-        """Answer a station's request, or process the values that it writes.
+        """Answer a station's request, or note the values that it writes.
 
-        Returns the answers, and the frame that must be sent to the vehicle, if any.
+        Returns the answers, and the frame to be sent to the vehicle, if any.
         """
         entry = self._entries.get(frame.target[0])
         if entry is None:
@@ -99,7 +99,7 @@ class AnswerCache:
         return [], frame
 
     def poll(self, now_us: int) -> list[Outgoing]:
-        """Return the next of every list and file that is under way."""
+        """Return the next answer of every list and file transfer in progress."""
         return [
             self._numbered(entry, each, now_us)
             for entry in self._entries.values()
@@ -113,7 +113,7 @@ class AnswerCache:
         return min((time_us for time_us in due if time_us is not None), default=None)
 
     def remove(self, system: int) -> None:
-        """Drop the kept answers of a vehicle, as when its link gets other options."""
+        """Drop the kept answers of a vehicle, for example when its link gets other options."""
         self._entries.pop(system, None)
 
     def remove_client(self, client_id: int) -> None:
@@ -122,7 +122,7 @@ class AnswerCache:
             entry.vehicle.remove_client(client_id)
 
     def describe(self, system: int, now_us: int) -> str:
-        """List the kept answers of a vehicle with the age of each part; empty without any."""
+        """List the kept answers of a vehicle with the age of each part; empty if there are none."""
         entry = self._entries.get(system)
         if entry is None or not entry.live.since_us:
             return ""
@@ -146,7 +146,7 @@ class AnswerCache:
         return entry
 
     def _fits(self, entry: _Entry, request: MavFrame) -> bool:
-        """Return whether a request is signed as the vehicle is."""
+        """Return whether a request is signed with the vehicle's key, or both are unsigned."""
         return entry.key is not None and entry.key == (
             self._signer.key_of(request) if request.signed else b""
         )
@@ -154,7 +154,7 @@ class AnswerCache:
     def _check(
         self, entry: _Entry, request: Request, frame: MavFrame, now_us: int
     ) -> MavFrame | None:
-        """Return the request of the checksum in the place of that of a list that has one."""
+        """Return a checksum request to send instead of a list request, if the checksum is known."""
         is_list = request.message.get_type() == "PARAM_REQUEST_LIST"
         if not is_list or entry.live.hash_frame is None or frame.signed:
             return None

@@ -1,19 +1,19 @@
-"""The answers of a recording to ground stations, and the frames that must not be played.
+"""The recorded answers of vehicles, and the frames that must not be played.
 
-A tlog holds the answers that the vehicle gave in flight. They are collected while the file is
-indexed, each with the time from which it was valid, so that a player can give them again: as of
-the moment that is played, or the first one for what the vehicle sent only later. A mission or a
-parameter that a station set in flight did not exist before.
+A tlog contains the answers that the vehicle gave in flight. They are collected while the file is
+indexed, each with the time from which it was valid, so that a player can give them again: the
+answer valid at the moment played, or the first one if the vehicle sent it only later. A mission or
+parameter that a station set in flight does not exist before that.
 
-| what                         | where from                                               |
+| answer                       | source                                                   |
 | ---------------------------- | -------------------------------------------------------- |
 | parameters                   | PARAM_VALUE of the vehicle, the newest of each name      |
 | mission, fence, rally points | a whole download, or an upload that the vehicle accepted |
 | home, origin, version, modes | the messages of that name                                |
 
-A recording holds both directions of a link. Messages of a vehicle are played; those of ground
-stations, and any others that command a vehicle or feed its navigation, could arm, steer or mislead
-a real vehicle with the same id on the link that it is played to.
+A recording contains both directions of a link. Messages of a vehicle are played. Those of ground
+stations, and others that command a vehicle or feed its navigation, are not: they could arm, steer
+or mislead a real vehicle with the same id on the link that the recording is played to.
 """
 
 import struct
@@ -38,15 +38,15 @@ AUTOPILOT_VERSION_ID: Final = MESSAGE_IDS["AUTOPILOT_VERSION"]
 HOME_POSITION_ID: Final = MESSAGE_IDS["HOME_POSITION"]
 AVAILABLE_MODES_ID: Final = MESSAGE_IDS["AVAILABLE_MODES"]
 PARAM_VALUE: Final = struct.Struct("<4sHH16sB")
-"""PARAM_VALUE: value, count, index, name, type."""
+"""Fields of PARAM_VALUE: value, count, index, name, type."""
 _SAME: Final = {HOME_POSITION_ID: 52}
-"""How much of the payload must be equal to be no change; the rest is the time of sending."""
+"""Bytes of the payload that contain content, by message; the rest is the time of sending."""
 _PARAM_SET: Final = MESSAGE_IDS["PARAM_SET"]
 _SET_NAME: Final = slice(6, 22)
-"""Of PARAM_SET: behind the value and the target."""
+"""Bytes of the name in PARAM_SET, after value and target."""
 ALL_KINDS: Final = 255
 MAX_KEPT: Final = 200_000
-"""Frames; some 10 MB. A vehicle has a thousand parameters that change now and then."""
+"""Maximum number of frames, about 10 MB. A vehicle has some 1000 parameters that rarely change."""
 Items = tuple[bytes, ...]
 Value = TypeVar("Value")
 
@@ -58,7 +58,7 @@ _REPORTS: Final = ids_of(
     "OPEN_DRONE_ID_AUTHENTICATION", "OPEN_DRONE_ID_SELF_ID", "OPEN_DRONE_ID_SYSTEM",
     "OPEN_DRONE_ID_OPERATOR_ID", "OPEN_DRONE_ID_MESSAGE_PACK",
 )  # fmt: skip
-"""Messages with a target that request nothing of it."""
+"""Messages with a target that are not requests."""
 _ASKING: Final = TARGET_OFFSETS.keys() - _REPORTS
 _FEEDING: Final = ids_of(
     "GPS_RTCM_DATA", "GPS_INPUT", "HIL_CONTROLS", "HIL_RC_INPUTS_RAW", "HIL_SENSOR",
@@ -68,14 +68,14 @@ _FEEDING: Final = ids_of(
     "OBSTACLE_DISTANCE", "OBSTACLE_DISTANCE_3D", "DISTANCE_SENSOR", "OPTICAL_FLOW",
     "OPTICAL_FLOW_RAD", "FOLLOW_TARGET", "TERRAIN_DATA",
 )  # fmt: skip
-"""Inputs of an autopilot from other components; when it sends them itself they are telemetry."""
+"""Inputs of an autopilot from other components; sent by the autopilot itself, telemetry."""
 ANSWERS: Final = np.array(sorted(ids_of(
     "COMMAND_ACK", "MISSION_ACK", "MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT",
     "MISSION_REQUEST", "MISSION_REQUEST_INT", "PARAM_VALUE", "PARAM_ERROR",
     "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "FILE_TRANSFER_PROTOCOL", "LOG_ENTRY", "LOG_DATA",
     "PING", "TIMESYNC",
 )))  # fmt: skip
-"""Answers to a station that asked in flight: one of today could take them for its own."""
+"""Answers to a recorded station; a live station could take them for answers to its requests."""
 _LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
 _KEPT: Final = ids_of(
     "PARAM_VALUE", "GPS_GLOBAL_ORIGIN", "AUTOPILOT_VERSION", "HOME_POSITION", "PROTOCOL_VERSION",
@@ -100,7 +100,7 @@ def is_command(frame: bytes, senders: Senders) -> bool:
 
 
 def answers_of(batch: Batch, stations: Set[int]) -> IntArray:
-    """Find the records in which a vehicle answers a station."""
+    """Find the records in which a vehicle answers a station, by index."""
     is_station_s = (batch.origins >> 8 >= FIRST_GROUND_STATION) | np.isin(
         batch.origins, list(stations)
     )
@@ -108,7 +108,7 @@ def answers_of(batch: Batch, stations: Set[int]) -> IntArray:
 
 
 def telemetry_of(batch: Batch, begin: int, senders: Senders) -> IntArray:
-    """Find the records that are neither from a station, nor requests, nor answers to one."""
+    """Find the records that are not from a station, not requests, and not answers to a station."""
     origins, stations = batch.origins[begin:], senders.stations
     kept = (origins >> 8 < FIRST_GROUND_STATION) & ~np.isin(origins, list(stations))
     kept &= ~np.isin(batch.message_ids[begin:], ANSWERS)
@@ -120,15 +120,15 @@ def telemetry_of(batch: Batch, begin: int, senders: Senders) -> IntArray:
 
 @dataclass(slots=True)
 class _Course(Generic[Value]):
-    """A value that changes: since when each of its values is valid."""
+    """The successive values of something, each with the time from which it was valid."""
 
     is_set: bool = False
-    """Whether the first value was set when it became valid; else it was so before."""
+    """Whether the first value was set at its time; otherwise it was valid before as well."""
     times: list[int] = field(default_factory=list)
     values: list[Value] = field(default_factory=list)
 
     def add(self, time_us: int, value: Value) -> None:
-        # Clocks of other recorders may go back; a value recorded later is valid later.
+        # Clocks of other recorders may step back; a value recorded later is valid later.
         self.times.append(max(time_us, self.times[-1]) if self.times else time_us)
         self.values.append(value)
 
@@ -139,29 +139,29 @@ class _Course(Generic[Value]):
 
 @dataclass(slots=True)
 class _Transfer:
-    """A mission in transfer: an upload waits for the vehicle's ACK, a download for its items."""
+    """A mission in transfer: an upload ends with the vehicle's ACK, a download with its items."""
 
     count: int
     items: dict[int, bytes] = field(default_factory=dict)
 
 
 class LogAnswers:
-    """The answers in one recording, of any number of parts."""
+    """The answers in one recording of one or several parts."""
 
     def __init__(self) -> None:
         self.frames: dict[tuple[int, int, bytes], _Course[bytes]] = {}
-        """By system, message id, and key of the item."""
+        """Key: system, message id, and key of the item."""
         self.missions: dict[tuple[int, int], _Course[Items]] = {}
-        """By system and kind."""
+        """Key: system and kind of mission."""
         self.seen: set[tuple[int, int]] = set()
-        """System and id of each message."""
+        """System and message id of each message that was seen."""
         self._transfers: dict[tuple[int, int, bool], _Transfer] = {}
         self._set: set[tuple[int, bytes]] = set()
-        """Parameters that a station has set, by system and name, until their value comes."""
+        """Parameters (system, name) that a station has set and whose new value is still to come."""
         self._kept = 0
 
     def add(self, batch: Batch, senders: Senders) -> None:
-        """Use the next records, after `senders` has."""
+        """Process the next records; `senders` must have processed them already."""
         systems = batch.origins >> 8
         vehicles = {each: senders.vehicle(each).component for each in np.unique(systems).tolist()}
         pairs = np.unique(systems << 32 | batch.message_ids)
@@ -174,9 +174,9 @@ class LogAnswers:
     def add_frame(
         self, frame: bytes, time_us: int, stations: Set[int] = frozenset(), vehicle: int = AUTOPILOT
     ) -> None:
-        """Use one frame: an answer or a part of a mission; others are ignored.
+        """Process one frame: an answer or a part of a mission; others are ignored.
 
-        `vehicle` is the component of its system that is the vehicle.
+        `vehicle` is the component that is the vehicle of its system.
         """
         message_id, (system, component) = message_id_of(frame), origin_of(frame)
         self.seen.add((system, message_id))
@@ -201,7 +201,7 @@ class LogAnswers:
             yield from transfer.items.values()
 
     def drop_mission(self, vehicle: int, kind: int) -> None:
-        """Drop a mission, and what is in transfer of it."""
+        """Drop a mission, and its transfers in progress."""
         self.missions.pop((vehicle, kind), None)
         for is_upload in (False, True):
             self._transfers.pop((vehicle, kind, is_upload), None)
@@ -240,7 +240,7 @@ class LogAnswers:
     def _store(
         self, vehicle: int, kind: int, transfer: _Transfer, time_us: int, *, is_set: bool = False
     ) -> None:
-        """Keep a mission that is complete."""
+        """Store a mission if all its items are there."""
         if len(transfer.items) < transfer.count:
             return
         items = tuple(transfer.items[i] for i in range(transfer.count))
@@ -251,7 +251,7 @@ class LogAnswers:
 
 
 class VehicleAnswers:
-    """The answers of one vehicle of a recording at the played moment, under its played id."""
+    """The answers of one recorded vehicle at the moment played, under its played id."""
 
     def __init__(
         self, log: LogAnswers, system_id: int, played_as: int, position_us: Callable[[], int]
@@ -262,11 +262,11 @@ class VehicleAnswers:
         self._position_us = position_us
 
     def has_message(self, message_id: int) -> bool:
-        """Return whether the vehicle sent a message at all."""
+        """Return whether the vehicle ever sent a message."""
         return (self._system_id, message_id) in self._log.seen
 
     def frames(self, message_id: int) -> list[bytes]:
-        """Return the frames that were sent last before the moment, or else first after it."""
+        """Return the last frames sent before the moment played, else the first ones after it."""
         return [self._edited(frame) for frame in self._recorded(message_id)]
 
     def _recorded(self, message_id: int) -> list[bytes]:
@@ -283,14 +283,14 @@ class VehicleAnswers:
         return (edited or read).data
 
     def mission(self, kind: int) -> Items | None:
-        """Return the frames of the items of a mission; None if the recording has none."""
+        """Return the frames of a mission's items; None if the recording has no such mission."""
         course = self._log.missions.get((self._system_id, kind))
         return None if course is None else course.at(self._position_us())
 
     def parameters(self) -> dict[str, bytes]:
-        """Return the parameters by name, in their order, numbered so that the list is complete."""
+        """Return the parameters by name, in their order, renumbered without gaps."""
         frames = self._recorded(PARAM_VALUE_ID)
-        # Answers to a setting carry no index (65535); they come last.
+        # A confirmation of PARAM_SET has no index (65535); these parameters come last.
         values = sorted(
             (*PARAM_VALUE.unpack(payload_of(frame, PARAM_VALUE.size))[2:4], frame)
             for frame in frames
@@ -302,7 +302,7 @@ class VehicleAnswers:
 
 
 def _key_of(frame: bytes) -> bytes:
-    """Return a key of frames of one message that hold different items."""
+    """Return a key that distinguishes frames of the same message with different items."""
     message_id = message_id_of(frame)
     if message_id == PARAM_VALUE_ID:
         return bytes(PARAM_VALUE.unpack(payload_of(frame, PARAM_VALUE.size))[3])
@@ -313,7 +313,7 @@ def _key_of(frame: bytes) -> bytes:
 
 
 def content_of(frame: bytes) -> bytes:
-    """Return the bytes of a kept frame that change with its content."""
+    """Return the bytes of a stored frame that change with its content."""
     message_id = message_id_of(frame)
     if message_id == PARAM_VALUE_ID:
         value, _, _, _, kind = PARAM_VALUE.unpack(payload_of(frame, PARAM_VALUE.size))

@@ -1,9 +1,9 @@
-"""Where to point an antenna: azimuth, elevation and distance from a station to a vehicle.
+"""Direction of a tracking antenna: azimuth, elevation and distance from a station to a vehicle.
 
-The station is the home of the vehicle, a given place, or another system, such as a GPS receiver at
-the antenna. Heights above mean sea level of both ends become heights above the ellipsoid by the
-geoid separation at the vehicle, if it is reported: between both it changes by some centimetres per
-kilometre, a few thousandths of a degree. The earth's curvature is exact.
+The station is the home of the vehicle, a given position, or another system, such as a GPS receiver
+at the antenna. Heights above mean sea level are converted to heights above the ellipsoid with the
+geoid separation at the vehicle, if it is reported. Between vehicle and station it changes by a few
+centimetres per kilometre, a few thousandths of a degree. The earth's curvature is exact.
 """
 
 import math
@@ -19,7 +19,7 @@ from gateway.recordings.positions import Position, named_position
 HOME: Final = "home"
 SYSTEM: Final = "system:"
 LEAST_DISTANCE_M: Final = 2.0
-"""Nearer, the errors of both positions are larger than the distance: no direction."""
+"""Minimum distance, m; below it the position errors exceed the distance and hide the direction."""
 MAX_ALT_M: Final = 10_000.0
 
 
@@ -28,7 +28,7 @@ class Pointing:
     """The direction to a vehicle, seen from the station."""
 
     azimuth_deg: float
-    """From true north, clockwise, in [0, 360)."""
+    """Clockwise from true north, in [0, 360)."""
     elevation_deg: float
     """Above the horizontal plane of the station."""
     distance_m: float
@@ -37,7 +37,7 @@ class Pointing:
 
 @dataclass(frozen=True, slots=True)
 class AntennaStation:
-    """Where the antenna stands: a place, else a system, else the home of the vehicle."""
+    """Location of the antenna: a fixed position, another system, or the home of the vehicle."""
 
     place: Position | None = None
     system_id: int = 0
@@ -58,7 +58,7 @@ class AntennaStation:
 def station_from(text: str) -> AntennaStation:
     """Read a station: `home`, `system:ID`, or `LATITUDE,LONGITUDE,HEIGHT` above mean sea level.
 
-    Raises ValueError if it is none of them.
+    Raises ValueError for any other text.
     """
     if text == HOME:
         return AntennaStation()
@@ -81,7 +81,7 @@ def pointing_of(
 ) -> Pointing | None:
     """Return the direction to a vehicle.
 
-    None without a valid position of both ends, or where they are too near to each other.
+    None if a position is not valid, or if both are too close to each other.
     """
     there, here = state.valid_position(now_us), station.position(state, states, now_us)
     if there is None or here is None:
@@ -96,7 +96,7 @@ def pointing_of(
         here.lon_deg,
         here.alt_amsl_m + raised_m,
     )
-    # Also where a height is not known: NaN.
+    # Negated, so that NaN (height not known) returns None as well.
     if not distance_m >= LEAST_DISTANCE_M:
         return None
     return Pointing(float(azimuth_deg) % 360.0, float(elevation_deg), float(distance_m))

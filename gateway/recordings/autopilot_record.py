@@ -1,7 +1,8 @@
-"""The record of an autopilot, a DataFlash log or a ULog, as the MAVLink of its vehicle.
+"""Convert an autopilot's own log, DataFlash or ULog, to the MAVLink of its vehicle.
 
-The messages of its table follow its rows; HEARTBEAT, SYS_STATUS, HOME_POSITION and SYSTEM_TIME are
-repeated. Before them are the modes, parameters and missions, as if a station had asked for them.
+Rows of the log produce the messages of the message table; HEARTBEAT, SYS_STATUS, HOME_POSITION and
+SYSTEM_TIME are repeated. Modes, parameters and missions come first, as if a station had requested
+them.
 """
 
 import struct
@@ -29,9 +30,9 @@ UINT32: Final = 0xFFFFFFFF
 BEAT_US: Final = US_PER_S
 TEXT_BYTES: Final = 50
 LASTING: Final = frozenset({"HOME", "home_position"})
-"""Topics whose rows are valid until the next one."""
+"""Topics whose newest row stays valid until the next one."""
 MAX_NAMES: Final = 1 << 14
-"""Parameters, and items of a mission, that are kept."""
+"""Maximum number of parameters, and of items of a mission, that are stored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +40,9 @@ class LogRow:
     """One row of a log, or a change of the vehicle's state."""
 
     time_us: int
-    """Since the begin of the log."""
+    """Time since the start of the log."""
     own_us: int
-    """On the autopilot's clock."""
+    """Time on the autopilot's clock."""
     topic: str
     instance: int
     values: Values
@@ -71,7 +72,7 @@ class Text:
 
 @dataclass(frozen=True, slots=True)
 class LoggedParameter:
-    """A parameter and its value, a float or a whole number of 32 bits."""
+    """A parameter and its value, a float or a 32-bit integer."""
 
     name: str
     value: float | int
@@ -89,76 +90,76 @@ class LoggedItem:
 
 @dataclass(frozen=True, slots=True)
 class Current:
-    """The vehicle began with an item of its mission."""
+    """The current mission item has changed."""
 
     seq: int
 
 
 Event = Armed | Mode | Text | LoggedParameter | LoggedItem | Current
 Entry = LogRow | tuple[int, Event]
-"""A row, or an event and the time since the begin of the log."""
+"""A row, or an event with its time since the start of the log."""
 
 
 @dataclass(slots=True)
 class AutopilotLog:
-    """The record of one autopilot, opened."""
+    """An autopilot's log, opened for reading."""
 
     table: MessageTable
     entries: Iterator[Entry]
-    """In the order of time."""
+    """Rows and events in the order of time."""
     vehicle_id: int
     autopilot: int
-    """MAV_AUTOPILOT."""
+    """A MAV_AUTOPILOT."""
     mav_type: int
     kind: str
     present: frozenset[str]
-    """Topics with rows, by the names of the table."""
+    """Topics with rows, by their names in the message table."""
     counts: Mapping[str, int]
-    """Rows by the log's own topics."""
+    """Number of rows by the log's own topic names."""
     unix_us_at_zero: int | None = None
     units: Mapping[tuple[str, str], str] = field(default_factory=dict)
-    """Of the log itself, by topic and field."""
+    """Units that the log itself states, by topic and field."""
     primary: Mapping[str, int] = field(default_factory=dict)
-    """The instance of a topic that is used where one is needed, if it is not the first."""
+    """Instance to use, by topic, where it is not the first."""
     parameters: Mapping[str, float | int] = field(default_factory=dict)
-    """Those at its begin."""
+    """Values at the start of the log."""
     defaults: Mapping[str, float] = field(default_factory=dict)
-    """Those of the firmware, where the log has them."""
+    """Default values of the firmware, if the log contains them."""
     modes: Mapping[int, str] = field(default_factory=dict)
-    """Names of the custom modes."""
+    """Names of the custom modes by number."""
     plans: Mapping[int, tuple[LoggedItem, ...]] = field(default_factory=dict)
-    """The mission, fence and rally points at its begin, by kind."""
+    """The mission, fence and rally points at the start of the log, by kind."""
     is_armed: bool = False
-    """At its begin."""
+    """Whether it was armed at the start of the log."""
     custom_mode: int = 0
     remarks: list[str] = field(default_factory=list)
-    """Complete once the entries are read."""
+    """Remarks for the user; complete once all entries are read."""
 
     def unit(self, topic: str, name: str) -> str | None:
-        """Return the unit that the log itself states; None without one."""
+        """Return the unit that the log itself states; None if it states none."""
         return self.units.get((topic, name))
 
     @property
     def without_counterpart(self) -> dict[str, int]:
-        """Rows by topic that become no MAVLink."""
+        """Number of rows by topic, of topics that have no counterpart in MAVLink."""
         used = self.table.topics
         return {name: n for name, n in sorted(self.counts.items()) if n and name not in used}
 
     @property
     def lacks(self) -> str:
-        """The same as text for the user; empty if there are none."""
+        """Text for the user that lists these topics; empty if there are none."""
         listed = ", ".join(f"{name} {n}" for name, n in self.without_counterpart.items())
         return listed and f"messages without a counterpart in MAVLink: {listed}"
 
 
 class _Newest:
-    """The newest rows of a log, as a message of its table sees them."""
+    """The newest rows of a log, and the instance to read them from."""
 
     def __init__(self, log: AutopilotLog) -> None:
         self.kind = log.kind
         self.now_us = 0
         self.instance: int | None = None
-        """Of the message; None for that of the primary sensors."""
+        """Instance to read; None for the primary one of each topic."""
         self.parameters = dict(log.parameters)
         self._log = log
         self._rows: dict[tuple[str, int], LogRow] = {}
@@ -177,7 +178,7 @@ class _Newest:
         return topic in self._seen
 
     def primary(self, topic: str) -> int:
-        """Return the instance of a topic that is used."""
+        """Return the primary instance of a topic."""
         where = self._log.table.lanes.get(topic)
         if where is not None:
             name, _, column = where.partition(".")
@@ -239,7 +240,7 @@ class RecordTranslator:
         self._texts = 0
 
     def frames(self) -> Iterator[TlogRecord]:
-        """Yield the frames at civil times, or without one at times since the begin."""
+        """Yield the frames at civil times, or at times since the start of the log."""
         stamper = Stamper(self._log.unix_us_at_zero or 0)
         entries = self._log.entries
         first = next(entries, None)
@@ -268,7 +269,7 @@ class RecordTranslator:
         self._newest.instance = None
 
     def _bound_for(self, row: MessageRow, entry: LogRow) -> BoundMessage | None:
-        """Return the message for a row; None if another instance is the one that counts."""
+        """Return the message for a row; None if the row is not of the primary instance."""
         if row.each is None:
             if entry.instance != self._newest.primary(entry.topic):
                 return None
@@ -288,7 +289,7 @@ class RecordTranslator:
         return {"time_boot_ms": self._own_us // 1000, "time_usec": self._own_us}
 
     def _repeat(self, time_us: int) -> Iterator[Any]:
-        """Yield the messages that are due at intervals; none for a gap in the log."""
+        """Yield the messages that are due at intervals; a gap in the log is not filled."""
         if self._beat_us is None or time_us >= self._beat_us:
             yield self._heartbeat()
             yield self._system_time(time_us)
@@ -326,7 +327,7 @@ class RecordTranslator:
                 yield mavlink.MAVLink_mission_current_message(event.seq, total)
 
     def _change(self, event: LoggedParameter) -> Iterator[Any]:
-        """Yield a parameter that has another value than before."""
+        """Yield a parameter if its value has changed."""
         if self._newest.parameters.get(event.name) == event.value:
             return
         self._newest.parameters[event.name] = event.value
@@ -363,7 +364,7 @@ class RecordTranslator:
             yield from self._whole_plan(kind)
 
     def _parameter(self, name: str, value: float) -> Any:
-        """Encode a parameter; a whole number by its bytes, as PX4 does."""
+        """Encode a parameter; an integer as its bytes, as PX4 does."""
         kind = mavlink.MAV_PARAM_TYPE_REAL32
         if isinstance(value, int):
             kind = mavlink.MAV_PARAM_TYPE_INT32
@@ -373,20 +374,20 @@ class RecordTranslator:
         )
 
     def _text(self, event: Text) -> Iterator[Any]:
-        """Encode a text, in pieces if it is long."""
+        """Encode a text, in chunks if it is long."""
         data = event.text.encode()
         pieces = [data[at : at + TEXT_BYTES] for at in range(0, len(data), TEXT_BYTES)]
         if len(pieces) <= 1:
             yield mavlink.MAVLink_statustext_message(event.severity, data)
             return
         self._texts = self._texts % 0xFFFF + 1
-        # A text whose last piece is full is ended by an empty one.
+        # If the last chunk is full, an empty one marks the end of the text.
         ended = [*pieces, b""] if len(pieces[-1]) == TEXT_BYTES else pieces
         for number, piece in enumerate(ended):
             yield mavlink.MAVLink_statustext_message(event.severity, piece, self._texts, number)
 
     def _item(self, event: LoggedItem) -> Iterator[Any]:
-        """Take in an item of a new plan, or of the one that is there; yield a complete one."""
+        """Add an item to a new or existing plan; yield the plan once it is complete."""
         known = self._plans.setdefault(event.kind, {})
         if known.get(event.seq) == event:
             return

@@ -1,13 +1,13 @@
-"""A live vehicle of another system, as far as it has answered before.
+"""A live vehicle of another system, answered for from the answers that it has given before.
 
-| asked                              | answered here                              | else       |
+| request                            | answered here                              | otherwise  |
 | ---------------------------------- | ------------------------------------------ | ---------- |
 | PARAM_REQUEST_LIST                 | if all but a few parameters are known      | passed on  |
-| PARAM_REQUEST_READ                 | if it is known; the checksum never         | passed on  |
+| PARAM_REQUEST_READ                 | if it is known; never the checksum         | passed on  |
 | MISSION_REQUEST_LIST and its items | if the whole mission is known              | passed on  |
 | REQUEST_MESSAGE                    | version and metadata                       | passed on  |
-| files                              | those that were read before                | passed on  |
-| anything that changes something    |                                            | passed on  |
+| files                              | if they were read before                   | passed on  |
+| anything that changes something    | never                                      | passed on  |
 """
 
 from typing import Final
@@ -27,20 +27,20 @@ from gateway.vehicle.services.ftp import FtpService, Opcode, decode_packet, full
 from gateway.vehicle.services.parameter_service import BY_NAME
 
 MOST_MISSING: Final = 16
-"""Parameters of a list that may be missing: a station requests them one by one."""
+"""Most parameters that may be missing from a list; stations request these one by one."""
 MAX_DOWNLOADS: Final = 64
 IN_SESSION: Final = (Opcode.TERMINATE_SESSION, Opcode.READ_FILE, Opcode.BURST_READ_FILE)
 
 
 class _Files(FtpService):
-    """Files whose content depends on the query too."""
+    """Files whose content also depends on the query."""
 
     def __init__(self, answers: LiveAnswers) -> None:
         super().__init__({})
         self._answers = answers
 
     def holds(self, request: Request) -> bool:
-        """Return whether a request is for a file that is held; else its client opens another."""
+        """Return whether a file request can be answered here; if not, end the client's session."""
         packet = decode_packet(bytes(request.message.payload))
         if packet.opcode in IN_SESSION:
             return self.has_session(request, packet)
@@ -61,16 +61,16 @@ class CachedVehicle(RecordedVehicle):
         self._files = _Files(answers)
         super().__init__(system_id, answers, files=self._files)
         self._downloads: dict[tuple[int, int, int, int], bool] = {}
-        """Missions that are being sent: client, system, component and kind."""
+        """Mission downloads in progress: client, system, component and kind."""
         self.other_lists = False
         """Whether other components of the system have parameters too."""
 
     def read(self, incoming: Incoming, now_us: int) -> Request | None:
-        """Read a request; None if it is none for this vehicle."""
+        """Read a request; None if it is not for this vehicle."""
         return self._reader.read(incoming, now_us)
 
     def answer(self, request: Request, now_us: int) -> list[Outgoing] | None:
-        """Answer a request; None if only the vehicle can."""
+        """Answer a request; None if only the vehicle can answer it."""
         kind = request.message.get_type()
         service = self._by_message.get(kind)
         if service is None or not self._holds(request):
@@ -107,7 +107,7 @@ class CachedVehicle(RecordedVehicle):
 
     def _holds_mission(self, request: Request) -> bool:
         if self._held.mission(request.message.mission_type) is None:
-            # A download that was begun here goes on with the vehicle, its confirmation too.
+            # The vehicle continues the download that was begun here, and receives its confirmation.
             self._downloads.pop(_download(request), None)
             return False
         if request.message.get_type() == "MISSION_REQUEST_LIST":

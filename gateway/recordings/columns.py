@@ -1,13 +1,13 @@
-"""Rows of a flight as columns: the one definition of what a recording holds, and its text form.
+"""Rows of a flight as columns: the definition of a recording's content and of its text form.
 
-A row is an IMU sample, the barometer and GPS records that came before it, and the state it led to.
-Its records were processed in the order barometer, GPS, IMU. Where they arrived in another order, or
-two of a kind between two IMU samples, there are rows without an IMU sample in between, so that the
-file keeps every record in order.
+A row is an IMU sample, the barometer and GPS records that arrived before it, and the resulting
+state. Records of a row were processed in the order barometer, GPS, IMU. Where they arrived in
+another order, or two of a kind arrived between two IMU samples, rows without an IMU sample are
+inserted, so that the file keeps the order of all records.
 
-A stretch of a table is one array of floats, one row per row and one column for each of `COLUMNS`;
-NaN is an empty cell. Whole numbers up to `LARGEST_WHOLE` are exact in it. The digits are those of
-Python's own `float` and `repr`.
+A block of a table is one array of floats, one row per row and one column for each of `COLUMNS`;
+NaN is an empty cell. Integers up to `LARGEST_WHOLE` are exact. The digits are those of Python's
+own `float` and `repr`.
 """
 
 import math
@@ -36,7 +36,7 @@ from gateway.units import counted
 
 Cell = int | float | None
 
-# They are the same for many rows.
+# Cached: most rows have the same node.
 _node: Final = lru_cache(64)(NodeId)
 _imu_flags: Final = lru_cache(256)(ImuFlags)
 _nav_flags: Final = lru_cache(256)(NavFlags)
@@ -44,8 +44,8 @@ _nav_flags: Final = lru_cache(256)(NavFlags)
 XYZ, NED = ("x", "y", "z"), ("north", "east", "down")
 NO_VECTOR: Final = (None, None, None)
 
-# By kind: whether its cells are whole numbers, whether it may be empty, how a record `r` is written
-# and how it is read from the cells `c`.
+# By kind: whether its cells are integers, whether it may be empty, the expression that writes a
+# record `r`, and the expression that reads it from the cells `c`.
 _KINDS: Final = {
     "whole": (True, False, "r.{a}", "int({c})"),
     "maybe": (True, True, "r.{a}", "None if isnan({c}) else int({c})"),
@@ -61,34 +61,34 @@ _KINDS: Final = {
 
 Read = TypeVar("Read")
 HEAD_COLUMNS: Final = ("time_us", "node_id", "node_time_us", "imu_flags")
-"""Shared by the counts and the calibrated values of a sample."""
+"""Columns that the raw counts and the calibrated values of a sample share."""
 UNITS: Final = {
     "_mps2": "m/s^2", "_mps": "m/s", "_radps": "rad/s", "_rad": "rad", "_ut": "uT",
     "_degc": "degC", "_deg": "deg", "_dege7": "1e-7 deg", "_us": "us", "_ms": "ms", "_pa": "Pa",
     "_m": "m", "_raw": "counts", "_range_g": "g", "_dps": "deg/s", "_per_gauss": "counts/gauss",
 }  # fmt: skip
-"""Unit of a column, by the ending of its name."""
+"""Unit of a column, by the suffix of its name."""
 LARGEST_WHOLE: Final = 1 << 53
-"""Up to here every whole number is a float. As a time in us it is three centuries; a greater one is
-invalid, and other programs round such a number."""
+"""Largest integer up to which all are exact as floats: three centuries in µs. Greater values are
+invalid, and other programs would round them."""
 Imported = ImuCalibrated | BaroRaw | GpsFix | NavState
-"""Records of another program's log."""
+"""Records that can be read from another program's log."""
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 _HEAD: Final = slice(1, len(HEAD_COLUMNS))
 _OF_NUMBERS: Final = b"0123456789.,-+eE\n"
 _COMMA, _NEWLINE = b",\n"
 _LEAST_FIXED: Final = 1e-4
-"""Smaller ones, and those from the next on, Python writes with an exponent, which JSON's writer
-does from other sizes on and in another form."""
+"""Python writes smaller numbers, and those from the next constant on, with an exponent; JSON's
+writer uses other limits and another form."""
 _LEAST_LARGE: Final = 1e16
 
 
 class Codec(Generic[Read]):
-    """The columns of one kind of record, and the functions that write and read them.
+    """The columns of one type of record, and the functions that write and read them.
 
-    Each field is a kind of `_KINDS`, the attribute, and the column or columns (a pattern and its
-    parts) if they are not named like the attribute.
+    Each field is given as a kind of `_KINDS`, the attribute, and the columns (a pattern and
+    its parts) if their names differ from the attribute's.
     """
 
     def __init__(self, record: type[Read], prefix: str, *fields: tuple[Any, ...]) -> None:
@@ -97,7 +97,7 @@ class Codec(Generic[Read]):
         self.truths: tuple[str, ...] = ()
         self.needed: tuple[str, ...] = ()
         self.patterns: list[str] = []
-        """The columns of each field at once, such as `accel_{x,y,z}_raw`."""
+        """The columns of each field as one pattern, such as `accel_{x,y,z}_raw`."""
         written, read = [], []
         for kind, attribute, *named in fields:
             is_whole, may_be_empty, write, get = _KINDS[kind]
@@ -115,7 +115,7 @@ class Codec(Generic[Read]):
             self.patterns.append(prefix + pattern.replace("{}", f"{{{','.join(parts)}}}"))
         self.empty = (None,) * len(self.columns)
         scope = globals() | {"isnan": math.isnan, "record": record}
-        # As dataclasses makes its methods: a loop over the fields would take three times as long.
+        # Generated code, as in dataclasses: a loop over the fields would take three times as long.
         self.write: Callable[[Read], tuple[Cell, ...]] = eval(
             f"lambda r: ({', '.join(written)},)", scope
         )
@@ -123,7 +123,7 @@ class Codec(Generic[Read]):
         self.read: Callable[..., Read] = eval(
             f"lambda c, vehicle_id=0, **known: record({', '.join(read)}, **known)", scope
         )
-        """Make a record of its cells; the first is not NaN."""
+        """Make a record from its cells; the first must not be NaN."""
 
 
 RAW_CODEC: Final = Codec(
@@ -199,18 +199,18 @@ COLUMNS: Final[tuple[str, ...]] = (
 )
 NAV_COLUMNS: Final = NAV_CODEC.columns
 WHOLE_COLUMNS: Final = frozenset((*HEAD_COLUMNS, *(n for group in _GROUPS for n in group.whole)))
-"""Those that hold whole numbers."""
+"""Columns of integers."""
 TRUTHS: Final = frozenset(name for group in _GROUPS for name in group.truths)
-"""Those of them that are 1 or 0: true or false."""
+"""Integer columns that are 1 or 0: true or false."""
 
 
 def unit_of(name: str) -> str:
-    """Return the unit of a column; empty for a number without one."""
+    """Return the unit of a column; empty for a dimensionless number."""
     return next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
 
 
 def span_of(*names: str) -> slice:
-    """Return where columns that follow each other are in a row."""
+    """Return the slice of adjacent columns in a row."""
     first = COLUMNS.index(names[0])
     return slice(first, first + len(names))
 
@@ -224,7 +224,7 @@ class TableRow:
     """One row; absent values are None."""
 
     time_us: int
-    """Of the IMU sample, or of the newest record where there is none."""
+    """Time of the IMU sample, or of the newest record if there is no sample."""
     baro: BaroRaw | None = None
     gps: GpsFix | None = None
     raw: ImuRaw | None = None
@@ -233,13 +233,13 @@ class TableRow:
 
 
 def row_to_line(row: TableRow) -> str:
-    """Write a row as a line: floats with all their digits, NaN and absent as an empty cell."""
-    # A cell that differs from itself is NaN.
+    """Write a row as a line: floats with all their digits, NaN and absent values as empty cells."""
+    # Only NaN differs from itself.
     return ",".join(["" if c is None or c != c else repr(c) for c in cells_of(row)]) + "\n"
 
 
 def cells_of(row: TableRow) -> tuple[Cell, ...]:
-    """Return a row's values in the order of `COLUMNS`; absent ones are None."""
+    """Return a row's values in the order of `COLUMNS`; None for absent ones."""
     imu = row.raw or row.imu
     node_time_us = row.raw.node_time_us if row.raw else None
     return (
@@ -254,7 +254,7 @@ def cells_of(row: TableRow) -> tuple[Cell, ...]:
 
 
 def row_of_cells(cells: Sequence[float], vehicle_id: int) -> TableRow:
-    """Make a row of the numbers of its cells, in the order of `COLUMNS`."""
+    """Make a row from the numbers of its cells, in the order of `COLUMNS`."""
     time_us = int(cells[0])
     has_raw, has_si, has_baro, has_gps, has_nav = (
         not math.isnan(cells[group.start]) for group in (RAW, SI, BARO, GPS, NAV)
@@ -286,7 +286,7 @@ class RowBuilder:
     ) -> list[TableRow]:
         """Process the next record and return the rows that it completes.
 
-        A state without a sample, such as an autopilot's, goes with the next sample.
+        A state without a sample, such as an autopilot's, is stored with the next sample.
         """
         match record:
             case BaroRaw():
@@ -326,7 +326,7 @@ class RowBuilder:
 
 
 def _calibrated(fused: FusedSample) -> ImuCalibrated:
-    """Return the part of a sample that the table keeps."""
+    """Return the calibrated values of a sample."""
     sample = fused.sample
     return ImuCalibrated(
         sample.time_us,
@@ -350,11 +350,11 @@ _NEEDED: Final = [
         for group in (RAW_CODEC, BARO_CODEC, GPS_CODEC, NAV_CODEC)
     ),
 ]
-"""A group's first column, and those without which it is invalid; each row needs its time."""
+"""First column of a group, and the columns that it requires; every row requires its time."""
 TIMES: Final = [
     k for k, name in enumerate(COLUMNS) if name.endswith("time_us") and "node" not in name
 ]
-"""Times on the gateway's clock."""
+"""Columns with times on the gateway's clock, by index."""
 NODE_ID, NODE_TIME, FLAGS = (_AT[n] for n in ("node_id", "node_time_us", "imu_flags"))
 FIX_TYPE, FIX_OK = _AT["gps_fix_type"], _AT["gps_fix_ok"]
 FIX_LAT, FIX_LON, FIX_ALT = (_AT[f"gps_{n}"] for n in ("lat_dege7", "lon_dege7", "alt_amsl_m"))
@@ -362,25 +362,25 @@ NAV_LAT, NAV_LON, NAV_FLAGS = _AT["nav_lat_deg"], _AT["nav_lon_deg"], _AT["nav_f
 
 
 def has_group(cells: FloatArray, group: slice) -> BoolArray:
-    """Return which rows hold a group of columns, such as `RAW`."""
+    """Return which rows contain a group of columns, such as `RAW`."""
     return ~np.isnan(cells[:, group.start])
 
 
 def has_position(cells: FloatArray) -> BoolArray:
-    """Return which rows hold a state with a valid position."""
+    """Return which rows contain a state with a valid position."""
     flags = np.nan_to_num(cells[:, NAV_FLAGS]).astype(np.int64)
     return np.asarray((flags & int(NavFlags.POSITION_VALID)) != 0)
 
 
 def has_fix(cells: FloatArray) -> BoolArray:
-    """Return which rows hold a GPS fix; latitude 0, longitude 0 is sent before the first one."""
+    """Return which rows contain a GPS fix; receivers send 0, 0 before the first one."""
     is_somewhere = (cells[:, FIX_LAT] != 0.0) | (cells[:, FIX_LON] != 0.0)
     return np.asarray((cells[:, FIX_OK] == 1.0) & is_somewhere)
 
 
 def read_lines(text: bytes, width: int) -> FloatArray | None:
-    """Read lines of `width` numbers each; None if one is not: `read_cells` finds which."""
-    # JSON's whole zero has no sign, a float's has one.
+    """Read lines of `width` numbers each; None if any is malformed: `read_cells` finds it."""
+    # JSON's integer zero has no sign, a float's has one.
     if text.translate(None, _OF_NUMBERS) or b"-0," in text or b"-0\n" in text:
         return None
     data = np.frombuffer(text, np.uint8)
@@ -404,7 +404,7 @@ def read_lines(text: bytes, width: int) -> FloatArray | None:
 
 
 def read_cells(line: bytes, width: int, indices: Sequence[int] | None) -> list[float]:
-    """Read one line as Python reads numbers."""
+    """Read one line, with Python's own parser of numbers."""
     texts = line.decode().split(",")
     if len(texts) != width:
         raise ValueError(f"{counted(len(texts), 'cell')} where there should be {width}")
@@ -414,7 +414,7 @@ def read_cells(line: bytes, width: int, indices: Sequence[int] | None) -> list[f
 
 
 def normalise(cells: FloatArray) -> dict[int, str]:
-    """Clear cells of absent groups in place; return why rows are invalid, by their numbers."""
+    """Clear cells of absent groups in place; return the invalid rows by number, with the reason."""
     for group in (RAW, SI, MAG, BARO, GPS, NAV):
         cells[np.isnan(cells[:, group.start]), group] = np.nan
     has_raw, has_si = has_group(cells, RAW), has_group(cells, SI)
@@ -428,12 +428,12 @@ def normalise(cells: FloatArray) -> dict[int, str]:
 
 
 def _faults(cells: FloatArray) -> dict[int, str]:
-    """Return why rows are invalid, by their numbers."""
+    """Return the invalid rows by number, with the reason."""
     found: dict[int, str] = {}
     whole, is_empty = cells[:, _WHOLE], np.isnan(cells)
     is_sound = is_empty[:, _WHOLE] | ((np.abs(whole) <= LARGEST_WHOLE) & (whole == np.trunc(whole)))
     for row, k in np.argwhere(~is_sound).tolist():
-        text = f"{COLUMNS[_WHOLE[k]]}: {whole[row, k]:.17g} is not a whole number that can be"
+        text = f"{COLUMNS[_WHOLE[k]]}: {whole[row, k]:.17g} is not a valid integer"
         found.setdefault(row, text)
     for first, needed in _NEEDED:
         is_there = ~is_empty[:, [first]] if first else True
@@ -455,12 +455,12 @@ def write_lines(cells: FloatArray, is_whole: BoolArray = IS_WHOLE) -> bytes:
 
 
 def _texts(column: FloatArray, is_whole: bool) -> list[object]:
-    """Return the values whose digits JSON's writer gives for a column."""
+    """Return the values of a column in a type that JSON's writer gives the right digits."""
     empty = np.isnan(column)
     if empty.all():
         return [None] * len(column)
     if not is_whole:
-        # NaN becomes null as None does.
+        # The writer makes null of NaN as of None.
         values: list[object] = column.tolist()
         size = np.abs(column)
         odd = ((size < _LEAST_FIXED) & (size > 0.0)) | (size >= _LEAST_LARGE)

@@ -1,4 +1,4 @@
-"""Two recordings or parameter files, compared: parameters, missions, figures, texts."""
+"""Compare two recordings or parameter files: parameters, missions, figures, texts."""
 
 import html
 from collections.abc import Iterable, Iterator, Mapping
@@ -22,11 +22,11 @@ from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import SEQUENCE_V1, SEQUENCE_V2, START_V2
 
 MAX_PARAM_FILE: Final = 4 << 20
-"""Bytes; a vehicle has some 1,500 parameters of 30 bytes."""
+"""Maximum size, bytes; a vehicle has about 1,500 parameters of 30 bytes each."""
 MAX_TEXTS: Final = 10_000
-"""Different texts of a recording that are compared."""
+"""Maximum number of different texts of a recording that are compared."""
 ERROR: Final = 3
-"""MAV_SEVERITY of an error; smaller ones are worse."""
+"""MAV_SEVERITY of an error; smaller values are more severe."""
 VIBRATION: Final = ("vibration_x", "vibration_y", "vibration_z")
 _IDS: Final = {name: MESSAGE_IDS[name] for name in ("BATTERY_STATUS", "VIBRATION", "GPS_RAW_INT")}
 UNKNOWN_U8: Final = 0xFF
@@ -37,38 +37,38 @@ SECTIONS: Final = {"parameters": "parameter", "plans": "item", "figures": "figur
 
 @dataclass(slots=True)
 class Contents:
-    """What is compared of one side; a parameter file has parameters only."""
+    """The compared content of one side; a parameter file has parameters only."""
 
     name: str
     parameters: dict[str, str] = field(default_factory=dict)
     plans: dict[str, list[str]] = field(default_factory=dict)
-    """Items by kind, as text."""
+    """Items as text, by kind of plan."""
     figures: dict[str, str] = field(default_factory=dict)
     texts: set[str] = field(default_factory=set)
     is_flight: bool = False
     defaults: dict[str, str] = field(default_factory=dict)
-    """Of parameters, where they are known."""
+    """Default values of parameters, where they are known."""
     meanings: dict[str, str] = field(default_factory=dict)
 
     def add_known(self, facts: Mapping[str, tuple[float, str]]) -> None:
-        """Take in the default and the meaning of parameters."""
+        """Add the default and the meaning of parameters."""
         self.defaults |= {name: parameter_text(value) for name, (value, _) in facts.items()}
         self.meanings |= {name: meaning for name, (_, meaning) in facts.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """The differences: by name, the value on each side; empty where there is none."""
+    """The differences: the value on each side by name; empty if that side has none."""
 
     names: tuple[str, str]
     parameters: dict[str, tuple[str, str]]
     plans: dict[str, tuple[str, str]]
     figures: dict[str, tuple[str, str]]
-    """All of them, also equal ones."""
+    """All figures, including equal ones."""
     texts: dict[str, tuple[str, str]]
     """Texts that only one side has."""
     known: dict[str, tuple[str, str]]
-    """Default and meaning of the parameters that differ, where one of them is known."""
+    """Default and meaning of the differing parameters, where either is known."""
 
 
 def compare(first: Contents, second: Contents) -> Comparison:
@@ -111,7 +111,7 @@ def _differences(first: Mapping[str, str], second: Mapping[str, str]) -> dict[st
 def read_param_file(path: Path) -> Contents:
     """Read a parameter file of Mission Planner, MAVProxy or QGroundControl.
 
-    Raises FlightError if it holds none, OSError if it cannot be read.
+    Raises FlightError if it has no parameters, OSError if it cannot be read.
     """
     with path.open("rb") as file:
         lines = file.read(MAX_PARAM_FILE).decode("utf-8", "replace").splitlines()
@@ -125,7 +125,7 @@ def read_param_file(path: Path) -> Contents:
             continue
         found.parameters[name] = parameter_text(value)
     if not found.parameters:
-        raise FlightError(f"{path}: holds no parameters")
+        raise FlightError(f"{path}: contains no parameters")
     return found
 
 
@@ -137,14 +137,14 @@ class FlownFigures:
         self.errors = 0
         self.distance = GroundDistance()
         self.used_mah: dict[int, tuple[int, int]] = {}
-        """First and last charge used, by battery."""
+        """Charge used by battery: the first and the last value."""
         self.greatest_vibration_mps2 = 0.0
         self.fewest_satellites: int | None = None
         self.lost = self.received = 0
         self._sequence: int | None = None
 
     def add_batch(self, batch: Batch, origin: int) -> None:
-        """Count the frames of the vehicle that are missing between others."""
+        """Count the vehicle's lost frames by gaps in their sequence numbers."""
         data, rows = np.frombuffer(batch.data, np.uint8), batch.origins == origin
         starts = batch.starts[rows] + TIME_SIZE
         at = np.where(data[starts] == START_V2, SEQUENCE_V2, SEQUENCE_V1)
@@ -153,7 +153,7 @@ class FlownFigures:
             return
         before = int(numbers[0]) - 1 if self._sequence is None else self._sequence
         gaps = (np.diff(numbers, prepend=before) - 1) & 0xFF
-        # A large step is a restart, or a frame that came twice.
+        # A large step is a restart, or a frame that was received twice.
         self.lost += int(gaps[gaps < 128].sum())
         self.received += len(numbers)
         self._sequence = int(numbers[-1])
@@ -181,7 +181,7 @@ class FlownFigures:
                 self.fewest_satellites = count if known is None else min(known, count)
 
     def figures(self, duration_s: float) -> dict[str, str]:
-        """Return the figures as text, those that are known."""
+        """Return the known figures as text."""
         found = {"duration": f"{duration_s:.1f} s"}
         if self.distance.distance_m is not None:
             found["distance"] = f"{self.distance.distance_m:.0f} m"
@@ -199,7 +199,7 @@ class FlownFigures:
 
 
 def read_recording(name: str, recording: VehicleRecording) -> Contents:
-    """Read the compared parts of a recording; raises FlightError if it has no vehicle."""
+    """Read the compared content of a recording; raises FlightError if it has no vehicle."""
     facts, reader = FlownFigures(), recording.reader(_IDS.values())
     last_us = 0
     for batch in recording.batches():
@@ -219,7 +219,7 @@ def read_recording(name: str, recording: VehicleRecording) -> Contents:
 
 
 def contents_of(name: str, plan: RecordedPlan) -> Contents:
-    """Return what is compared of the answers of a vehicle."""
+    """Return the compared content of a vehicle's answers."""
     return Contents(
         name,
         {each.name: each.text for each in plan.parameters()},
@@ -255,7 +255,7 @@ def rows_of(found: Comparison, section: str) -> tuple[tuple[str, ...], list[tupl
 
 
 def as_html(found: Comparison) -> Iterator[str]:
-    """Write a comparison as one page that needs nothing else."""
+    """Write a comparison as one self-contained page."""
     title = html.escape(" and ".join(found.names))
     yield f'<!doctype html><meta charset="utf-8"><title>{title}</title>'
     yield "<style>body{font-family:sans-serif}td,th{text-align:left;padding:2px 12px}</style>"

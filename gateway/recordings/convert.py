@@ -1,4 +1,4 @@
-"""Flights written as files: one writer per format, by the ending of the file's name."""
+"""Write flights as files: one writer per format, chosen by the suffix of the file's name."""
 
 import heapq
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -50,16 +50,16 @@ from gateway.recordings.tlog_editing import TlogEditor, TlogEdits, first_positio
 from gateway.recordings.trimming import Limits, trimmed
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 
-NOT_FUSED: Final = "raw samples, settings and the states' digits"
-NOT_IN_TABLE: Final = "all but samples, fixes and states of one vehicle"
+NOT_FUSED: Final = "raw samples, settings and the exact digits of states"
+NOT_IN_TABLE: Final = "all except samples, fixes and states of one vehicle"
 NOT_DRAWN: Final = (
     "samples, velocities and settings",
-    "all MAVLink messages but positions, attitude and texts",
+    "all MAVLink messages except positions, attitude and texts",
 )
 
 
 class FlightToWrite:
-    """Recordings that become one file: as MAVLink or as rows, whichever its format needs.
+    """Recordings that are written as one file: as MAVLink or as rows, depending on the format.
 
     Raises OSError if a file cannot be read.
     """
@@ -88,31 +88,31 @@ class FlightToWrite:
         kinds = {format_of(file) for file in files}
         if len(kinds) > 1:
             each = ", ".join(f"{file}: {format_of(file)}" for file in files)
-            raise FlightError(f"the files differ in kind; give those of one kind ({each})")
+            raise FlightError(f"the files differ in format; give files of one format ({each})")
         self.is_mavlink = kinds == {TLOG}
-        """Whether the frames are the recorded ones, and the rows are derived from them."""
+        """Whether the files contain MAVLink; the rows are then derived from it."""
         self._estimates = estimates_of(files, fuse=fuse, both=both)
         self.has_messages = self.is_mavlink or self._estimates != "fused"
-        """Whether they hold the messages of vehicles, as MAVLink or an autopilot's own record."""
+        """Whether the files contain messages of vehicles, in MAVLink or an autopilot's log."""
         self._as_recorded = not fuse and all(is_table(file) for file in files)
         self.fusions: list[RecordedFusion] = []
-        """Those that were made to write it."""
+        """The fusions made to write the file."""
         self._tables: list[RecordedTable] = []
         self._logs: list[AutopilotLog] = []
         self._remarks: list[str] = []
         self.senders = Senders()
-        """Those of MAVLink, once its frames are requested."""
+        """Senders of the MAVLink; known once its frames are requested."""
         self.anonymiser: Anonymiser | None = None
-        """Counts the fields that were changed, once a tlog is written."""
+        """Counts the changed fields; set once a tlog is written."""
         if kinds == {TABLE} and options.system_id is not None:
             self.files = self._files_of(options.system_id)
 
     def frames(self) -> Iterator[TlogRecord]:
-        """Yield the MAVLink that is kept: as recorded, or as the gateway would send it."""
+        """Yield the selected MAVLink: as recorded, or as the gateway would send it."""
         return (record for batch in self.chosen() for record in batch.records())
 
     def tlog(self) -> Iterator[bytes]:
-        """Yield the MAVLink as a tlog, with the edits."""
+        """Yield the selected MAVLink as a tlog, with the edits applied."""
         sources, edits = self._sources, self._edits
         if edits.anonymity is not None:
             self.anonymiser = Anonymiser(edits.anonymity, first_position(sources))
@@ -121,7 +121,7 @@ class FlightToWrite:
         yield from editor.apply(self._batches(editor, sources), self.senders)
 
     def chosen(self) -> Iterator[Batch]:
-        """Yield the MAVLink that is kept, of all messages, not edited."""
+        """Yield the selected MAVLink, of all messages, not edited."""
         choice = replace(self._edits.choice, messages=frozenset())
         editor = TlogEditor(replace(self._edits, choice=choice), self._limits, self.remark)
         return editor.chosen(self._batches(editor, self._sources), self.senders)
@@ -133,19 +133,19 @@ class FlightToWrite:
 
     @cached_property
     def _sources(self) -> list[TlogSource]:
-        """The files that are MAVLink, opened once; their senders are known then."""
+        """The files opened as MAVLink, once; this also finds their senders."""
         if not self.is_mavlink:
             return []
         sources = [open_tlog(file) for file in self.files]
         for source in sources:
-            # A part that was begun when the power failed may be empty.
+            # A part that had just been created when the power failed may be empty.
             if not source.senders.origins and ".tlog" not in source.path.suffixes:
                 raise FlightError(f"{source.path}: {NO_RECORDING}")
             self.senders.merge(source.senders)
             self._remarks += [f"{source.path}: {text}" for text in source.remarks]
         if not self.senders.origins:
             raise FlightError(f"{', '.join(map(str, self.files))}: {NO_RECORDING}")
-        # A tlog may also be made of a ground station's frames.
+        # A tlog may also contain only the frames of a ground station.
         if self.options.system_id not in {origin >> 8 for origin in self.senders.origins}:
             check_vehicle(self.files, self.options.system_id, self.senders.systems())
         return sources
@@ -153,7 +153,7 @@ class FlightToWrite:
     def vehicle_messages(
         self, wanted: Iterable[int] = (), system_id: int | None = None
     ) -> Iterator[VehicleMessage]:
-        """Yield the positions, attitudes and texts of the vehicles, and other messages by id."""
+        """Yield the vehicles' positions, attitudes and texts, and other messages given by id."""
         batches, reader = self.chosen(), VehicleReader(self.senders, wanted, system_id)
         for batch in batches:
             yield from reader.feed_batch(batch)
@@ -193,18 +193,18 @@ class FlightToWrite:
 
     @property
     def remarks(self) -> list[str]:
-        """Remarks for the user, complete once all is written."""
+        """Remarks for the user; complete once all is written."""
         read: list[AutopilotLog | RecordedTable] = [*self._logs, *self._tables]
         found = [*read, *self.fusions]
         return [*self._remarks, *(remark for source in found for remark in source.remarks)]
 
     @property
     def defaults(self) -> dict[str, float]:
-        """Default values of parameters that the logs of autopilots state, by name."""
+        """Default values of parameters, stated by the logs of autopilots, by name."""
         return {name: value for log in self._logs for name, value in log.defaults.items()}
 
     def lacks(self, ending: str) -> str:
-        """Return the content that a format cannot hold, once all is written; empty for none."""
+        """Describe the content that a format cannot hold, once all is written; empty if none."""
         if self._logs and ending == ".tlog":
             return "; ".join(filter(None, (log.lacks for log in self._logs)))
         lacks = LACKS[ending]
@@ -215,15 +215,15 @@ class FlightToWrite:
         self._remarks.append(text)
 
     def fused(self) -> RecordedFusion:
-        """Return these files fused again."""
+        """Fuse these files again."""
         fusion = self._fusion_of(self.files, self.options)
         self.fusions.append(fusion)
         return fusion
 
     def _sent(self) -> Iterator[TlogRecord]:
-        """Yield the frames that the gateway would send for all aircraft, stamped as in one file.
+        """Yield the frames that the gateway would send for all aircraft, in order of time.
 
-        Of logs of autopilots, those of their records, or both.
+        For logs of autopilots these are the frames of their own estimates, or both.
         """
         streams: list[Iterator[TlogRecord]] = []
         if self._estimates != "fused":
@@ -244,19 +244,19 @@ class FlightToWrite:
 Write = Callable[[FlightToWrite], Iterable[bytes]]
 
 WRITERS: Final[dict[str, Write]] = {}
-"""By the ending of the file's name."""
+"""Writers by file suffix."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lacks:
-    """The content that a format cannot hold, as text."""
+    """Text on the content that a format cannot hold."""
 
     of_tables: str = ""
     of_tlogs: str = ""
 
 
 LACKS: Final[dict[str, Lacks]] = {}
-"""By the ending of the file's name."""
+"""Content that a format cannot hold, by file suffix."""
 
 
 def add_writer(ending: str, write: Write, lacks: Lacks = Lacks()) -> None:
@@ -280,7 +280,7 @@ def _write_table(flight: FlightToWrite) -> Iterator[bytes]:
 
 
 def _drawn(draw: Callable[[str, list[VehicleTrack]], Iterator[str]]) -> Write:
-    """Return a writer of tracks for a map."""
+    """Return a writer of map tracks."""
     return lambda flight: (piece.encode() for piece in draw(flight.title, _vehicles(flight)))
 
 
@@ -301,7 +301,7 @@ def _vehicles(flight: FlightToWrite) -> list[VehicleTrack]:
 
 
 def _packaged(module: str, name: str) -> Write:
-    """Return a writer whose packages are imported at its first use."""
+    """Return a writer whose dependencies are imported at its first use."""
 
     def write(flight: FlightToWrite) -> Iterable[bytes]:
         pieces: Iterable[bytes] = import_format(module, name).write(flight)
@@ -320,7 +320,7 @@ add_writer(".parquet", _packaged("parquet", "Parquet"), Lacks(of_tlogs=NOT_IN_TA
 
 
 class Pieces:
-    """A file in memory, without seek; the bytes written so far can be taken out."""
+    """A file in memory, without seek, from which the bytes written so far can be taken."""
 
     def __init__(self) -> None:
         self.closed = False
@@ -334,11 +334,11 @@ class Pieces:
         return len(data)
 
     def tell(self) -> int:
-        """Return how much was written in all."""
+        """Return the number of bytes written in total."""
         return self._size
 
     def flush(self) -> None:
-        """Do nothing: nothing is buffered elsewhere."""
+        """Do nothing: there is no other buffer."""
 
     def close(self) -> None:
         """Close the stream."""

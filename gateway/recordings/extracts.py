@@ -31,7 +31,7 @@ from gateway.vehicle.plan import FENCE, MISSION, RALLY, Item, read_item
 
 END_US: Final = 1 << 62
 _INTEGERS: Final = {1: "<Bxxx", 2: "<bxxx", 3: "<Hxx", 4: "<hxx", 5: "<I", 6: "<i"}
-"""How an integer lies in the four bytes of a value, by MAV_PARAM_TYPE."""
+"""Encoding of an integer in the four bytes of a value, by MAV_PARAM_TYPE."""
 POLYGONS: Final = {
     mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION: True,
     mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False,
@@ -41,7 +41,7 @@ CIRCLES: Final = {
     mavlink.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION: False,
 }
 CRUISE_MPS, HOVER_MPS = 15, 5
-"""Speeds that a plan must have, and a recording does not contain: those of QGroundControl."""
+"""Speeds in m/s that a plan requires and a recording lacks: QGroundControl's values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class RecordedParameter:
 
 
 def parameter_text(value: float) -> str:
-    """Return a value with the fewest digits that give the same single-precision float."""
+    """Return a value with the fewest digits that yield the same single-precision float."""
     if float(value).is_integer() and abs(value) < 1 << 53:
         return str(int(value))
     return str(np.float32(value))
@@ -87,23 +87,23 @@ class RecordedPlan:
         return found
 
     def items(self, kind: int) -> list[Item]:
-        """Return the items of a mission, fence, or rally points; none if it was not recorded."""
+        """Return the items of a mission, fence, or rally points; empty if not recorded."""
         read: Any = mavlink.MAVLink(None)
         frames = self._answers.mission(kind) or ()
         return [read_item(read.decode(bytearray(frame))) for frame in frames]
 
     def home(self) -> Position | None:
-        """Return the position of home."""
+        """Return the home position."""
         fields = self.fields(HOME_POSITION_ID)
         return None if fields is None else named_position(fields)
 
     def fields(self, message_id: int) -> dict[str, Any] | None:
-        """Return the fields of the newest message of one type among the answers."""
+        """Return the fields of the newest message of one type; None if it was not recorded."""
         frames = self._answers.frames(message_id)
         return fields_of(frames[0]) if frames else None
 
     def _is_bytewise(self) -> bool:
-        """Return whether integers are sent as their own bytes in place of a float."""
+        """Return whether integers are sent as their bytes instead of converted to float."""
         if (version := self.fields(AUTOPILOT_VERSION_ID)) is not None:
             able = version["capabilities"]
             return bool(able & mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE)
@@ -111,13 +111,13 @@ class RecordedPlan:
 
 
 def param_file(parameters: Iterable[RecordedParameter]) -> Iterator[str]:
-    """Write parameters as Mission Planner and MAVProxy read them."""
+    """Write parameters in the format of Mission Planner and MAVProxy."""
     for parameter in parameters:
         yield f"{parameter.name},{parameter.text}\n"
 
 
 def qgc_params(parameters: Iterable[RecordedParameter], plan: RecordedPlan) -> Iterator[str]:
-    """Write parameters as QGroundControl reads them."""
+    """Write parameters in the format of QGroundControl."""
     yield f"# Onboard parameters for Vehicle {plan.system_id}\n#\n"
     yield "# Vehicle-Id Component-Id Name Value Type\n"
     for each in parameters:
@@ -135,7 +135,7 @@ def waypoints(items: Sequence[Item]) -> Iterator[str]:
 
 
 def qgc_plan(plan: RecordedPlan) -> str:
-    """Write mission, fence and rally points as a plan of QGroundControl."""
+    """Write mission, fence and rally points as a QGroundControl plan."""
     items, at = plan.items(MISSION), plan.home()
     home: tuple[float, ...] = (0, 0, 0) if at is None else (at.lat_deg, at.lon_deg, at.alt_amsl_m)
     is_ardupilot = plan.heartbeat[1] == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA

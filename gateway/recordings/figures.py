@@ -1,4 +1,4 @@
-"""Figures of a flight that reports, catalogue and lists share: GPS outages and lost samples."""
+"""Figures of a flight for reports, catalogue and lists: GPS outages and lost samples."""
 
 from typing import Final
 
@@ -12,21 +12,22 @@ IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 
 OUTAGE_US: Final = US_PER_S
-"""A longer gap between fixes is an outage."""
+"""Minimum length of an outage: a longer gap between fixes is one."""
 OUTAGE_STEPS: Final = 2.5
-"""So many usual intervals without a fix are an outage, where fixes come seldom."""
+"""Minimum length of an outage in usual intervals, for receivers with a low rate."""
 NODE_WRAP_US: Final = 1 << 32
-"""The clock of a node starts again at zero after so much time."""
+"""Period after which a node's 32-bit clock wraps to zero."""
 LONGEST_LOSS_US: Final = 60 * US_PER_S
-"""In a longer gap the node was switched off."""
+"""Longest gap counted as lost samples; in a longer one the node was switched off."""
 
 
 def gps_outages_us(
     gps_us: IntArray, fixed: NDArray[np.bool_], end_us: int
 ) -> list[tuple[int, int]] | None:
-    """Return begin and end of each time without a fix, from the first fix on; None without any fix.
+    """Return start and end of each outage from the first fix on; None if there is no fix at all.
 
-    `gps_us`, shape (n,), are the times of all reports of the receiver; `fixed` those with a fix.
+    `gps_us`, shape (n,), are the times of all reports of the receiver; `fixed` marks reports with a
+    fix.
     """
     fixes_us = gps_us[fixed]
     if not len(fixes_us):
@@ -34,14 +35,14 @@ def gps_outages_us(
     usual_us = float(np.median(np.diff(gps_us))) if len(gps_us) > 1 else 0.0
     ends_us = np.append(fixes_us[1:], max(end_us, int(fixes_us[-1])))
     gaps_us = ends_us - fixes_us
-    # A clock that jumps by days is no gap.
+    # A gap of days is a jump of the clock, not an outage.
     is_outage = (gaps_us > max(OUTAGE_US, OUTAGE_STEPS * usual_us)) & (gaps_us <= DAY_US)
     begins, ends = fixes_us[is_outage].tolist(), ends_us[is_outage].tolist()
     return list(zip(begins, ends, strict=True))
 
 
 def missing_samples(node_time_us: IntArray) -> FloatArray:
-    """Count the samples missing before each but the first, by the node's own clock."""
+    """Count the samples missing before each sample except the first, by the node's own clock."""
     interval_us = np.diff(node_time_us) % NODE_WRAP_US
     usual_us = np.median(interval_us[interval_us > 0]) if interval_us.any() else 1.0
     missing = np.maximum(np.rint(interval_us / usual_us) - 1.0, 0.0)
@@ -49,7 +50,7 @@ def missing_samples(node_time_us: IntArray) -> FloatArray:
 
 
 def lost_share(node_time_us: IntArray) -> float | None:
-    """Return the share of samples that are missing; None for fewer than two samples."""
+    """Return the proportion of missing samples; None for fewer than two samples."""
     if len(node_time_us) < 2:
         return None
     lost = float(missing_samples(node_time_us).sum())

@@ -1,10 +1,10 @@
-"""Recordings on the disk as streams, read in chunks, and any recorded MAVLink as a tlog.
+"""Read recordings from disk as streams of chunks, and any recorded MAVLink as a tlog.
 
 | layout | bytes before each frame           | times                                   |
 | ------ | --------------------------------- | --------------------------------------- |
-| tlog   | eight: the time                   | as recorded, without jumps of the clock |
-| padded | sixteen: the time and eight zeros | the same                                |
-| bare   | none: a capture of a link         | of the messages, see `FrameClock`       |
+| tlog   | 8: the time                       | as recorded, without jumps of the clock |
+| padded | 16: the time and eight zeros      | as for tlog                             |
+| bare   | 0: a capture of a link            | from the messages, see `FrameClock`     |
 """
 
 import codecs
@@ -45,72 +45,72 @@ from gateway.wire.mavlink_splitter import MavlinkSplitter, SplitFault, message_i
 CHUNK: Final = 1 << 20
 SNIFF: Final = 512
 TAIL: Final = 1 << 14
-"""Some twenty rows."""
+"""Bytes read at the end of a table, about 20 rows."""
 MAX_HEAD: Final = 4 * MAX_LINE
-"""Before the first row; a few kilobytes pack any number of zeros."""
+"""Maximum bytes before the first row: a few packed kilobytes can expand to any number of zeros."""
 MAX_PACKED_RATIO: Final = 100
-"""Of a gzipped file. Recordings are packed to a third or a tenth, and a file of repeated lines to a
-thousandth, on which a reader of lines would work for minutes."""
+"""Maximum compression ratio of a gzipped file. Recordings are packed to a third or a tenth. A file
+of repeated lines is packed to a thousandth, and reading its lines would take minutes."""
 LEAST_BOMB: Final = 1 << 25
-"""Bytes from which on that matters: they are read in a second."""
+"""Unpacked bytes from which the ratio is checked; less is read within a second."""
 MAX_UNPACKED: Final = 1 << 30
-"""Bytes to which a packed file may be unpacked at once, unless the settings give another limit; a
-megabyte of gzip can hold a gigabyte of zeros."""
+"""Maximum unpacked size of a file, bytes, unless the settings give another limit: a megabyte of
+gzip can expand to a gigabyte of zeros."""
 HEAD: Final = 1 << 14
-"""The begin of a log is looked for in so many bytes, behind text that a console wrote; and some
-hundred frames, by which the layout of a tlog is recognised."""
+"""Bytes that are searched for the start of a log, which may follow text that a console wrote, and
+from which the layout of a tlog is recognised: several hundred frames."""
 BLANK: Final = b"\xff\0"
-"""Flash memory that was erased and never written, and zeros of a card that lost its power, as in
-front of a log that was copied whole."""
+"""Erased flash memory, and zeros of a card that lost its power; they may precede a log that was
+copied from raw memory."""
 MAX_BLANK: Final = 1 << 20
 GZIP: Final = ".gz"
 GZIP_MAGIC: Final = b"\x1f\x8b"
-"""The first bytes show that a file is packed, whatever its name."""
+"""First bytes of a gzipped file; its name is not considered."""
 
 Progress = Callable[[int], None]
-"""Called with how many more bytes were read."""
+"""Callback with the number of bytes read since its last call."""
 
 
 Position = Literal["causal", "interpolated"]
 SettingsChoice = Literal["recorded", "current"]
 Estimates = Literal["own", "fused", "both"]
-"""Of an autopilot's log: its own estimates, those of mavgate, or both as two vehicles."""
+"""Estimates to use from an autopilot's log: its own, those of mavgate, or both as two vehicles."""
 
 NO_RECORDING: Final = (
     "unknown file format; readable: tlog, raw MAVLink, CSV, ULog, DataFlash, MCAP, Parquet"
 )
 TLOG, TABLE, CSV, PARQUET = "tlog", "table", "csv", "Parquet"
-"""Formats; a CSV is that of another program, with columns of its own."""
+"""Names of formats; a CSV is one of another program, with columns of its own."""
 ULOG_HEAD: Final = b"ULog\x01\x12\x35"
 ULOG_BEGIN: Final = re.compile(
     rb"\A[^\xfd\xfe]*?(?=ULog\x01\x12\x35|..F[a-z0-9_]+:uint64_t timestamp;)", re.DOTALL
 )
-"""Ends at the header of a ULog, or where that is lost at the first format of a topic. A tlog that
-holds the download of a log has MAVLink frames before it."""
+"""Match up to the header of a ULog or, if the header is lost, up to the first format of a topic. A
+tlog that contains a log download does not match: it begins with MAVLink frames."""
 DATAFLASH_BEGIN: Final = re.compile(
     rb"\A(?:(?=\xa3\x95)|[^\xfd\xfe]*?(?=\xa3\x95\x80..[A-Z][A-Z0-9]{2,3}))", re.DOTALL
 )
-"""The same of a binary DataFlash log: its first message, or behind other bytes its first format."""
+"""Match up to a binary DataFlash log: its first message or, after other bytes, its first format."""
 _DATAFLASH_LINE: Final = re.compile(rb"^FMT, ?\d", re.MULTILINE)
 LINE_BPS: Final = 57_600
-"""The usual telemetry radio; ten bits a byte."""
+"""Bit rate assumed for captures without times, that of usual telemetry radios; 10 bits per byte."""
 LAST_CIVIL_US: Final = 4_102_444_800 * US_PER_S
-"""The year 2100."""
+"""The year 2100; later times are not civil time."""
 _UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "time_unix_usec": 1}
-"""Fields with the sender's time, and their unit."""
+"""Fields with the sender's time, and their unit in µs."""
 _TIMES: Final = {
     message_id: names
     for message_id, kind in DEFINITIONS.items()
     if (names := [name for name in _UNITS_US if name in kind.fieldnames])
 }
-"""Fields of each message with a time."""
+"""Names of the time fields, by message id, of all messages that have some."""
 PIECE: Final = 1 << 12
 SHOWN_JUMPS: Final = 3
 _DAY_S: Final = 86_400
 
 
 class FlightError(UserError):
-    """A file without the data that a command needs; the text names the data and the file."""
+    """A file lacks the data that a command needs; the text names the data and the file."""
 
 
 def _begins(*heads: bytes) -> Callable[[bytes], bool]:
@@ -124,7 +124,7 @@ OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {
     ),
     PARQUET: _begins(b"PAR1"),
 }
-"""Whether a file that begins with these bytes is of a format, by the format's name."""
+"""Test whether a file that begins with these bytes is of a format, by the format's name."""
 
 
 def encoding_of(head: bytes) -> str:
@@ -159,14 +159,14 @@ def format_of(path: Path) -> str:
 
 
 def first_bytes(path: Path) -> bytes:
-    """Return the begin of a file, unpacked, by which its format is known; raises OSError."""
+    """Return the start of a file, unpacked, to recognise its format; raises OSError."""
     with open_unpacked(path) as (file, _):
         head, _ = _behind_blank(iter(lambda: file.read(HEAD), b""))
         return head[:HEAD].removeprefix(codecs.BOM_UTF8)
 
 
 def _behind_blank(content: Iterator[bytes]) -> tuple[bytes, int]:
-    """Return the first bytes that are not blank, `HEAD` of them if there are; and how many were."""
+    """Return up to `HEAD` bytes after the blank ones, and the number of blank bytes."""
     head, size = b"", 0
     for data in content:
         size += len(data)
@@ -180,21 +180,21 @@ def _behind_blank(content: Iterator[bytes]) -> tuple[bytes, int]:
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """Bytes before the begin of a log."""
+    """Bytes before the start of a log."""
 
     blank: int = 0
     text: bytes = b""
-    """Those that follow the blank ones."""
+    """The bytes that follow the blank ones."""
 
     @property
     def remarks(self) -> list[str]:
-        """Remarks for the user about them."""
+        """Remarks for the user on these bytes."""
         size = self.blank + len(self.text)
         return [f"left out {counted(size, 'byte')} before its first message"] if size else []
 
 
 def skip_to(begin: re.Pattern[bytes], content: Iterator[bytes]) -> tuple[Iterator[bytes], Before]:
-    """Leave out the bytes before the begin of a log."""
+    """Skip the bytes before the start of a log."""
     head, blank = _behind_blank(content)
     found = begin.search(head, 0, HEAD)
     at = found.end() if found else 0
@@ -209,14 +209,14 @@ def is_packed(path: Path) -> bool:
 
 @contextmanager
 def open_unpacked(path: Path) -> Iterator[tuple[BinaryIO, BinaryIO]]:
-    """Open a file, gzipped or not, to read it to its end."""
+    """Open a file, gzipped or not, for reading to its end; yields the content and the raw file."""
     with _readable(path), open_recording(path) as raw:
         packed = raw.peek(len(GZIP_MAGIC)).startswith(GZIP_MAGIC)
         yield (cast(BinaryIO, io.BufferedReader(_Unpacker(path, raw))) if packed else raw), raw
 
 
 class _Unpacker(io.RawIOBase):
-    """The content of a gzipped file, unless it is packed as no recording can be."""
+    """The content of a gzipped file; rejects a compression ratio that no recording has."""
 
     def __init__(self, path: Path, raw: BinaryIO) -> None:
         self._path = path
@@ -225,28 +225,28 @@ class _Unpacker(io.RawIOBase):
         self._size = 0
 
     def readable(self) -> bool:
-        """Return True."""
+        """Return True, as `io.RawIOBase` requires."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """Read into a buffer; raises OSError for a bomb."""
+        """Read into a buffer; raises OSError if the compression ratio is too high."""
         data = self._file.read(len(buffer))
         buffer[: len(data)] = data
         self._size += len(data)
         if self._size > max(MAX_PACKED_RATIO * self._raw.tell(), LEAST_BOMB):
-            why = f"is packed to less than 1/{MAX_PACKED_RATIO}, as no recording is"
+            why = f"has a compression ratio above {MAX_PACKED_RATIO}, which no recording has"
             raise OSError(errno.EFBIG, why, str(self._path))
         return len(data)
 
 
 def open_recording(path: Path) -> io.BufferedReader:
-    """Open a file to read it to its end; raises OSError as `open_descriptor`."""
+    """Open a file for reading to its end; raises OSError as `open_descriptor`."""
     return os.fdopen(open_descriptor(path), "rb")
 
 
 def open_descriptor(path: Path) -> int:
-    """Open a file to read it, if it has an end."""
-    # A pipe that nobody writes to would wait here.
+    """Open a regular file for reading; raises OSError for a pipe or a device."""
+    # Non-blocking: opening a pipe without a writer would wait forever.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
@@ -259,7 +259,7 @@ def open_descriptor(path: Path) -> int:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Raise a clear OSError for a damaged gzip file, and one with a name for what fails later."""
+    """Raise OSError with a clear text for a damaged gzip file, and with a name for other errors."""
     try:
         yield
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
@@ -295,9 +295,9 @@ def read_chunks(
 
 @contextmanager
 def temporary_copy(path: Path, content: Iterable[bytes]) -> Iterator[IO[bytes]]:
-    """Have a file's content in a temporary one, which nobody cuts while it is read.
+    """Copy content to a temporary file, which nobody can truncate while it is read.
 
-    It has no name, so that nothing is left of it if the process is killed; see `name_of`.
+    The file has no name, so nothing is left if the process is killed; see `name_of`.
     """
     copy = TemporaryFile(prefix="mavgate-")  # noqa: SIM115
     try:
@@ -316,12 +316,12 @@ def temporary_copy(path: Path, content: Iterable[bytes]) -> Iterator[IO[bytes]]:
 
 
 def name_of(file: IO[bytes]) -> str:
-    """Return a name by which this process can open a file without a name."""
+    """Return a path by which this process can open an unnamed file."""
     return f"/dev/fd/{file.fileno()}"
 
 
 def read_ends(path: Path) -> tuple[bytes, bytes]:
-    """Read the lines of a text file up to its first row, and some of the last."""
+    """Read the lines of a text file up to its first row, and some of its last lines."""
     head = tail = b""
     with open_unpacked(path) as (file, raw):
         while line := file.readline(MAX_LINE):
@@ -338,25 +338,25 @@ def read_ends(path: Path) -> tuple[bytes, bytes]:
 
 
 def read_blocks(path: Path, reader: TableReader, progress: Progress | None) -> Iterator[TableBlock]:
-    """Read a table block by block; the reader then knows its head."""
+    """Read a table block by block; the reader stores its head."""
     for data in read_chunks(path, progress):
         yield reader.feed_block(data)
     yield reader.feed_block(b"", final=True)
 
 
 class FrameClock:
-    """The time of each frame, counted from the first one."""
+    """Times of frames, counted from the first one, derived from times in their messages."""
 
     def __init__(self, *, by_size: bool = False) -> None:
         self._by_size = by_size
         self.civil_us_at_zero: int | None = None
-        """Civil time of the first frame; None until a message gives it."""
+        """Civil time of the first frame; None until a message contains civil time."""
         self.is_timed = False
-        """Whether any message held a time."""
+        """Whether any message contained a time."""
         self._now_us = 0
         self._line_us = 0.0
         self._bases_us: dict[tuple[int | str, ...], tuple[int, int]] = {}
-        """Of each sender and field: time at its own zero, and its newest own time."""
+        """Time at zero of the sender's clock, and its newest time, by sender and field."""
 
     def time_us(self, frame: bytes) -> int:
         """Return the time of the next frame."""
@@ -382,7 +382,7 @@ class FrameClock:
 
 
 class Layout(IntEnum):
-    """Bytes between two frames."""
+    """Number of bytes before each frame."""
 
     BARE = 0
     TLOG = TIME_SIZE
@@ -391,20 +391,20 @@ class Layout(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class TlogSource:
-    """A file of recorded MAVLink whose layout and clock are known."""
+    """A file of recorded MAVLink with its recognised layout and its clock."""
 
     path: Path
     layout: Layout
     timeline: Timeline
     senders: Senders
     remarks: tuple[str, ...] = ()
-    """Remarks for the user about its times."""
+    """Remarks for the user on its times."""
     civil_us_at_zero: int = 0
     by_size: bool = False
-    """Whether frames of a bare capture are spaced by their size."""
+    """Whether frames of a capture without times are spaced by their transmission time."""
 
     def chunks(self, progress: Progress | None = None, limit: int | None = None) -> Iterator[bytes]:
-        """Read it as the bytes of a tlog; see `read_chunks`."""
+        """Read the file as the bytes of a tlog; see `read_chunks`."""
         data = read_chunks(self.path, progress, limit)
         if self.layout is Layout.TLOG:
             return data
@@ -413,7 +413,7 @@ class TlogSource:
         return self._timed(data)
 
     def batches(self, progress: Progress | None = None, *, strict: bool = False) -> Iterator[Batch]:
-        """Read it batch by batch, at corrected times; see `TlogScanner`."""
+        """Read the file batch by batch, at corrected times; see `TlogScanner`."""
         scanner = TlogScanner(strict=strict)
         for data in self.chunks(progress):
             yield self.timeline.apply(scanner.feed(data))
@@ -429,7 +429,7 @@ class TlogSource:
 
 
 def open_tlog(path: Path) -> TlogSource:
-    """Recognise the layout of a file, and read its times once; raises OSError."""
+    """Recognise the layout of a file, and read all its times once; raises OSError."""
     layout = file_layout(first_bytes(path))
     if layout is Layout.BARE:
         return _open_bare(path)
@@ -437,16 +437,16 @@ def open_tlog(path: Path) -> TlogSource:
     for batch in TlogSource(path, layout, Timeline(), senders).batches():
         timeline.add(batch)
         senders.add(batch)
-    padded = ("has eight zero bytes more in each record; left out",)
+    padded = ("has eight extra zero bytes in each record; left out",)
     remarks = padded if layout is Layout.PADDED else ()
     return TlogSource(path, layout, timeline, senders, (*remarks, *_jumps_in_words(timeline)))
 
 
 def file_layout(head: bytes) -> Layout:
-    """Recognise the layout by the bytes between the first frames; a tlog where it is unclear."""
+    """Recognise the layout by the bytes between the first frames; a tlog if that is ambiguous."""
     gaps: Counter[int] = Counter()
     splitter, gap, met = MavlinkSplitter(), 0, False
-    # In pieces: bytes with many false starts are not searched to their end.
+    # In pieces, which bounds the work for bytes with many false starts of frames.
     for begin in range(0, len(head), PIECE):
         for event in splitter.feed(head[begin : begin + PIECE]):
             if isinstance(event, SplitFault):
@@ -465,9 +465,7 @@ def _open_bare(path: Path) -> TlogSource:
             clock.time_us(frame)
     how = "its times are those in its messages"
     if not clock.is_timed:
-        how = (
-            f"no message holds a time, so frames are spaced as a line of {LINE_BPS} baud sends them"
-        )
+        how = f"no message contains a time, so frames are spaced as on a link of {LINE_BPS} baud"
     remarks = [f"is a capture without time stamps; {how}"]
     if left_out:
         remarks.append(f"left out {counted(left_out, 'byte')} between frames")
@@ -482,7 +480,7 @@ def _open_bare(path: Path) -> TlogSource:
 
 
 def _frames(data: Iterator[bytes]) -> Iterator[list[tuple[int, bytes, bytes]]]:
-    """Yield the frames of each chunk, each behind the count and last of the bytes before it."""
+    """Yield the frames of each chunk, each with the number and the last of the skipped bytes."""
     splitter, rest, lead, left_out = MavlinkSplitter(), b"", b"", 0
     for chunk in data:
         for begin in range(0, len(chunk), PIECE):
@@ -503,7 +501,7 @@ def _frames(data: Iterator[bytes]) -> Iterator[list[tuple[int, bytes, bytes]]]:
 
 
 def _stamped(data: Iterator[bytes]) -> Iterator[bytes]:
-    """Leave out the eight zeros of each record, before or behind its time."""
+    """Remove the eight zeros of each record, which are before or after its time."""
     for pieces in _frames(data):
         records = []
         for _, lead, frame in pieces:
@@ -521,7 +519,7 @@ def _jumps_in_words(timeline: Timeline) -> Iterator[str]:
         direction = "forward" if step_s > 0 else "back"
         yield (
             f"its clock jumped {direction} by {size} at {jump.offset_us / US_PER_S:.1f} s; "
-            "its times run on without the jump"
+            "its times continue without the jump"
         )
     if (more := len(timeline.jumps) - SHOWN_JUMPS) > 0:
         yield f"and {counted(more, 'more jump')} of its clock"

@@ -1,4 +1,4 @@
-"""Any recording as a flight that the simulated receiver sends again."""
+"""Read any recording as a flight that the simulated receiver sends again."""
 
 import logging
 import math
@@ -32,7 +32,7 @@ IMU: Final = slice(1, BARO)
 def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
     """Read a recording as a flight to be sent again.
 
-    Raises FlightError if there is no flight in it; OSError if it cannot be read at all.
+    Raises FlightError if it contains no flight; OSError if it cannot be read at all.
     """
     table = joined_tables([open_rows(file, options) for file in files])
     aircraft = aircraft_for(files, table, options)
@@ -47,9 +47,9 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
 
 
 def _cells(samples: Samples) -> FloatArray:
-    """Return samples in the order of `COLUMNS`; records between two of them are in the later one.
+    """Return samples in the order of `COLUMNS`; records between two samples go with the later one.
 
-    A sample that is not later than those before is left out.
+    A sample that is not later than all before it is left out.
     """
     imu = samples.imu
     newest_us = np.maximum.accumulate(imu.time_us)
@@ -65,7 +65,7 @@ def _cells(samples: Samples) -> FloatArray:
             cells[row, BARO] = record.alt_pressure_m
         elif record.fix_ok:
             position = (record.lat_dege7 * DEG_PER_DEGE7, record.lon_dege7 * DEG_PER_DEGE7)
-            # A receiver sends a whole velocity or none; speed and course are of a level one.
+            # A receiver sends a complete velocity or none; speed and course are horizontal.
             north_mps, east_mps, down_mps = record.vel_n_mps
             velocity = (north_mps, east_mps, 0.0 if math.isnan(down_mps) else down_mps)
             cells[row, GPS:] = (record.time_us / US_PER_S, *position, record.alt_amsl_m, *velocity)

@@ -1,4 +1,4 @@
-"""From the samples of a recording to states: live order or smoothed, at once or block by block."""
+"""Fuse samples of a recording to states: in live order or smoothed, at once or block by block."""
 
 import math
 from collections import deque
@@ -67,9 +67,9 @@ VALID: Final = int(
     | NavFlags.ALTITUDE_VALID
 )
 SMOOTHED_ESTIMATOR: Final = "eskf"
-"""The filter that the smoother goes over."""
+"""The only filter whose states can be smoothed."""
 Correct = Callable[[IntArray, FloatArray], FloatArray]
-"""Changes the states of given times."""
+"""Function that corrects states, given their times."""
 
 
 class FusionSettings(Settings, frozen=True):
@@ -100,19 +100,19 @@ class Samples:
 
     imu: ImuLog
     aiding: list[Aiding]
-    """Heights and fixes, each with the number of the IMU sample before which it arrived."""
+    """Heights and fixes, each with the index of the IMU sample before which it arrived."""
     calibration: NodeCalibration = field(default_factory=NodeCalibration)
     begin: FusionState | None = None
-    """The state that is stored before the first sample."""
+    """The state stored before the first sample."""
 
     def estimator(self, estimation: EstimationSettings) -> Estimator:
-        """Build an estimator in the stored state; ValueError if that is of other settings."""
+        """Build an estimator in the stored state; ValueError if the state is of other settings."""
         settings = AircraftSettings(calibration=self.calibration, estimation=estimation)
         return make_fusion(settings, self.begin)[1]
 
 
 class Fused(NamedTuple):
-    """The states of a recording."""
+    """The states of a recording, and the GPS latency used."""
 
     states: FloatArray
     """Shape (n, NAV_COLUMNS), one row per IMU sample; see `gateway.estimation.columns`."""
@@ -127,15 +127,14 @@ def fuse(
     smoothed: bool = False,
     on_fix: Callable[[], None] | None = None,
 ) -> Fused:
-    """Fuse the samples of a recording or of its next stretch: the only way from them to states.
+    """Fuse the samples of a recording or of its next part; every command uses this function.
 
-    In the order of arrival the estimator advances over the samples, with the bits of live states;
-    `on_fix` is called after each fix. Smoothed, the states use the samples after them too and are
-    in order of time (see `smooth`); the estimator has to be the Kalman filter then, and is not
-    changed.
+    In the order of arrival, the estimator advances over the samples, bit-identical to live states;
+    `on_fix` is called after each fix. Smoothed states also use later samples, are in order of time
+    (see `smooth`), and require the Kalman filter, which is not changed.
 
-    Raises ValueError if it is to be smoothed and the clock was set back: there is no order to
-    smooth in.
+    Raises ValueError if smoothing is requested and the clock was set back, since there is no order
+    to smooth in.
     """
     imu = samples.imu
     if smoothed:
@@ -154,7 +153,7 @@ def fuse(
 def _fuse_singly(
     estimator: Estimator, samples: Samples, on_fix: Callable[[], None] | None
 ) -> FloatArray:
-    """Run any estimator over samples one by one."""
+    """Fuse samples one by one, with any estimator."""
     waiting = deque(samples.aiding)
     rows = []
     for number, sample in enumerate([*samples.imu.samples(), None]):
@@ -172,7 +171,7 @@ def _fuse_singly(
 
 
 def sample_log(samples: Samples, estimator: KernelEstimator) -> SampleLog:
-    """Lay samples out by their times, for the smoother and the search for the GPS latency."""
+    """Arrange samples by their times, for the smoother and the estimation of the GPS latency."""
     imu = samples.imu
     heights = [record for _, record in samples.aiding if isinstance(record, BaroSample)]
     fixes = [record for _, record in samples.aiding if isinstance(record, GpsFix)]
@@ -187,7 +186,7 @@ def sample_log(samples: Samples, estimator: KernelEstimator) -> SampleLog:
 
 
 def _in_order(log: SampleLog) -> SampleLog:
-    """Sort samples that came late; ValueError if the clock was set back."""
+    """Sort samples that arrived late; ValueError if the clock was set back."""
     if not len(log.imu_time_us):
         return log
     back_us = -np.diff(log.imu_time_us, prepend=log.imu_time_us[:1])
@@ -210,7 +209,7 @@ def _in_order(log: SampleLog) -> SampleLog:
 
 
 def has_sample(cells: FloatArray) -> BoolArray:
-    """Return which rows of a table hold an IMU sample."""
+    """Return which rows of a table contain an IMU sample."""
     return has_group(cells, RAW) | has_group(cells, SI)
 
 
@@ -240,7 +239,7 @@ def samples_of(blocks: Iterable[TableBlock], calibration: NodeCalibration) -> Sa
 
 
 def samples_of_cells(cells: FloatArray, chain: SensorChain) -> Samples:
-    """Calibrate rows of a table: counts where there are some, else SI values as they are."""
+    """Calibrate rows of a table: raw counts if present, else SI values as they are."""
     holds = has_sample(cells)
     rows = cells[holds]
     flags = rows[:, FLAGS].astype(np.int64)
@@ -253,7 +252,7 @@ def samples_of_cells(cells: FloatArray, chain: SensorChain) -> Samples:
         si[has_counts] = np.column_stack([accel, gyro, mag, temperature_degc])
     imu = ImuLog(rows[:, 0].astype(np.int64), si[:, 0:3], si[:, 3:6], si[:, 6:9], si[:, 9], flags)
     before: IntArray = np.cumsum(holds) - holds
-    # In a row the height comes before the fix.
+    # Within a row the height precedes the fix.
     found: list[tuple[int, int, BaroSample | GpsFix]] = []
     heights = np.flatnonzero(has_group(cells, BARO)).tolist()
     for row, values in zip(heights, cells[heights, BARO].tolist(), strict=True):
@@ -266,7 +265,7 @@ def samples_of_cells(cells: FloatArray, chain: SensorChain) -> Samples:
 
 
 class Fusion:
-    """Fuse the blocks of a table one after another, as its rows were fused live."""
+    """Fuse the blocks of a table one after another, in the way the rows were fused live."""
 
     def __init__(
         self,
@@ -282,12 +281,12 @@ class Fusion:
         self._played = played
         self._correct = correct
         self.time_us: list[IntArray] = []
-        """Times of the IMU samples that were fused."""
+        """Times of the fused IMU samples."""
         self.refused: list[str] = []
-        """Why states of the file were not restored; then the estimator starts cold."""
+        """Reasons why states in the file were not restored; the estimator then starts cold."""
 
     def block(self, block: TableBlock) -> TableBlock:
-        """Return a block with the new states; rows without a record are left out."""
+        """Return a block with the new states; rows without any record are left out."""
         cells = block.cells
         held = np.any([has_group(cells, group) for group in (BARO, GPS, RAW, SI)], axis=0)
         cells = cells[held]
@@ -306,7 +305,7 @@ class Fusion:
         return TableBlock(np.concatenate(fused), tuple(comments))
 
     def _handle(self, comment: TableComment) -> bool:
-        """Handle a line that is not a row; return whether it stays in the file."""
+        """Handle a line that is not a row; return whether it is kept in the file."""
         if isinstance(comment, TableHeader):
             if self._follow:
                 self._aircraft.change(settings_of(comment), 0, Outputs())
@@ -320,7 +319,7 @@ class Fusion:
         return True
 
     def _fused(self, cells: FloatArray) -> FloatArray:
-        """Return rows with the samples as they are calibrated now, and the states of now."""
+        """Return rows with newly calibrated samples and newly fused states."""
         found = cells.copy()
         has_counts, holds = has_group(cells, RAW), has_sample(cells)
         samples = samples_of_cells(cells, self._aircraft.chain)
@@ -349,9 +348,9 @@ class Fusion:
 
 
 def interpolated_positions(fixes: FloatArray, latency_s: float) -> Correct:
-    """Put straight lines between fixes in place of the fused position, as the paper's playback.
+    """Replace fused positions by straight lines between fixes, as in the paper's playback.
 
-    `fixes` are cells of `GPS`. States before the first fix and behind the last keep theirs.
+    `fixes` are cells of `GPS`. States before the first fix and after the last one are unchanged.
     """
     types = fixes[:, FIX_TYPE - GPS.start]
     is_2d_or_3d = (types == GpsFixType.FIX_2D) | (types == GpsFixType.FIX_3D)
@@ -365,7 +364,7 @@ def interpolated_positions(fixes: FloatArray, latency_s: float) -> Correct:
         row = np.flatnonzero((after < len(fix_us)) & (arrival_us >= fix_us.min(initial=np.inf)))
         b, a = after[row], np.maximum(after[row] - 1, 0)
         share = (arrival_us[row] - fix_us[a]) / np.maximum(fix_us[b] - fix_us[a], 1)
-        # The shorter way, so that a flight over the date line does not go around the earth.
+        # The shorter direction, so that a flight across the date line does not circle the earth.
         east_deg = wrap_180((lon[b] - lon[a]) * DEG_PER_DEGE7)
         found = states.copy()
         found[row, NAV_LAT] = (lat[a] + share * (lat[b] - lat[a])) * DEG_PER_DEGE7
@@ -377,7 +376,7 @@ def interpolated_positions(fixes: FloatArray, latency_s: float) -> Correct:
 
 
 def smoothed_states(smooth_us: IntArray, smoothed: FloatArray) -> Correct:
-    """Replace each state by the smoothed one of its time; the flags of sensors in use stay."""
+    """Replace each state by the smoothed one of its time; the sensor flags are kept."""
 
     def correct(time_us: IntArray, states: FloatArray) -> FloatArray:
         at = np.searchsorted(smooth_us, time_us).clip(0, max(len(smooth_us) - 1, 0))

@@ -1,6 +1,6 @@
-"""The folder of recordings: listing, and safe renaming and deleting.
+"""The folder of recordings: listing, and safe renaming and deletion.
 
-A recording `NAME` is all files `NAME_01.tlog`, `NAME_01_v1.csv`, `NAME_02.tlog` and so on.
+A recording `NAME` consists of all files `NAME_01.tlog`, `NAME_01_v1.csv`, `NAME_02.tlog` etc.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from gateway.printable import UserError
 
 _FILE_NAME: Final = re.compile(r"(?P<name>.+)_(?P<part>\d{2,})(?:_v\d+)?\.(?:tlog|csv)")
 _SURROGATE: Final = re.compile("[\ud800-\udfff]")
-"""Python's sign of a file name that is not UTF-8, which JSON cannot hold."""
+"""Python's encoding of bytes in a file name that are not UTF-8; JSON cannot contain it."""
 MAX_NAME: Final = 100
 NEWEST: Final = "last"
 """Name that always means the newest recording."""
@@ -31,15 +31,15 @@ class Recording:
     files: tuple[Path, ...]
     size: int
     modified_s: float
-    """When it was last written, in s since 1970."""
+    """Time of the last modification, s since 1970."""
 
 
 class RecordingError(UserError, ValueError):
-    """The request cannot be carried out; the text says why."""
+    """A request that cannot be carried out; the text states the reason."""
 
 
 def check_name(name: str) -> str:
-    """Check the name under which a user saves a session."""
+    """Check the name that a user gives a recording."""
     if name == NEWEST:
         raise ValueError(f"{name!r} is not a name for a recording: it always means the newest")
     sound = all(c.isalnum() or c in " .-_" for c in name) and len(name.encode()) <= MAX_NAME
@@ -52,7 +52,7 @@ def check_name(name: str) -> str:
 
 
 def part_of(path: Path) -> int:
-    """Return which part of its recording a file is; raises ValueError if it is not one."""
+    """Return the part number of a recording's file; raises ValueError for any other file."""
     match = _FILE_NAME.fullmatch(path.name)
     if match is None:
         raise ValueError(f"{path} is not part of a recording")
@@ -60,23 +60,23 @@ def part_of(path: Path) -> int:
 
 
 def is_file_name(name: str) -> bool:
-    """Return whether a name is that of a recording's file, without a path."""
+    """Return whether a name is that of a recording's file, without directories."""
     return _FILE_NAME.fullmatch(name) is not None and not {"/", "\0"} & set(name)
 
 
 def recording_name(path: Path) -> str:
-    """Return the name of a file's recording; for another file its own name."""
+    """Return the name of a file's recording; for other files, the file's own name."""
     match = _FILE_NAME.fullmatch(path.name)
     return path.name if match is None else match["name"]
 
 
 def as_text(name: str) -> str:
-    r"""Return a file's name as it can be printed and stored: bytes that are not UTF-8 as `\xNN`."""
+    r"""Return a file name in printable form: bytes that are not UTF-8 as `\xNN`."""
     return os.fsencode(name).decode(errors="backslashreplace")
 
 
 def parts_together(paths: Iterable[Path]) -> list[list[Path]]:
-    """Group consecutive parts of a recording; other files stay alone."""
+    """Group consecutive parts of a recording; any other file is a group of its own."""
     found: list[list[Path]] = []
     newest: dict[tuple[Path, str, str], list[Path]] = {}
     for path in paths:
@@ -95,9 +95,9 @@ def parts_together(paths: Iterable[Path]) -> list[list[Path]]:
 
 
 def list_recordings(folder: Path) -> list[Recording]:
-    """List the recordings of a folder, the newest last; none if there is no such folder.
+    """List the recordings of a folder, newest last; empty if the folder does not exist.
 
-    Two that ended in the same tick of the file system's clock stand by name.
+    Recordings of the same modification time are sorted by name.
     """
     files: dict[str, list[Path]] = {}
     with contextlib.suppress(FileNotFoundError):
@@ -117,7 +117,7 @@ def list_recordings(folder: Path) -> list[Recording]:
 
 
 def find_recording(folder: Path, name: str) -> Recording:
-    """Find one recording by name; `last` is the newest, unless one has that name.
+    """Find a recording by name; `last` means the newest, unless a recording has that name.
 
     Raises RecordingError if there is none.
     """
@@ -131,14 +131,14 @@ def find_recording(folder: Path, name: str) -> Recording:
 
 
 def free_name(folder: Path, wanted: str) -> str:
-    """Return the wanted name, with a number added if there is such a recording."""
+    """Return the wanted name, with a number appended if a recording has it already."""
     taken = {recording.name for recording in list_recordings(folder)}
     names = (wanted if n == 1 else f"{wanted}-{n}" for n in itertools.count(1))
     return next(name for name in names if name not in taken)
 
 
 def check_free(folder: Path, name: str) -> None:
-    """Check that a recording can have a name; raises RecordingError if not."""
+    """Check that a name is free for a recording; raises RecordingError if not."""
     try:
         check_name(name)
     except ValueError as error:
@@ -148,14 +148,14 @@ def check_free(folder: Path, name: str) -> None:
 
 
 def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
-    """Rename a recording as `move_recording`, and sync its folder."""
+    """Rename a recording with `move_recording`, and sync its folder."""
     moved = move_recording(folder, name, to_name)
     sync_folder(folder)
     return moved
 
 
 def move_recording(folder: Path, name: str, to_name: str) -> Recording:
-    """Rename a recording, also while it is being written; never overwrites.
+    """Rename a recording, even while it is being written; never overwrites a file.
 
     Raises RecordingError if there is no such recording, or the new name is taken or invalid.
     """
@@ -164,7 +164,7 @@ def move_recording(folder: Path, name: str, to_name: str) -> Recording:
     for path in recording.files:
         target = folder / (to_name + path.name.removeprefix(recording.name))
         try:
-            # So that nothing is overwritten, also on file systems without hard links.
+            # Reserves the name without overwriting, also on file systems without hard links.
             target.touch(exist_ok=False)
         except FileExistsError as error:
             raise RecordingError(f"{target} already exists") from error

@@ -1,4 +1,4 @@
-"""Tables of one aircraft behind one another, on the clock of the first."""
+"""Concatenate tables of one aircraft, on the clock of the first."""
 
 import math
 from collections.abc import Iterator
@@ -16,24 +16,24 @@ from gateway.records import FusionState, NodeStatus
 from gateway.units import counted
 
 OLDER: Final = "a recording is older than the one before it; give the oldest first"
-OVERLAP: Final = "left out {} that overlap with the recording before"
+OVERLAP: Final = "left out {} that overlap with the previous recording"
 LATE_US: Final = 1_000_000
-"""Rows of one clock that are older by less than this came late, and are in their place."""
+"""Rows that are older than the previous ones by less than this are late, not of another clock."""
 
 
 def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
-    """Put tables of one aircraft behind one another on the clock of the first.
+    """Concatenate tables of one aircraft on the clock of the first.
 
-    Parts of one recording share a clock; other recordings are ordered by civil time.
-    Where two overlap, the later one is taken from the end of the earlier one on.
+    Parts of one recording share a clock; other recordings are aligned by civil time.
+    Where two overlap, the later one starts at the end of the earlier one.
 
-    Raises FlightError if they are of several aircraft; while the rows are read, if one begins
-    before the one that it is given behind.
+    Raises FlightError if they are of several aircraft and, while the rows are read, if a recording
+    begins before the one given before it.
     """
     vehicles = sorted({table.header.vehicle_id for table in tables})
     if len(vehicles) > 1:
         listed = " and ".join(map(str, vehicles))
-        raise FlightError(f"these are tables of the aircraft {listed}; take those of one alone")
+        raise FlightError(f"these are tables of the aircraft {listed}; give those of one only")
     first = tables[0].header
     remarks: list[str] = []
 
@@ -67,7 +67,7 @@ def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
 
 
 def _is_behind(begin_us: float, shift_us: int | None, begun_us: float, newest_us: float) -> bool:
-    """Return whether a recording begins at the end of the one before, as far as that is known."""
+    """Return whether a recording continues after the one before, as far as this is known."""
     if shift_us is None:
         return True
     if begin_us < begun_us:
@@ -76,7 +76,7 @@ def _is_behind(begin_us: float, shift_us: int | None, begun_us: float, newest_us
 
 
 def _shift_us(header: TableHeader, first: TableHeader) -> int | None:
-    """Return how far two clocks are apart by civil time; None where it is unknown."""
+    """Return the difference of two clocks by civil time; None if it is unknown."""
     zero_us, first_zero_us = header.unix_us_at_zero, first.unix_us_at_zero
     if header.session != "" and header.session == first.session:
         return 0  # parts of a recording, whose time GPS may have corrected in between
@@ -87,7 +87,7 @@ def _shift_us(header: TableHeader, first: TableHeader) -> int | None:
 
 
 def _without(block: TableBlock, count: int) -> TableBlock:
-    """Leave out the first rows and their remarks, but keep changes of settings."""
+    """Leave out the first rows and their comments, but keep changes of settings."""
     comments = tuple(
         (max(row - count, 0), comment)
         for row, comment in block.comments
@@ -97,7 +97,7 @@ def _without(block: TableBlock, count: int) -> TableBlock:
 
 
 def shifted(block: TableBlock, shift_us: int) -> TableBlock:
-    """Move rows and all that they hold in time; a state holds times of its own and is left out."""
+    """Shift rows and comments in time; states are left out, since they contain times themselves."""
     if not shift_us:
         return block
     cells = block.cells.copy()

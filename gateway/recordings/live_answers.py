@@ -1,18 +1,18 @@
-"""The answers of a live vehicle, as they pass between it and ground stations.
+"""Answers of a live vehicle, collected as they pass between it and ground stations.
 
 | answer                     | source                           | dropped by                     |
 | -------------------------- | -------------------------------- | ------------------------------ |
-| parameters                 | PARAM_VALUE, the newest of each  | PARAM_SET: this one; another   |
+| parameters                 | PARAM_VALUE, the newest of each  | PARAM_SET: that one; another   |
 |                            | name                             | checksum, some commands: all   |
-| mission, fence, rally      | a whole download, or an upload   | the begin of an upload;        |
+| mission, fence, rally      | a whole download, or an upload   | the start of an upload;        |
 | points                     | that the vehicle has accepted    | another id or another home     |
 | version, metadata          | AUTOPILOT_VERSION,               | another version                |
 |                            | COMPONENT_METADATA               |                                |
-| files of metadata          | a file that was read whole       | a write by MAVLink FTP         |
+| files of metadata          | a file that was read completely  | a write by MAVLink FTP         |
 
-All of it is dropped when the vehicle restarts or reports another version. A value or plan of a
-station is dropped when it is sent, and kept again when the vehicle confirms it: a lost confirmation
-does no harm.
+All answers are dropped when the vehicle restarts or reports another version. A value or plan that a
+station sends is dropped at once and stored again when the vehicle confirms it, so a lost
+confirmation does no harm.
 """
 
 import struct
@@ -32,15 +32,15 @@ from gateway.wire.mavlink_messages import BOOT_TIME_OFFSETS, boot_time_us, ids_o
 from gateway.wire.mavlink_splitter import MavFrame
 
 HASH_NAME: Final = "_HASH_CHECK"
-"""PX4's checksum of all parameters."""
+"""Name of PX4's checksum of all parameters."""
 SHOWN_IDS: Final = ids_of("AUTOPILOT_VERSION", "PROTOCOL_VERSION", "COMPONENT_METADATA")
-"""Messages that stay the same until a restart."""
+"""Messages with content that is constant until a restart."""
 NOTED_IDS: Final = (
     SHOWN_IDS | BOOT_TIME_OFFSETS.keys() | ids_of("PARAM_VALUE", "MISSION_CURRENT", "HOME_POSITION")
 )
-"""Messages to all that are read here."""
+"""Messages without a target that are evaluated here."""
 MISSION_IDS: Final = ids_of("MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_ACK")
-"""Messages of a vehicle in transfers of missions."""
+"""Messages of a vehicle that are part of mission transfers."""
 CHANGING: Final = frozenset(
     (
         mavlink.MAV_CMD_PREFLIGHT_STORAGE, mavlink.MAV_CMD_PREFLIGHT_CALIBRATION,
@@ -48,33 +48,33 @@ CHANGING: Final = frozenset(
         mavlink.MAV_CMD_DO_ACCEPT_MAG_CAL,
     )
 )  # fmt: skip
-"""Commands after which any parameter or mission may be another."""
+"""Commands that can change any parameter or mission."""
 STORE: Final = (mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1.0)
-"""Writes the parameters as they are; QGroundControl sends it after each change."""
+"""Command and param1 that store the parameters; QGroundControl sends it after a change."""
 NO_INDEX: Final = 0xFFFF
-"""In the PARAM_VALUE that confirms a setting, of ArduPilot and of the checksum."""
+"""Index in the PARAM_VALUE by which ArduPilot confirms a setting, and in that of the checksum."""
 RESTART_US: Final = 5 * US_PER_S
-"""A start that is later by this is another one; a congested link delays frames by less."""
+"""Increase of the boot time that indicates a restart; congestion delays frames by less."""
 FRESH_US: Final = 10 * US_PER_S
-"""A vehicle whose time since its start is not received for so long may have restarted."""
+"""Maximum time without a boot time; after it, the vehicle may have restarted unnoticed."""
 PACKED: Final = "/param.pck"
-"""ArduPilot's file of all parameters."""
+"""ArduPilot's file that contains all parameters."""
 METADATA_FILES: Final = (".json", ".json.xz", ".json.gz", PACKED)
 MAX_BYTES: Final = 1_000_000
-"""Of one vehicle: a thousand parameters are 40 kB, the metadata of PX4 some 300 kB."""
+"""Limit for one vehicle: 1000 parameters take 40 kB, the metadata of PX4 about 300 kB."""
 MAX_READS: Final = 8
-"""Files that are being read."""
+"""Maximum number of file reads in progress."""
 READING: Final = (Opcode.READ_FILE, Opcode.BURST_READ_FILE)
 PARAMETERS: Final = "parameters"
 
 _PLAN_IDS: Final = struct.Struct("<2xH2xIII")
-"""MISSION_CURRENT: number of items, then the ids of mission, fence and rally points."""
+"""Fields of MISSION_CURRENT: number of items, and the ids of mission, fence and rally points."""
 _HOME_BYTES: Final = 12
 
 
 @dataclass(slots=True)
 class _Reading:
-    """A file that a station reads."""
+    """A file while a station reads it."""
 
     path: str
     session: int = -1
@@ -82,7 +82,7 @@ class _Reading:
     chunks: dict[int, bytes] = field(default_factory=dict)
 
     def content(self) -> bytes | None:
-        """Return the whole file; None if some of it is missing."""
+        """Return the whole file; None while some of it is missing."""
         if sum(map(len, self.chunks.values())) < self.size:
             return None
         found = bytearray()
@@ -94,46 +94,46 @@ class _Reading:
 
 
 class LiveAnswers:
-    """Answers of one vehicle since its start; see `recorded_vehicle.Answers`."""
+    """Answers that a vehicle has given since its start; see `recorded_vehicle.Answers`."""
 
     def __init__(self, system_id: int) -> None:
         self.system_id = system_id
         self._ordered: dict[str, bytes] | None = None
-        """The parameters in their order, while they stay the same."""
+        """The parameters in their order; None after a change."""
         self._booted_us: int | None = None
         self._timed_us = 0
-        """When its time since the start was received last."""
+        """When a time since boot was last received."""
         self.clear()
 
     def clear(self) -> None:
-        """Drop everything."""
+        """Drop all answers."""
         self.files: dict[str, bytes] = {}
-        """By path and query."""
+        """Content by path and query."""
         self.since_us: dict[str, int] = {}
-        """When each part became complete, by its name."""
+        """When each part became complete, by the name of the part."""
         self._log = LogAnswers()
         self._shown: dict[int, bytes] = {}
         self._home = b""
         self._plan_ids: dict[int, int] = {}
         self._readings: dict[tuple[int, int], _Reading] = {}
         self._uploader = (0, 0)
-        """System and component of the station that began to upload a mission last."""
+        """System and component of the station that most recently began to upload a mission."""
         self._drop_parameters()
 
     def is_fresh(self, now_us: int) -> bool:
-        """Return whether the vehicle certainly has not restarted."""
+        """Return whether a restart of the vehicle is ruled out."""
         return self._booted_us is not None and now_us - self._timed_us <= FRESH_US
 
     @property
     def size(self) -> int:
-        """The bytes that are held."""
+        """Number of bytes stored."""
         items = [each for kind in KINDS for each in self.mission(kind) or ()]
         reads = [each for one in self._readings.values() for each in one.chunks.values()]
         parts = (self._values.values(), self.files.values(), items, reads, self._log.pending())
         return sum(len(each) for part in parts for each in part)
 
     def has_message(self, message_id: int) -> bool:
-        """Return whether a message is held."""
+        """Return whether a message is stored."""
         return message_id in self._shown
 
     def frames(self, message_id: int) -> list[bytes]:
@@ -141,7 +141,7 @@ class LiveAnswers:
         return [self._shown[message_id]] if message_id in self._shown else []
 
     def mission(self, kind: int) -> Items | None:
-        """Return the frames of the items; None if they are not known."""
+        """Return the frames of a mission's items; None if they are not known."""
         course = self._log.missions.get((self.system_id, kind))
         return None if course is None else course.values[-1]
 
@@ -154,11 +154,11 @@ class LiveAnswers:
 
     @property
     def missing(self) -> int | None:
-        """The number of parameters that are not known; None if none is known."""
+        """Number of unknown parameters; None if none is known yet."""
         return self._count - len(self._values) if self._values else None
 
     def add(self, frame: MavFrame, now_us: int) -> None:
-        """Take in a frame of the vehicle."""
+        """Process a frame of the vehicle."""
         booted_us = boot_time_us(frame, now_us)
         if booted_us is not None:
             if self._booted_us is not None and booted_us - self._booted_us > RESTART_US:
@@ -176,13 +176,13 @@ class LiveAnswers:
             case shown if shown in SHOWN_IDS:
                 self._add_shown(frame, now_us)
             case mavlink.MAVLINK_MSG_ID_MISSION_ACK if frame.target != self._uploader:
-                # Of several stations that upload at once, the vehicle takes the items of one.
+                # Several stations are uploading; the vehicle accepts the items of one of them.
                 pass
             case part if part in MISSION_IDS:
                 self._add_mission(frame, now_us, is_upload=False)
 
     def add_request(self, message: Any, frame: MavFrame, now_us: int) -> None:
-        """Take in a request that a station sends to the vehicle."""
+        """Process a request from a station to the vehicle."""
         match message.get_type():
             case "PARAM_SET" if message.param_id != HASH_NAME:
                 self._values.pop(message.param_id, None)
@@ -214,10 +214,10 @@ class LiveAnswers:
         self.since_us.pop(PARAMETERS, None)
 
     def _drop_dependent(self) -> None:
-        """Drop all that another value of a parameter makes wrong."""
+        """Drop everything that a changed parameter invalidates."""
         self._ordered = None
         self.hash_frame: bytes | None = None
-        """PARAM_VALUE of the checksum that fits the parameters."""
+        """PARAM_VALUE with the checksum of the known parameters."""
         kept = self.files.items()
         self.files = {path: content for path, content in kept if PACKED not in path}
         readings = self._readings.items()
@@ -235,12 +235,12 @@ class LiveAnswers:
         if index == NO_INDEX:
             index = self._indices.get(name, NO_INDEX)
         if self._indices.get(name, index) != index or self._count not in (0, count):
-            # Others are switched on or off: all have other indices.
+            # Parameters were enabled or disabled, which changes all indices.
             self._drop_parameters()
         self._count = count
         known = self._values.get(name)
         if known is not None and content_of(known) != content_of(frame.data):
-            # Dropped now, as there may be no room for the new value.
+            # Drop the old value first: the new one may exceed the limit.
             del self._values[name]
             self._drop_dependent()
         if index < count and self.size < MAX_BYTES:
@@ -252,14 +252,14 @@ class LiveAnswers:
             self.since_us.setdefault(PARAMETERS, now_us)
 
     def _add_plan_ids(self, frame: MavFrame) -> None:
-        # The dialect lacks the ids; the number of items serves a vehicle without ids.
+        # The dialect lacks the ids; for a vehicle that sends none, the number of items is used.
         count, *ids = _PLAN_IDS.unpack(payload_of(frame.data, _PLAN_IDS.size))
         for kind, number in zip(KINDS, (ids[0] or count, *ids[1:]), strict=True):
             if self._plan_ids.setdefault(kind, number) != number:
                 self._drop_missions(kind)
 
     def _add_home(self, frame: MavFrame) -> None:
-        # Item 0 of ArduPilot's missions is home.
+        # Item 0 of ArduPilot's missions is the home position.
         home = payload_of(frame.data, _HOME_BYTES)
         if self._home not in (b"", home):
             self._drop_missions(mavlink.MAV_MISSION_TYPE_MISSION)
@@ -310,7 +310,7 @@ class LiveAnswers:
         elif packet.opcode == ACK and packet.data and self.size < MAX_BYTES:
             reading.chunks[packet.offset] = packet.data
         elif PACKED in reading.path and packet.data[:1] == bytes((FtpError.EOF,)):
-            # ArduPilot does not know the size of a file that it makes while it is read.
+            # ArduPilot does not announce the size of a file that it generates while it is read.
             reading.size = sum(map(len, reading.chunks.values()))
         content = reading.content()
         if content:

@@ -1,11 +1,11 @@
-"""Tlogs joined or merged: by time, and without the copies that several receivers recorded.
+"""Join or merge tlogs: by time, and without the copies that several receivers recorded.
 
 Theory of operation. Two programs that record the same link write the same frames, each at the time
-of its own clock. A frame whose bytes occur once in each file is a copy, and the difference of its
-times is the offset of the clocks plus the difference of the delays. Most copies have nearly the
-same difference, so the densest second of all differences holds it, and its median is the offset. A
-sample of the frames is enough: those whose last bytes, which are a checksum or a signature, are
-divisible by a power of two that grows with the file.
+of its own clock. A frame whose bytes occur exactly once in each file is a copy. The difference of
+its two times is the offset of the clocks plus the difference of the delays. Most copies have nearly
+the same difference, so the densest second of all differences is found, and its median is the
+offset. A sample of the frames suffices: those whose last two bytes, part of a checksum or a
+signature, are divisible by a power of two that grows with the file.
 """
 
 import heapq
@@ -23,27 +23,27 @@ from gateway.recordings.tlog_scan import TIME_SIZE
 from gateway.units import US_PER_S
 
 MAX_SAMPLE: Final = 50_000
-"""Frames of a file that are kept to compare: some 10 MB."""
+"""Maximum number of frames in the sample of a file, about 10 MB."""
 WINDOW_US: Final = US_PER_S
-"""Copies of a frame lie within this time of each other, once the clocks are aligned."""
+"""Maximum time between copies of a frame, once the clocks are aligned."""
 LEAST_COPIES: Final = 10
-"""Fewer frames may be equal by chance: parameters are the same in every flight."""
+"""Fewer equal frames may be a coincidence: parameters are the same in every flight."""
 MAX_PENDING: Final = 100_000
-"""Frames whose copies are waited for; a file may give all its frames one time."""
+"""Maximum number of frames held to find copies; a file may give all its frames the same time."""
 PIECE: Final = 4096
-"""Records that become one batch: some 250 kB."""
+"""Records per batch, about 250 kB."""
 
 
 class FrameSample:
-    """A sample of the frames of a file, with their times, and the range of its times."""
+    """A sample of a file's frames with their times, and the file's range of times."""
 
     def __init__(self) -> None:
         self.first_us: int | None = None
         self.last_us: int | None = None
         self.step = 1
-        """Frames whose last two bytes are divisible by this are in the sample."""
+        """The sample contains frames whose last two bytes are divisible by this."""
         self.frames: dict[bytes, int | None] = {}
-        """Time of each frame; None if it occurs again."""
+        """Time of each frame; None if the frame occurs more than once."""
 
     def add(self, batch: Batch) -> None:
         """Add the next batch of the file."""
@@ -69,12 +69,12 @@ class FrameSample:
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """The offset of a file's clock to that of another one."""
+    """The offset between the clocks of two files."""
 
     offset_us: int
-    """To be added to the file's times."""
+    """Offset to add to the times of the file, µs."""
     copies: int
-    """Frames of the sample that both files hold."""
+    """Number of frames of the sample that are in both files."""
 
 
 def clock_offset(sample: FrameSample, reference: FrameSample) -> ClockOffset | None:
@@ -99,11 +99,11 @@ def clock_offset(sample: FrameSample, reference: FrameSample) -> ClockOffset | N
 
 @dataclass(slots=True)
 class Alignment:
-    """How the files of one flight lie to each other."""
+    """The relation of the clocks of one flight's files."""
 
     samples: list[FrameSample] = field(default_factory=list)
     offsets: list[ClockOffset | None] = field(default_factory=list)
-    """Of each file to the first one; None if it has no copies of frames of another file."""
+    """Offset of each file to the first one; None if no frame is copied in another file."""
 
     def add(self, batches: Iterable[Batch]) -> None:
         """Add the next file."""
@@ -120,11 +120,11 @@ class Alignment:
 
     @property
     def shifts_us(self) -> list[int]:
-        """Return what must be added to the times of each file."""
+        """Return the offset to add to the times of each file."""
         return [0 if offset is None else offset.offset_us for offset in self.offsets]
 
     def order(self, shifts_us: Sequence[int]) -> list[int]:
-        """Return the files' numbers by their begin; files without records come last."""
+        """Return the files' numbers by start time; files without records come last."""
         begins = [
             (sample.first_us is None, (sample.first_us or 0) + shift_us, number)
             for number, (sample, shift_us) in enumerate(zip(self.samples, shifts_us, strict=True))
@@ -132,7 +132,7 @@ class Alignment:
         return [number for *_, number in sorted(begins)]
 
     def overlap_us(self, shifts_us: Sequence[int]) -> int:
-        """Return the longest time that is in two files."""
+        """Return the longest time that is covered by two files."""
         longest_us, end_us = 0, -(1 << 62)
         for number in self.order(shifts_us):
             sample, shift_us = self.samples[number], shifts_us[number]
@@ -145,13 +145,13 @@ class Alignment:
 
 
 class Copies:
-    """Recognise the frames that another file has brought already."""
+    """Recognise frames that another file has contained already."""
 
     def __init__(self) -> None:
         self.count = 0
         """Copies found."""
         self._pending: dict[bytes, list[tuple[int, set[int]]]] = {}
-        """By frame: its times, and the files in which it was found then."""
+        """Times of each frame, each with the files that contain the frame at that time."""
         self._order: deque[tuple[int, bytes]] = deque()
 
     def is_copy(self, time_us: int, file: int, frame: bytes) -> bool:
@@ -177,7 +177,7 @@ class Copies:
 def by_time(
     files: Sequence[Iterable[Batch]], shifts_us: Sequence[int], copies: Copies | None = None
 ) -> Iterator[TlogRecord]:
-    """Yield the records of all files in order of their shifted times, without copies if wanted."""
+    """Yield the records of all files in order of shifted time; `copies` removes copies."""
 
     def shifted(number: int) -> Iterator[tuple[int, int, bytes]]:
         for batch in files[number]:
@@ -191,7 +191,7 @@ def by_time(
 
 
 def batched(records: Iterable[TlogRecord]) -> Iterator[Batch]:
-    """Put records into batches again."""
+    """Put records into batches."""
     scanner, rest = TlogScanner(), iter(records)
     while piece := b"".join(encode_record(r.time_us, r.frame) for r in islice(rest, PIECE)):
         yield scanner.feed(piece)

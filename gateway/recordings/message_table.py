@@ -1,16 +1,16 @@
-"""From the fields of an autopilot's own log to those of MAVLink messages, by a table.
+"""Convert fields of an autopilot's own log to those of MAVLink messages, by a table.
 
-The tables are `formats/dataflash.toml` and `formats/ulog.toml`. A message of them:
+The tables are `formats/dataflash.toml` and `formats/ulog.toml`. For example, the message
 
     [messages.VFR_HUD]
     of = ["POS", "GPS"]
     groundspeed = ["hypot(XKF1.VN m/s, XKF1.VE m/s)", "GPS.Spd m/s", 0]
 
-is sent for each row of the first topic of `of` that the log has. A field takes the first of its
-values that is known: `TOPIC.FIELD unit`, a function of such values, or a number. Units become
-those of the MAVLink definition; the unit that a log itself states goes before the table's.
-`*100` instead of a unit multiplies, `copter: ` before a value restricts it to a kind of vehicle,
-and `PARM.NAME` is a parameter, where `#` is the number of the instance, from 2 on.
+is sent for each row of the first topic of `of` that the log contains. A field gets the first of its
+values that is known: `TOPIC.FIELD unit`, a function of such values, or a number. Units are
+converted to those of the MAVLink definition; a unit that the log itself states has priority over
+the table's. `*100` instead of a unit is a factor, `copter: ` before a value restricts it to a kind
+of vehicle, and `PARM.NAME` is a parameter, where `#` is the number of the instance, from 2 on.
 
 With `each` a message is sent for every instance of its topic, by the names in that list, or by its
 own name if the list is empty. With `every_s` it is repeated at that interval, from the newest rows.
@@ -50,14 +50,14 @@ UNITS: Final[dict[str, tuple[str, float]]] = {
     "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6), "µs": ("time", 1e-6),
     "ratio": ("share", 1.0), "%": ("share", 1e-2), "d%": ("share", 1e-3), "c%": ("share", 1e-4),
 }  # fmt: skip
-"""Quantity of a unit, and its factor to SI, by its name in MAVLink or in the logs."""
+"""Quantity and factor to SI of each unit, by its name in MAVLink or in the logs."""
 TURN: Final = 2.0 * math.pi
 MAX_AGE_US: Final = 3_000_000
-"""A row that is older than this at the time of a message is not used for it."""
+"""Maximum age of a row whose values are used in a message."""
 _EKF_FLAGS: Final = 0x3FF
-"""Bits of ArduPilot's filter status that EKF_STATUS_REPORT has in the same places."""
+"""Bits that are the same in ArduPilot's filter status and in EKF_STATUS_REPORT."""
 _LANDED, _IN_AIR = 1, 2
-"""MAV_LANDED_STATE."""
+"""Values of MAV_LANDED_STATE."""
 WRAPPED: Final = frozenset({"compass", "course", "heading"})
 Values = Mapping[str, Any]
 _CALL: Final = re.compile(r"(?:(?P<kind>\w+): )?(?:(?P<function>\w+)\()?(?P<values>[^()]*)\)?")
@@ -99,14 +99,14 @@ FUNCTIONS: Final[dict[str, Callable[..., float]]] = {
     "known": lambda value: value if value > 0 else NAN,
     "minus": lambda value, other: value - other,
 }  # fmt: skip
-"""Of values in SI; `compass`, `course` and `heading` are angles from north, from 0 to a turn."""
+"""Functions of SI values; `compass`, `course` and `heading` are angles from north in [0, 2π)."""
 
 
 class Context(Protocol):
-    """The newest rows of a log, and its facts, as far as a message needs them."""
+    """The newest rows of a log and its facts, as the values of a message require them."""
 
     kind: str
-    """Of the vehicle, as in the table: copter, plane, rover …; empty if it is not known."""
+    """Kind of vehicle, as in the table: copter, plane, rover …; empty if it is not known."""
 
     def value(self, topic: str, name: str) -> float:
         """Return a field of the newest row of a topic; NaN if there is none, or it is too old."""
@@ -114,15 +114,15 @@ class Context(Protocol):
 
 
 class LogFacts(Protocol):
-    """A log, as far as a table is bound to it."""
+    """The facts of a log that binding a table requires."""
 
     @property
     def present(self) -> frozenset[str]:
-        """Topics with rows."""
+        """Topics that have rows."""
         ...
 
     def unit(self, topic: str, name: str) -> str | None:
-        """Return the unit that the log itself states; None without one."""
+        """Return the unit that the log itself states; None if it states none."""
         ...
 
 
@@ -131,17 +131,17 @@ Read = Callable[[Context], float]
 
 @dataclass(frozen=True, slots=True)
 class LogField:
-    """A field of a log's topic, and its unit by the table."""
+    """A field of a log's topic, and its unit according to the table."""
 
     topic: str
     name: str
     quantity: str
     factor: float
-    """To SI, or to the field's own scale where it has no unit."""
+    """Factor to SI, or to the field's own scale if it has no unit."""
 
     @classmethod
     def parse(cls, text: str) -> "LogField":
-        """Parse `TOPIC.FIELD unit`; raises ValueError if it is none."""
+        """Parse `TOPIC.FIELD unit`; raises ValueError for any other text."""
         found = _VALUE.fullmatch(text)
         if found is None or (found["unit"] or "ratio") not in UNITS:
             raise ValueError(f"{text!r} is not TOPIC.FIELD with a known unit")
@@ -149,7 +149,7 @@ class LogField:
         return cls(found["topic"], found["name"], quantity, float(found["factor"] or factor))
 
     def factor_in(self, log: LogFacts) -> float:
-        """Return the factor to SI for the unit that a log states, or else for the table's."""
+        """Return the factor to SI of the unit that the log states, or else of the table's."""
         stated = UNITS.get(log.unit(self.topic, self.name) or "")
         is_same = stated is not None and stated[0] == self.quantity
         return stated[1] if stated is not None and is_same else self.factor
@@ -157,28 +157,28 @@ class LogField:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """One of the values of a field: a number, a source, or a function of sources."""
+    """One of the alternative values of a field: a number, a source, or a function of sources."""
 
     sources: tuple[LogField, ...] = ()
     function: str = ""
     kind: str = ""
-    """Kind of vehicle that it is restricted to."""
+    """Kind of vehicle to which the value is restricted; empty for all."""
     number: float = 0.0
 
     @classmethod
     def parse(cls, given: str | float) -> "Value":
-        """Parse a value; raises ValueError if it is none."""
+        """Parse a value; raises ValueError if it is malformed."""
         if not isinstance(given, str):
             return cls(number=given)
         found = _CALL.fullmatch(given)
         function = (found and found["function"]) or ""
         if found is None or (function and function not in FUNCTIONS):
-            raise ValueError(f"{given!r} is no value")
+            raise ValueError(f"{given!r} is not a value")
         texts = [text for text in found["values"].split(", ") if text]
         return cls(tuple(map(LogField.parse, texts)), function, found["kind"] or "")
 
     def bind(self, log: LogFacts, kind: str, factor: float) -> Read | None:
-        """Return its reader for a field with a factor to SI; None if the log cannot have it."""
+        """Return a reader with a factor to SI; None if the log cannot contain the value."""
         if self.kind not in ("", kind):
             return None
         if not self.sources:
@@ -207,7 +207,7 @@ def _call(
         if not all(map(math.isfinite, values)):
             return NAN
         found = function(*values) / factor
-        # Half a unit before the full turn is rounded to it.
+        # A value within half a unit of the full turn would be rounded to it.
         return found - turn if turn and turn > 1 and round(found) >= turn else found
 
     return read
@@ -225,15 +225,15 @@ class MessageRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True)
 class BoundMessage:
-    """A message of a table for one log and one instance: how each of its elements is read."""
+    """A message of a table, bound to a log and an instance."""
 
     name: str
     packer: MessagePacker
     reads: tuple[tuple[bool, tuple[Read, ...]], ...]
-    """By element in the order of the definition: whether it is a whole number, and its readers."""
+    """For each element in the order of the definition: whether it is an integer; its readers."""
 
     def values(self, context: Context, times: Mapping[str, int]) -> list[float]:
-        """Return the values of all elements; unknown ones are NaN, and 0 of whole numbers."""
+        """Return the values of all elements; an unknown one is NaN, or 0 for an integer."""
         found: list[float] = []
         for is_whole, reads in self.reads:
             value = NAN if reads else 0.0
@@ -249,7 +249,7 @@ class BoundMessage:
         return found
 
     timed: tuple[tuple[int, str, int], ...] = ()
-    """Places of the fields with the time of the row, and the greatest value of their types."""
+    """Index of each field with the time of the row, its name, and the maximum of its type."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,22 +258,22 @@ class MessageTable:
 
     messages: tuple[MessageRow, ...]
     aliases: dict[str, tuple[str, int]] = field(default_factory=dict)
-    """Topic and instance of topics by other names."""
+    """Topic and instance by former topic name."""
     lanes: dict[str, str] = field(default_factory=dict)
-    """Topics of several filters, and where the number of the one that is used is found."""
+    """Topics of several filters; value: the field with the number of the filter in use."""
     health: dict[str, int] = field(default_factory=dict)
     """Bits of MAV_SYS_STATUS_SENSOR by topic."""
     known: frozenset[str] = frozenset()
-    """Topics that are used otherwise than for a field: modes, texts, parameters."""
+    """Topics that are used for other purposes than fields: modes, texts, parameters."""
     modes: dict[str, dict[str, str]] = field(default_factory=dict)
-    """Names by kind of vehicle and custom mode."""
+    """Names by custom mode, by kind of vehicle."""
     vehicle_types: dict[str, int] = field(default_factory=dict)
     nav_states: dict[str, tuple[str, int, int]] = field(default_factory=dict)
-    """Of PX4: name, main mode and sub mode."""
+    """PX4's navigation states: name, main mode and sub mode."""
 
     @property
     def topics(self) -> frozenset[str]:
-        """All topics that are used, by the names of the log."""
+        """All topics in use, by their names in the log."""
         used = {t for one in self.messages for t in one.of} | self.known | {*self.health}
         used |= {source.topic for source in self.sources}
         used |= {where.partition(".")[0] for where in self.lanes.values()}
@@ -281,7 +281,7 @@ class MessageTable:
 
     @property
     def sources(self) -> Iterator[LogField]:
-        """All fields that are used."""
+        """All fields in use."""
         for one in self.messages:
             for values in one.fields.values():
                 for value in values:

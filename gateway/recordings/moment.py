@@ -11,7 +11,7 @@ MAX_TEXT: Final = 40
 USE: Final = "use 80, 1:20 or 2026-06-11T14:25:30Z"
 FIRST_US: Final = 0
 LAST_US: Final = 253_402_300_799 * US_PER_S
-"""The ends of the calendar that other programs read: 1970 to 9999."""
+"""Latest time that other programs read, the end of 9999."""
 _CLOCK: Final = re.compile(r"([+-]?)(?:(\d+):)?(?:(\d+):)?(\d+(?:\.\d*)?|\.\d+)\s*s?")
 
 
@@ -20,14 +20,14 @@ class Moment:
     """A moment of a recording; exactly one of the two is set."""
 
     offset_s: float | None = None
-    """From the start, or from here if `relative`."""
+    """Time from the start, or from the present position if `relative`."""
     relative: bool = False
     time_us: int | None = None
     """Civil time in µs since 1970."""
 
 
 def parse_moment(text: str) -> Moment:
-    """Read a moment; raises ValueError if it has another form."""
+    """Parse a moment; raises ValueError for any other form."""
     if len(text) > MAX_TEXT:
         raise ValueError(f"invalid time of {len(text)} letters; {USE}")
     if match := _CLOCK.fullmatch(text.strip()):
@@ -45,7 +45,7 @@ def parse_moment(text: str) -> Moment:
 
 
 def civil_time(unix_us: float) -> datetime | None:
-    """Return a time in µs since 1970 as a moment in UTC; None beyond the calendar's years."""
+    """Return a time in µs since 1970 as UTC; None outside of the years that a calendar can show."""
     try:
         return datetime.fromtimestamp(unix_us / US_PER_S, UTC)
     except (ValueError, OverflowError, OSError):
@@ -53,14 +53,14 @@ def civil_time(unix_us: float) -> datetime | None:
 
 
 def time_us_of(moment: Moment, first_us: int) -> int:
-    """Convert a moment to a recording's own time, given that of its start."""
+    """Convert a moment to the recording's time, given that of its start."""
     if moment.time_us is not None:
         return moment.time_us
     return first_us + round((moment.offset_s or 0.0) * US_PER_S)
 
 
 def iso_time(unix_us: int) -> str:
-    """Write a time as ISO 8601; one beyond the calendar as its nearest end."""
+    """Write a time as ISO 8601; a time outside of the calendar as the nearest end."""
     seconds, fraction_us = divmod(min(max(unix_us, FIRST_US), LAST_US), US_PER_S)
     moment = datetime.fromtimestamp(seconds, UTC)
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{fraction_us // 1000:03d}Z"

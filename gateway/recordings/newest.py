@@ -1,9 +1,8 @@
-"""The newest state of live vehicles from their MAVLink: one reader for pages, outputs and metrics.
+"""The newest state of live vehicles from their MAVLink, for pages, outputs and metrics.
 
-Of each vehicle it keeps the newest message of each name. The position is that of the best source
-(see `positions`), unless a better one is interrupted; it is valid for outputs while it is not old
-and the vehicle's estimator, if it reports its quality, has an absolute position. Pure: time is an
-argument.
+The newest message of each name is kept for each vehicle. The position is that of the best source
+(see `positions`), unless a better one is interrupted. It is valid for outputs unless it is old, or
+the vehicle's estimator reports that it has no absolute position. Pure: time is an argument.
 """
 
 import math
@@ -33,43 +32,43 @@ from gateway.wire.mavlink_splitter import MavFrame
 Fields = Mapping[str, Any]
 
 HEARD_US: Final = 60 * US_PER_S
-"""A vehicle that was not heard for longer has gone."""
+"""Time after its last message at which a vehicle is removed."""
 POSITION_FRESH_US: Final = 3 * US_PER_S
-"""Positions of a poorer source are left out so long after one of a better source."""
+"""Time after a position of a better source for which inferior sources are ignored."""
 POSITION_OLD_US: Final = 5 * US_PER_S
-"""An older position is not sent: five times the usual interval of a radio."""
+"""Maximum age of a valid position: five times the usual interval of a radio."""
 QUALITY_OLD_US: Final = 15 * US_PER_S
-"""An older report of an estimator does not concern the present position."""
+"""Maximum age of an estimator's report that applies to the present position."""
 ATTITUDE_FRESH_US: Final = US_PER_S
-"""The quaternion is preferred to the angles unless it is older than this."""
+"""Maximum age of a quaternion that is preferred to the angles."""
 UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
 UNKNOWN_SATELLITES: Final = 255
 UNKNOWN_U32: Final = 0xFFFFFFFF
 LEAST_SPEED_MPS: Final = 0.2
-"""Below it a velocity has no direction."""
+"""Minimum speed at which a velocity has a direction."""
 _PRESENT: Final = ("GLOBAL_POSITION_INT", "GLOBAL_POSITION_INT_COV", "LOCAL_POSITION_NED")
 _ABSOLUTE, _CONSTANT = mavlink.ESTIMATOR_POS_HORIZ_ABS, mavlink.ESTIMATOR_CONST_POS_MODE
-"""Bits of ESTIMATOR_STATUS, and the same ones of ArduPilot's EKF_STATUS_REPORT."""
+"""Bits of ESTIMATOR_STATUS; they are the same in ArduPilot's EKF_STATUS_REPORT."""
 STATE_IDS: Final = frozenset(RANKS) | ids_of(
     *("HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "VFR_HUD", "BATTERY_STATUS", "SYS_STATUS"),
     *("HOME_POSITION", "GPS_GLOBAL_ORIGIN", "ESTIMATOR_STATUS", "EKF_STATUS_REPORT"),
     "RADIO_STATUS",
 )
-"""The messages from which the state is taken."""
+"""Messages from which the state is derived."""
 
 
 class VehicleComponents:
-    """Which component of each live system is its vehicle.
+    """The component of each live system that is its vehicle.
 
-    Component 1 is, else the first with the heartbeat of an autopilot: so the attitude of a gimbal
-    or the position of a camera is not that of its aircraft.
+    It is component 1, or the first one that sends an autopilot's heartbeat. So the attitude of a
+    gimbal or the position of a camera is not taken for the aircraft's.
     """
 
     def __init__(self) -> None:
         self._components: dict[int, int] = {}
 
     def includes(self, system_id: int, component_id: int, autopilot: int | None) -> bool:
-        """Return whether a message is a vehicle's; `autopilot` is that of a heartbeat."""
+        """Return whether a message is a vehicle's; `autopilot` is the one in a heartbeat."""
         if not 0 < system_id < FIRST_GROUND_STATION:
             return False
         if component_id == AUTOPILOT:
@@ -79,20 +78,20 @@ class VehicleComponents:
         return self.is_known(system_id, component_id)
 
     def is_known(self, system_id: int, component_id: int) -> bool:
-        """Return whether a component is the vehicle of its system, as far as was heard."""
+        """Return whether a component is known to be the vehicle of its system."""
         return component_id == self._components.get(system_id)
 
 
 @dataclass(slots=True)
 class GpsReport:
-    """The newest report of the first GPS receiver that has one; NaN is unknown."""
+    """The newest report of the first GPS receiver that sent one; NaN is unknown."""
 
     fix_type: int
-    """GPS_FIX_TYPE."""
+    """A GPS_FIX_TYPE."""
     satellites: float
     hdop: float
     separation_m: float
-    """Height of the geoid above the ellipsoid."""
+    """Height of the geoid above the ellipsoid, m."""
     course_deg: float
     h_acc_m: float
     v_acc_m: float
@@ -103,17 +102,17 @@ class NewestState:
 
     def __init__(self) -> None:
         self.fields: dict[str, Fields] = {}
-        """The newest message of each name, as its fields by name."""
+        """Fields of the newest message of each name."""
         self.heard_us: dict[str, int] = {}
-        """When that came."""
+        """When each of these messages arrived."""
         self.position: Position | None = None
-        """The newest of its best source."""
+        """The newest position of the best source."""
         self.position_us = -POSITION_FRESH_US
         self._source = ""
         self._origin: Position | None = None
 
     def update(self, name: str, fields: Fields, now_us: int) -> bool:
-        """Use a message; return whether it brought a new position."""
+        """Process a message; return whether it contained a new position."""
         self.fields[name] = fields
         self.heard_us[name] = now_us
         if name == "GPS_GLOBAL_ORIGIN":
@@ -131,12 +130,12 @@ class NewestState:
         return True
 
     def age_us(self, now_us: int, *names: str) -> float:
-        """Return the age of the newest of some messages; infinite if none came."""
+        """Return the age of the newest of these messages; infinite if there is none."""
         heard = [self.heard_us[name] for name in names if name in self.heard_us]
         return now_us - max(heard) if heard else math.inf
 
     def valid_position(self, now_us: int) -> Position | None:
-        """Return the position, if it may be sent on: neither old nor disclaimed by its sender."""
+        """Return the position, if it is neither old nor marked as invalid by the estimator."""
         if self.position is None or now_us - self.position_us > POSITION_OLD_US:
             return None
         for name in ("ESTIMATOR_STATUS", "EKF_STATUS_REPORT") if self._source in _PRESENT else ():
@@ -167,7 +166,7 @@ class NewestState:
         return float(hud["heading"] % 360) if hud is not None else NAN
 
     def true_heading_deg(self, now_us: int) -> float:
-        """Return the present heading, if its sender knows it; NaN if unknown or old."""
+        """Return the present heading as its sender reports it; NaN if unknown or old."""
         for name, field, unit_deg in (
             ("GLOBAL_POSITION_INT", "hdg", M_PER_CM),
             ("VFR_HUD", "heading", 1.0),
@@ -179,7 +178,7 @@ class NewestState:
         return NAN
 
     def airspeed_mps(self) -> float:
-        """Return the airspeed; unknown where the field repeats the ground speed, without sensor."""
+        """Return the airspeed; NaN if the field repeats the ground speed, without a sensor."""
         hud = self.fields.get("VFR_HUD")
         unknown = hud is None or hud["airspeed"] == hud["groundspeed"]
         return NAN if hud is None or unknown else float(hud["airspeed"])
@@ -205,7 +204,7 @@ class NewestState:
         return float(sum(volts)) if volts else NAN, float(percent)
 
     def satellites(self) -> float:
-        """Return the number of satellites; a log without it has a fix of none."""
+        """Return the number of satellites; NaN if unknown, as with a fix of 0 satellites."""
         fix = self.fields.get("GPS_RAW_INT")
         if fix is None or fix["satellites_visible"] == UNKNOWN_SATELLITES:
             return NAN
@@ -238,11 +237,11 @@ class NewestState:
         return bool(beat and beat["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
 
     def mode(self) -> str:
-        """Return the flight mode in the words of its autopilot; empty if unknown."""
+        """Return the flight mode under its autopilot's name; empty if unknown."""
         beat = self.fields.get("HEARTBEAT") or self.fields.get("HIGH_LATENCY2")
         if beat is None:
             return ""
-        # HIGH_LATENCY2 has the upper half of the mode of PX4.
+        # HIGH_LATENCY2 contains the upper half of PX4's custom mode.
         is_half = "base_mode" not in beat and beat["autopilot"] == mavlink.MAV_AUTOPILOT_PX4
         number = beat["custom_mode"] << 16 if is_half else beat["custom_mode"]
         return mode_name(beat["autopilot"], beat["type"], number)
@@ -257,15 +256,15 @@ def _rates(fields: Fields) -> Vec3:
 
 
 class NewestVehicles:
-    """The newest states of the vehicles whose frames are fed."""
+    """The newest states of all vehicles whose frames are fed."""
 
     def __init__(self) -> None:
         self.states: dict[int, NewestState] = {}
-        """By system id."""
+        """States by system id."""
         self.components = VehicleComponents()
 
     def heard(self, now_us: int) -> dict[int, NewestState]:
-        """Return those that were heard within `HEARD_US`, by system id in its order."""
+        """Return the vehicles received within `HEARD_US`, ordered by system id."""
         return {
             system_id: state
             for system_id, state in sorted(self.states.items())
@@ -273,7 +272,7 @@ class NewestVehicles:
         }
 
     def feed(self, frame: MavFrame, now_us: int) -> NewestState | None:
-        """Process a frame of `STATE_IDS`; return the state of its vehicle, if it is of one."""
+        """Process a frame of `STATE_IDS`; return its vehicle's state, if a vehicle sent it."""
         message_id, (system_id, component_id) = frame.message_id, frame.origin
         if message_id not in DEFINITIONS or not 0 < system_id < FIRST_GROUND_STATION:
             return None

@@ -1,4 +1,4 @@
-"""Recordings opened for the player, with the times and ids of their vehicles."""
+"""Open recordings for the player, with the times and ids of their vehicles."""
 
 import logging
 import os
@@ -40,14 +40,14 @@ log = logging.getLogger(__name__)
 
 READ_SIZE: Final = 1 << 20
 PIECE: Final = 8
-"""Frames generated at once: one or two milliseconds."""
+"""Frames generated per step, which takes one or two milliseconds."""
 
 
 class TlogFile:
-    """A tlog on disk: its index, and reading at any position.
+    """A tlog on disk: its index, and random access.
 
-    It is read, not memory-mapped: a file that shrinks, or a USB stick that is pulled out, would
-    kill a process that had mapped it.
+    It is read, not memory-mapped: if a file shrinks, or a USB stick is pulled out, a process that
+    has mapped it is killed.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class TlogFile:
         self.path = path
         source = open_tlog(path)
         self.remarks = source.remarks
-        """Remarks for the user about its times."""
+        """Remarks for the user on its times."""
         is_plain = source.layout is Layout.TLOG and not is_packed(path)
         if is_plain:
             self._file = open_descriptor(path)
         else:
-            # Only a plain tlog can be read at any position.
+            # Only a plain tlog allows random access.
             with temporary_copy(path, source.chunks(None, unpacked_limit)) as plain:
                 self._file = os.dup(plain.fileno())
         self.index = TlogIndex(source.timeline)
@@ -82,11 +82,11 @@ class TlogFile:
             offset += len(data)
             if progress is not None:
                 progress(len(data))
-        # What is recorded from here on is not indexed, and not played.
+        # Records written from here on are not indexed, and not played.
         self._size = offset
 
     def read(self, offset: int, size: int) -> bytes:
-        """Read up to `size` bytes; nothing at the end, or if the medium fails."""
+        """Read up to `size` bytes; empty at the end, or if the medium fails."""
         try:
             return os.pread(self._file, max(0, min(size, self._size - offset)), offset)
         except OSError:
@@ -98,16 +98,16 @@ class TlogFile:
         return self.index.last_us or 0
 
     def prepare(self, until_us: int) -> bool:  # noqa: ARG002
-        """Return True: everything is there."""
+        """Return True: no preparation is needed."""
         return True
 
     def close(self) -> None:
-        """Close the file; its tracks end."""
+        """Close the file, which ends its tracks."""
         os.close(self._file)
 
 
 class FusedTlog:
-    """Generate frames on demand, and keep them on disk for seeking back."""
+    """Frames that are generated on demand, and stored on disk for seeking back."""
 
     def __init__(
         self,
@@ -129,27 +129,27 @@ class FusedTlog:
 
     @property
     def last_us(self) -> int:
-        """Time of the end, or of the last frame generated."""
+        """Time of the end, or of the last frame generated so far, whichever is later."""
         return max(self._last_us or 0, self.index.last_us or 0)
 
     def read(self, offset: int, size: int) -> bytes:
-        """Read up to `size` bytes; generate the next frames if there are none yet."""
+        """Read up to `size` bytes; frames that do not exist yet are generated."""
         while offset >= self._size and self._make():
             pass
         return os.pread(self._file.fileno(), size, offset)
 
     def prepare(self, until_us: int) -> bool:
-        """Generate a few of the frames up to a time; return whether all are there."""
+        """Generate a few of the frames up to a time; return whether all are available."""
         return (self.index.last_us or 0) >= until_us or not self._make()
 
     def close(self) -> None:
         """Delete the generated frames."""
         with suppress(OSError):
-            # Closing tries again to write the bytes that a full disk had refused.
+            # Closing repeats the write that failed on a full disk.
             self._file.close()
 
     def _make(self) -> bool:
-        """Generate some frames; return whether there were any."""
+        """Generate some frames; return whether there were any left."""
         if self._ended:
             return False
         made = b"".join(encode_record(r.time_us, r.frame) for r in islice(self._frames, PIECE))
@@ -170,7 +170,7 @@ class FusedTlog:
 
 @dataclass(slots=True)
 class OpenFlight:
-    """One open recording, of any number of parts."""
+    """One open recording of one or several parts."""
 
     sources: list[Source] = field(default_factory=list)
     answers: LogAnswers = field(default_factory=LogAnswers)
@@ -179,31 +179,31 @@ class OpenFlight:
 
     @property
     def first_us(self) -> int:
-        """Civil time of its begin."""
+        """Civil time of its start."""
         return min(source.index.first_us or 0 for source in self.sources)
 
     @property
     def last_us(self) -> int:
-        """Civil time of its end, as far as that is known."""
+        """Civil time of its end, as far as it is known."""
         return max(source.last_us for source in self.sources)
 
     @property
     def vehicles(self) -> list[int]:
-        """System ids of all senders that are not ground stations."""
+        """System ids of all senders except ground stations."""
         systems = (source.index.senders.systems() for source in self.sources)
         return sorted(set().union(*systems))
 
 
 @dataclass(frozen=True, slots=True)
 class PlayedFlight:
-    """A recording as it is played: when, and under which system ids."""
+    """A recording in playback, with its shift in time and its system ids."""
 
     tracks: tuple[Track, ...]
     answers: LogAnswers
     shift_us: int
-    """From the recording's time to the player's."""
+    """Shift from the recording's time to the player's."""
     system_ids: dict[int, int]
-    """Of its vehicles: recorded and played."""
+    """Played system id of each recorded vehicle."""
 
 
 def open_flights(
@@ -214,13 +214,12 @@ def open_flights(
     fuse: bool = False,
     both: bool = False,
 ) -> list[OpenFlight]:
-    """Index the tlogs, and begin to read or fuse other files; the parts of a recording together.
+    """Index the tlogs, and begin to read or fuse other files; parts of a recording together.
 
-    Of an autopilot's own log its estimates are played; with `fuse` those of mavgate, and with
-    `both` these and those.
+    For an autopilot's own log, its own estimates are played; with `fuse`, those of mavgate; with
+    `both`, its own and those of mavgate.
 
-    Raises FlightError if there is nothing to play in one of them; OSError if one cannot be
-    read.
+    Raises FlightError if a file contains nothing to play; OSError if a file cannot be read.
     """
     flights = []
     for parts in parts_together(files):
@@ -247,7 +246,7 @@ def _open_made(
     opened: ExitStack,
     estimates: Estimates,
 ) -> None:
-    """Begin to generate the frames of a flight that has none."""
+    """Begin to generate the frames of a flight that contains none."""
 
     def add(frames: Iterator[TlogRecord], last_us: int | None = None) -> None:
         made = FusedTlog(frames, last_us, flight.answers)
@@ -271,7 +270,7 @@ def _open_made(
 def lay_out(
     flights: Sequence[OpenFlight], wanted_ids: Sequence[int] = (), *, with_commands: bool
 ) -> list[PlayedFlight]:
-    """Give each vehicle its own system id, and recordings of different days the same start."""
+    """Assign each vehicle its own system id; start recordings of different days together."""
     begin_us, end_us = flights[0].first_us, flights[0].last_us
     used: set[int] = set()
     played = []

@@ -1,17 +1,17 @@
 """Play recordings: when each recorded frame is due.
 
-Theory of operation. While it plays, one line ties the gateway clock to the recording:
+Theory of operation. During playback, a linear relation ties the gateway clock to the recording:
 
     due = anchor_now + (time - anchor_time) / speed
 
-Pause, speed, seek, a skipped gap and a clock that jumps within the recording only set a new
-anchor. Frames come in the order of their times over all tracks. At infinite speed everything is
-due at once and the owner's batch size sets the pace.
+Pausing, a change of speed, a seek, a skipped gap, and a jump of the recorded clock only set a new
+anchor. Frames are played in the order of their times over all tracks. At infinite speed everything
+is due at once, and the caller's batch size limits the rate.
 
 | state   | resume, seek, step, speed               | end of the range reached            |
 | ------- | --------------------------------------- | ----------------------------------- |
-| playing | takes effect from here                  | loop: seek to its begin; else ended |
-| paused  | resume: playing; step: so many frames   | stays paused                        |
+| playing | takes effect from the present position  | loop: seek to its start; else ended |
+| paused  | resume: playing; step: next frames      | stays paused                        |
 | ended   | seek: playing; resume: from the start   |                                     |
 """
 
@@ -35,10 +35,10 @@ from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 
 BLOCK_BYTES: Final = 1 << 18
-"""Read at once while playing: some 0.1 s of reading and deciding for minutes of flight."""
+"""Bytes per read during playback: minutes of flight, for 0.1 s of processing."""
 
 CONTEXT_RECORDS: Final = 20 * STRIDE
-"""How far back a seek looks for frames that a ground station needs: a minute and more."""
+"""Records that a seek searches backwards for a vehicle's state: more than a minute."""
 CONTEXT_IDS: Final = [
     MESSAGE_IDS[name]
     for name in (
@@ -47,40 +47,40 @@ CONTEXT_IDS: Final = [
         "HOME_POSITION", "EXTENDED_SYS_STATE",
     )
 ]  # fmt: skip
-"""The messages that show the state of a vehicle."""
+"""Messages that contain the state of a vehicle."""
 _CONTEXT: Final = frozenset(CONTEXT_IDS)
 LEAST_SPEED: Final = 0.1
 GREATEST_SPEED: Final = 100.0
 AS_FAST_AS_POSSIBLE: Final = math.inf
 END_OF_TIME_US: Final = 1 << 64
 CLOCK_JUMP_US: Final = 86_400 * US_PER_S
-"""A longer gap means that a clock was set; it is skipped."""
+"""A longer gap is a change of the clock and is skipped."""
 
 
 class Source(Protocol):
-    """A tlog that exists, or is generated as it is read."""
+    """A tlog that exists, or is generated while it is read."""
 
     @property
     def index(self) -> TlogIndex:
-        """Index of the part that exists so far."""
+        """Index of the part that is available so far."""
         ...
 
     @property
     def last_us(self) -> int:
-        """Time of its end, as far as known; 0 if it is empty."""
+        """Time of its end as far as it is known; 0 if it is empty."""
         ...
 
     def read(self, offset: int, size: int) -> bytes:
-        """Read up to `size` bytes; nothing at the end."""
+        """Read up to `size` bytes; empty at the end."""
         ...
 
     def prepare(self, until_us: int) -> bool:
-        """Do a part of the work for reading up to a time; return whether it is done."""
+        """Do a part of the work for reading up to a time; return whether it is finished."""
         ...
 
 
 class Track:
-    """A tlog being played."""
+    """A tlog in playback."""
 
     def __init__(
         self,
@@ -97,11 +97,11 @@ class Track:
         self._records = self._records_of(self._read_from(0))
         self._next = next(self._records, None)
         self.ahead: list[bytes] = []
-        """The first messages after the last seek that show the state of a vehicle."""
+        """First message of each kind after the last seek that contains a vehicle's state."""
 
     @property
     def first_us(self) -> int:
-        """Time of the first record; 0 in an empty recording."""
+        """Time of the first record; 0 if the recording is empty."""
         return (self._source.index.first_us or 0) + self._shift_us
 
     @property
@@ -110,11 +110,11 @@ class Track:
         return self._source.last_us + self._shift_us
 
     def prepare(self, time_us: int) -> bool:
-        """Do a part of the work for a seek; return whether it can be made at once now."""
+        """Do a part of the work for a seek; return whether the seek would be immediate now."""
         return self._source.prepare(time_us - self._shift_us)
 
     def peek_us(self) -> int | None:
-        """Return the time of the next record, None at the end."""
+        """Return the time of the next record; None at the end."""
         return None if self._next is None else self._next.time_us + self._shift_us
 
     def take(self) -> bytes:
@@ -126,7 +126,7 @@ class Track:
         return self._addressed(record.frame)
 
     def seek(self, time_us: int) -> list[bytes]:
-        """Move to the first record that is not before a time."""
+        """Move to the first record at or after a time; return the frames of the state before it."""
         wanted_us = time_us - self._shift_us
         newest: dict[tuple[int, int, int], bytes] = {}
         batches = self._read_from(self._source.index.offset_before(wanted_us, CONTEXT_RECORDS))
@@ -139,7 +139,7 @@ class Track:
             for i in known.tolist():
                 frame = batch.frame(i)
                 key = _kind_of(frame)
-                # Taken out first, so that the newest come last.
+                # Removed first, so that the newest frames are last.
                 newest.pop(key, None)
                 newest[key] = frame
             if len(reached):
@@ -150,7 +150,7 @@ class Track:
         return [self._addressed(frame) for frame in newest.values()]
 
     def _ahead(self, batch: Batch, begin: int) -> list[bytes]:
-        """Return the first message of each kind that shows a state."""
+        """Return the first message of each kind that contains a state."""
         wanted = self._wanted(batch, begin)
         shown = wanted[np.isin(batch.message_ids[wanted], CONTEXT_IDS)]
         kinds = batch.origins[shown] << 32 | batch.message_ids[shown]
@@ -163,7 +163,7 @@ class Track:
         return telemetry_of(batch, begin, self._source.index.senders)
 
     def _records_of(self, batches: Iterator[Batch], begin: int = 0) -> Iterator[TlogRecord]:
-        """Yield the records to play; sequence numbers have no gap where answers are left out.
+        """Yield the records to play; sequence numbers are closed up where answers are left out.
 
         `begin` is the first record of the first batch.
         """
@@ -210,7 +210,7 @@ class Track:
 
 
 class PlayState(StrEnum):
-    """State of a player."""
+    """State of the player."""
 
     PLAYING = "playing"
     PAUSED = "paused"
@@ -218,14 +218,14 @@ class PlayState(StrEnum):
 
 
 def check_speed(speed: float) -> float:
-    """Check a speed: 0.1 to 100, or infinite; raises ValueError if it is outside."""
+    """Check a speed: 0.1 to 100, or infinite; raises ValueError for any other."""
     if speed != AS_FAST_AS_POSSIBLE and not LEAST_SPEED <= speed <= GREATEST_SPEED:
         raise ValueError(f"speed {speed:g}; {LEAST_SPEED:g} to {GREATEST_SPEED:g}, or inf")
     return speed
 
 
 class Player:
-    """Play several recordings together."""
+    """Play several recordings simultaneously."""
 
     def __init__(
         self,
@@ -246,24 +246,24 @@ class Player:
         self.loop = loop
         self.state = PlayState.PLAYING
         self.sent = 0
-        """Frames so far."""
+        """Number of frames sent."""
         self.speed = check_speed(speed)
-        """Factor to recorded time."""
+        """Ratio of playback to recorded time."""
         self._anchor = (now_us, self.begin_us)
         self.position_us = self.begin_us
-        """Recorded time of the newest frame that was played."""
+        """Recorded time of the last frame played."""
         self._held: dict[tuple[int, int, int], bytes] = {}
-        """The newest message of each kind that shows the state of a vehicle."""
+        """The newest message of each kind that contains the state of a vehicle."""
         self._context = self._seek_tracks(self.begin_us)
 
     @property
     def end_us(self) -> int:
-        """End of the range; may move while a table is being fused during playback."""
+        """End of the range; it may change while a table is fused during playback."""
         last_us = max(t.last_us for t in self._tracks)
         return last_us if self._end_us is None else min(self._end_us, last_us)
 
     def set_speed(self, speed: float, now_us: int) -> None:
-        """Change the speed from here on; raises ValueError like `check_speed`."""
+        """Change the speed from now on; raises ValueError like `check_speed`."""
         here_us = self._time_at(now_us)
         self.speed = check_speed(speed)
         self._anchor = (now_us, here_us)
@@ -275,7 +275,7 @@ class Player:
             self.state = PlayState.PAUSED
 
     def resume(self, now_us: int) -> None:
-        """Resume; after the end, from the start."""
+        """Resume; after the end, start again."""
         if self.state is PlayState.ENDED:
             self.seek(self.begin_us, now_us)
         elif self.state is PlayState.PAUSED:
@@ -283,7 +283,7 @@ class Player:
         self.state = PlayState.PLAYING
 
     def step(self, now_us: int, count: int = 1) -> list[bytes]:
-        """Pause, and play the next frames at once."""
+        """Pause, and return the next frames immediately."""
         self.pause(now_us)
         frames, self._context = self._context, []
         for _ in range(count):
@@ -295,19 +295,19 @@ class Player:
         return frames
 
     def held(self) -> list[bytes]:
-        """Return the state of the vehicles at the present position.
+        """Return the frames of the vehicles' state at the present position.
 
-        What was not sent before it is as in its first message.
+        For a message that was not sent before this position, the first one after it is returned.
         """
         ahead = {_kind_of(frame): frame for track in self._tracks for frame in track.ahead}
         return list((ahead | self._held).values())
 
     def prepare(self, time_us: int) -> bool:
-        """Do a part of the work for a seek; return whether it can be made at once now."""
+        """Do a part of the work for a seek; return whether the seek would be immediate now."""
         return all(track.prepare(time_us) for track in self._tracks)
 
     def seek(self, time_us: int, now_us: int) -> None:
-        """Move to a time of the recordings, limited to the range; a paused player stays paused."""
+        """Move to a recorded time, limited to the range; a paused player stays paused."""
         time_us = min(max(time_us, self.begin_us), self.end_us)
         self._context = self._seek_tracks(time_us)
         self._anchor = (now_us, time_us)
@@ -316,7 +316,7 @@ class Player:
             self.state = PlayState.PLAYING
 
     def next_due_us(self) -> int | None:
-        """Return when `poll` is to be called next; None while nothing will be due."""
+        """Return when `poll` must be called next; None while nothing will be due."""
         if self._context:
             return self._anchor[0]
         if self.state is not PlayState.PLAYING:
@@ -372,7 +372,7 @@ class Player:
             self.state = PlayState.ENDED
 
     def _time_at(self, now_us: int) -> int:
-        """Return the recorded time of a moment while playing, never beyond the next frame."""
+        """Return the recorded time at a moment of playback."""
         anchor_now_us, anchor_time_us = self._anchor
         if self.state is not PlayState.PLAYING:
             return anchor_time_us
@@ -385,11 +385,11 @@ class Player:
         time_us = track.peek_us()
         if time_us is None or self.speed == AS_FAST_AS_POSSIBLE:
             return anchor_now_us
-        # Rounded up: a frame must not be due before its time.
+        # Rounded up, so that a frame is not due before its time.
         return anchor_now_us + math.ceil((time_us - anchor_time_us) / self.speed)
 
     def _skip_gap(self, track: Track, now_us: int) -> None:
-        """Set a new anchor if the next frame is too far away, or the recorded clock went back."""
+        """Set a new anchor if the next frame is too far ahead, or the recorded clock went back."""
         time_us = track.peek_us() or 0
         gap_us = time_us - self.position_us
         longest_us = CLOCK_JUMP_US if self.max_gap_us is None else self.max_gap_us

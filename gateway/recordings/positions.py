@@ -1,9 +1,9 @@
-"""Positions of vehicles: which MAVLink messages hold them, when one is valid, how far it is.
+"""Positions of vehicles: the MAVLink messages with positions, their validity, distances.
 
-One definition for every command, file and page: a position is on the earth, is not latitude 0,
-longitude 0 (sent before the first fix), and of a GPS receiver only with a fix. A track is broken
-where its positions are interrupted, the vehicle restarted, or the position jumped; no distance is
-counted there.
+All commands, files and pages use this definition: a position is on the earth, is not latitude 0,
+longitude 0 (sent before the first fix), and requires a fix if it is a GPS receiver's. A track is
+broken where its positions are interrupted, the vehicle restarted, or the position jumped; distance
+is not counted there.
 """
 
 import math
@@ -27,37 +27,37 @@ FIX_2D: Final = 2
 UNKNOWN_U16: Final = 65535
 MAX_LAT_DEGE7, MAX_LON_DEGE7 = 900_000_000, 1_800_000_000
 GPS_IDS: Final = (MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["GPS2_RAW"])
-"""Of the first and of the second GPS receiver."""
+"""Messages of the first and of the second GPS receiver."""
 GLOBAL_POSITION_INT_ID: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
 LOCAL_POSITION_NED_ID: Final = MESSAGE_IDS["LOCAL_POSITION_NED"]
 ORIGIN_ID: Final = MESSAGE_IDS["GPS_GLOBAL_ORIGIN"]
 INTERRUPTION_US: Final = 60 * US_PER_S
-"""A longer time without a position breaks a track; those of narrow links come every 10 s."""
+"""Longer time without a position that breaks a track; narrow links send one every 10 s."""
 RESTART_US: Final = 5 * US_PER_S
-"""Time since boot that falls by more is a restart; two links may be out of order by less."""
+"""Decrease of the time since boot that means a restart; two links reorder frames by less."""
 JUMP_M: Final = 200.0
 JUMP_MPS: Final = 400.0
-"""A step that is longer than `JUMP_M` and faster than this is a jump, not a motion."""
+"""A step longer than `JUMP_M` plus this speed times its duration is a jump, not a motion."""
 STEP_US: Final = US_PER_S // 2
-"""Interval of the positions between which the distance is summed."""
+"""Minimum interval of the positions between which the distance is summed."""
 LEAST_STEP_M: Final = 1.0
-"""Shorter steps are not summed: at rest the noise of positions would be a distance."""
+"""Minimum step that is summed; shorter ones at rest would sum up position noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class PositionSource:
-    """A message that holds positions: the names and units of its fields."""
+    """A message that contains positions: the names and units of its fields."""
 
     lat: str = "lat"
     lon: str = "lon"
     alt: str = "alt"
     alt_unit_m: float = M_PER_MM
     fix: str = ""
-    """Field with the type of the fix; empty where there is none."""
+    """Field with the type of fix; empty if there is none."""
     velocity_unit_mps: float = 0.0
-    """Of `vx`, `vy` and `vz`; 0 where the message has none."""
+    """Unit of `vx`, `vy` and `vz` in m/s; 0 if the message has no velocity."""
     speed: tuple[str, float, int] = ("", 1.0, 0)
-    """Field with the speed over ground, its unit in m/s, and its value for unknown."""
+    """Field with the speed over ground, its unit in m/s, and its value for "unknown"."""
 
 
 _GPS: Final = PositionSource(fix="fix_type", speed=("vel", M_PER_CM, UNKNOWN_U16))
@@ -75,7 +75,7 @@ _SOURCES: Final = {
     ),
 }  # fmt: skip
 POSITION_SOURCES: Final = {MESSAGE_IDS[name]: source for name, source in _SOURCES.items()}
-"""By message id, the best first: estimates of the vehicle, receivers, narrow links."""
+"""Sources by message id, best first: the vehicle's estimates, receivers, narrow links."""
 RANKS: Final = {message_id: rank for rank, message_id in enumerate(POSITION_SOURCES)}
 
 
@@ -87,7 +87,7 @@ class Position:
     lon_deg: float
     alt_amsl_m: float = NAN
     alt_home_m: float = NAN
-    """Above home."""
+    """Altitude above home."""
     groundspeed_mps: float = NAN
     vel_n_mps: Vec3 = UNKNOWN_VEC3
 
@@ -97,30 +97,30 @@ class TrackPoint:
     """One point of a track."""
 
     time_us: int
-    """µs since 1970, or since the start where civil time is not known."""
+    """µs since 1970, or since the start if civil time is not known."""
     lat_deg: float
     lon_deg: float
     alt_amsl_m: float = NAN
     attitude_deg: tuple[float, float, float] | None = None
-    """Roll, pitch and yaw, where they are known."""
+    """Roll, pitch and yaw, if they are known."""
 
 
 def is_located(lat_dege7: Any, lon_dege7: Any) -> Any:
-    """Return whether coordinates, or which of several, are those of a known position."""
+    """Return whether coordinates, scalar or array, are those of a known position."""
     is_somewhere = (lat_dege7 != 0) | (lon_dege7 != 0)
     is_lat = (lat_dege7 >= -MAX_LAT_DEGE7) & (lat_dege7 <= MAX_LAT_DEGE7)
     return is_somewhere & is_lat & (lon_dege7 >= -MAX_LON_DEGE7) & (lon_dege7 <= MAX_LON_DEGE7)
 
 
 def holds_position(message_id: int, fields: Any) -> Any:
-    """Return whether a message, or which of several, holds a valid position.
+    """Return whether a message contains a valid position; an array if the fields are columns.
 
     Parameters
     ----------
     message_id : int
         One of `POSITION_SOURCES`.
     fields : mapping or structured ndarray
-        Its fields, as scalars or as columns.
+        The message's fields, as scalars or as columns.
     """
     if message_id == LOCAL_POSITION_NED_ID:
         return np.isfinite(fields["x"]) & np.isfinite(fields["y"])
@@ -132,9 +132,9 @@ def holds_position(message_id: int, fields: Any) -> Any:
 def position_of(
     message_id: int, fields: Mapping[str, Any], origin: Position | None = None
 ) -> Position | None:
-    """Return the position in a message of `POSITION_SOURCES`; None if it has no valid one.
+    """Return the position in a message of `POSITION_SOURCES`; None if it contains no valid one.
 
-    `origin`, of GPS_GLOBAL_ORIGIN, is that of LOCAL_POSITION_NED.
+    `origin`, from GPS_GLOBAL_ORIGIN, is the origin of LOCAL_POSITION_NED.
     """
     if not holds_position(message_id, fields):
         return None
@@ -163,7 +163,7 @@ def _speed_mps(source: PositionSource, fields: Mapping[str, Any]) -> float:
 
 
 def named_position(fields: Mapping[str, Any]) -> Position | None:
-    """Return the position in HOME_POSITION or GPS_GLOBAL_ORIGIN; None if it is not valid."""
+    """Return the position in HOME_POSITION or GPS_GLOBAL_ORIGIN; None if invalid."""
     lat, lon = fields["latitude"], fields["longitude"]
     if not is_located(lat, lon):
         return None
@@ -171,7 +171,7 @@ def named_position(fields: Mapping[str, Any]) -> Position | None:
 
 
 class Continuity:
-    """Find where a track is broken, position by position."""
+    """Detect where a track is broken, position by position."""
 
     def __init__(self) -> None:
         self._last: tuple[int, float, float] | None = None
@@ -180,9 +180,9 @@ class Continuity:
     def is_broken_at(
         self, time_us: int, lat_deg: float, lon_deg: float, boot_us: int | None = None
     ) -> bool:
-        """Return whether a position does not carry on the track before it.
+        """Return whether a position does not continue the track before it.
 
-        `boot_us` is the vehicle's own time since its boot, if it is known.
+        `boot_us` is the vehicle's own time since boot, if it is known.
         """
         last, self._last = self._last, (time_us, lat_deg, lon_deg)
         is_restarted = boot_us is not None and boot_us < self._boot_us - RESTART_US
@@ -199,11 +199,11 @@ class Continuity:
 
 
 class GroundDistance:
-    """The distance over ground: the one definition, for every command and page.
+    """Distance over ground, as all commands and pages use it.
 
-    Steps of `LEAST_STEP_M` or more between positions `STEP_US` apart are summed, except where the
-    track is broken. The positions are those of the vehicle's best source; of a table its states',
-    or its fixes' if no state has a position.
+    Steps of `LEAST_STEP_M` or more between positions at least `STEP_US` apart are summed, except
+    where the track is broken. The positions are those of the vehicle's best source; in a table,
+    those of the states, or of the fixes if no state has a position.
     """
 
     def __init__(self) -> None:
@@ -214,11 +214,11 @@ class GroundDistance:
 
     @property
     def distance_m(self) -> float | None:
-        """Distance over ground in m; None without a position."""
+        """Distance over ground in m; None without any position."""
         return None if self._last is None else self._sum_m
 
     def is_due(self, time_us: int) -> bool:
-        """Return whether a position of this time counts."""
+        """Return whether a position of this time is used."""
         return self._sampled_us is None or not 0 <= time_us - self._sampled_us < STEP_US
 
     def update(
@@ -238,7 +238,7 @@ class GroundDistance:
 
 
 def ground_distance_m(time_us: IntArray, lat_deg: FloatArray, lon_deg: FloatArray) -> float:
-    """Return the distance over ground along positions, unknown ones of which are NaN; or NaN."""
+    """Return the distance over ground along positions; NaN positions are skipped."""
     distance, known = GroundDistance(), np.isfinite(lat_deg)
     columns = (time_us[known].tolist(), lat_deg[known].tolist(), lon_deg[known].tolist())
     for at_us, lat, lon in zip(*columns, strict=True):

@@ -1,6 +1,6 @@
 """Open any recording as a table, with the reader of its format.
 
-Readers that need large packages are imported with the first file of their format.
+Readers that require large packages are imported with the first file of their format.
 """
 
 import codecs
@@ -48,25 +48,25 @@ from gateway.toml_file import TomlError, read_toml
 from gateway.units import counted
 
 TRACKER_LOG: Final = files("gateway.recordings.formats") / "tracker-log.toml"
-"""The map for logs whose columns are time_s, ax, gx and so on."""
+"""Column map for logs with the columns time_s, ax, gx and so on."""
 RECORDS: Final = {"DataFlash": "dataflash_record", "ULog": "ulog_record"}
-"""Module that reads the record of an autopilot, by the name of the format."""
+"""Module that reads an autopilot's log, by the name of the format."""
 
 Read = Callable[[Path, ReadOptions], RecordedTable]
 
 READERS: dict[str, Read] = {}
-"""By the name of the format."""
+"""Readers by the name of the format."""
 
 
 def add_reader(name: str, knows: Callable[[bytes], bool], read: Read) -> None:
-    """Add a format that every command that takes a flight can read."""
+    """Add a format that every command that takes a flight will be able to read."""
     if name in READERS:
         raise ValueError(f"{name} files are read already")
     OTHER_FORMATS[name], READERS[name] = knows, read
 
 
 def import_format(module: str, name: str) -> Any:
-    """Import the module of a format, which needs an extra; raises FlightError if absent."""
+    """Import the module of a format, which requires an extra; raises FlightError if missing."""
     try:
         return import_module(f"gateway.recordings.formats.{module}")
     except ModuleNotFoundError as error:
@@ -76,7 +76,7 @@ def import_format(module: str, name: str) -> Any:
 
 
 def _add_packaged(name: str, module: str) -> None:
-    """Add a reader whose packages are imported with the first file of its format."""
+    """Add a reader whose dependencies are imported with the first file of its format."""
 
     def read(path: Path, options: ReadOptions) -> RecordedTable:
         table: RecordedTable = import_format(module, name).read(path, options)
@@ -86,19 +86,19 @@ def _add_packaged(name: str, module: str) -> None:
 
 
 def has_record(path: Path) -> bool:
-    """Return whether a file is the log of an autopilot, with its own estimates."""
+    """Return whether a file is an autopilot's log, with its own estimates."""
     return format_of(path) in RECORDS
 
 
 def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
-    """Open an autopilot's own log to be played; raises FlightError and OSError as `open_rows`."""
+    """Open an autopilot's own log for playback; raises FlightError and OSError as `open_rows`."""
     kind = format_of(path)
     record: AutopilotLog = import_format(RECORDS[kind], kind).open_record(path, options)
     return record
 
 
 def estimates_of(files: Iterable[Path], *, fuse: bool, both: bool) -> Estimates:
-    """Return which estimates of these files are sent; FlightError for `both` without a log."""
+    """Return which estimates of these files are sent; FlightError for `both` if none is a log."""
     if not all(has_record(file) for file in files):
         if both:
             raise FlightError("--beside is for logs of autopilots, DataFlash and ULog")
@@ -107,20 +107,19 @@ def estimates_of(files: Iterable[Path], *, fuse: bool, both: bool) -> Estimates:
 
 
 def beside_id(vehicle_id: int) -> int:
-    """Return the system id of the second vehicle, with the states of mavgate."""
+    """Return the system id of the second vehicle, which has the states of mavgate."""
     return vehicle_id % (FIRST_GROUND_STATION - 1) + 1
 
 
 def is_table(path: Path) -> bool:
-    """Return whether a file is a table of mavgate's, with its own settings and states."""
+    """Return whether a file is a table of mavgate, with its own settings and states."""
     return format_of(path) in (TABLE, PARQUET)
 
 
 def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
-    """Open any file that holds a flight as a table.
+    """Open any file that contains a flight as a table.
 
-    Raises FlightError if it contains no flight that can be read; OSError if it cannot be read at
-    all.
+    Raises FlightError if it contains no readable flight; OSError if it cannot be read at all.
     """
     return READERS[format_of(path)](path, options)
 
@@ -136,7 +135,7 @@ def read_column_map(path: Path) -> ColumnMap:
 
 
 def csv_reader(options: ReadOptions) -> CsvReader:
-    """Make the reader of another program's CSV."""
+    """Return a reader for another program's CSV."""
     known = options.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
     return CsvReader(known, lenient=options.columns is None)
 
@@ -195,7 +194,7 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
 
 
 def _monotone(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> Iterator[TableBlock]:
-    """Shift times behind each step back of the clock, as after a restart, so that they increase."""
+    """Shift times after each backward step of the clock, as at a restart, so that they increase."""
     last_us, shift_us, restarts = -math.inf, 0.0, 0
     for block in blocks:
         times_us = block.cells[:, 0]
@@ -211,12 +210,12 @@ def _monotone(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> I
     if restarts:
         remarks.append(
             f"{path}: its clock went back {counted(restarts, 'time')}; "
-            "what follows goes on from there"
+            "later times continue from there"
         )
 
 
 def check_vehicle(paths: Iterable[Path], wanted: int | None, found: Iterable[int]) -> None:
-    """Raise FlightError if the vehicle that the user wants is not among those of the files."""
+    """Raise FlightError if the files do not contain the vehicle that the user wants."""
     if wanted is not None and wanted not in (known := sorted(found)):
         each = ", ".join(map(str, paths))
         listed = ", ".join(map(str, known)) or "none"

@@ -1,8 +1,8 @@
-"""Recordings fused again: the settings to fuse them with, their rows and states, their MAVLink.
+"""Fuse recordings again: the settings to use, the rows and states, their MAVLink.
 
-GPS latency and declination follow one rule for every command: a latency that the user has set is
-used; else that of the log's comments; else it is estimated from the motion; else the default is
-assumed, with a remark. mavgate's own recordings keep theirs.
+GPS latency and declination follow one rule for all commands: a value that the user has set is used;
+else that of the log's comments; else the latency is estimated from the motion; else the default is
+used, with a remark. mavgate's own recordings keep theirs.
 """
 
 import re
@@ -78,25 +78,26 @@ from gateway.units import US_PER_S, counted
 from gateway.vehicle.service import INFO, StatusText
 
 PIECE: Final = 200
-"""Rows that are fused at once for a playback: some milliseconds, in which it sends nothing."""
+"""Rows fused per step of a playback: some milliseconds, in which nothing is sent."""
 LONGEST_GAP_US: Final = 1_000_000
-"""In a longer gap the pipeline's timers are not run one by one."""
+"""In a longer gap the pipeline's timers are not run step by step."""
 HEAD_LINES: Final = 20
 LATENCY_TOLERANCE_S: Final = 0.03
-"""The position may lag the velocity of the same fix by this much; only the velocity is compared."""
+"""The position may lag the velocity of the same fix by this much; the estimation compares only
+the velocity."""
 _KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
 USUAL: Final = ReferenceSettings()
 LINES: Final = 2000
-"""Lines that are written at once."""
+"""Number of lines written at a time."""
 WRITTEN: Final = ("time_us", *NAV_COLUMNS)
 IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in WRITTEN])
 LEAST_RATE_HZ: Final = 10.0
-"""A hand-held or flying tracker turns within a tenth of a second."""
+"""Minimum sample rate without a remark: a tracker turns within a tenth of a second."""
 NOT_RESTORED: Final = "the state stored at the start is not used: {}; the estimator has to converge"
 
 
 class Replay:
-    """Feed rows to a pipeline as if they arrived now: from them, and their states, to MAVLink."""
+    """Feed rows to a pipeline as if they arrived now, to convert them and states to MAVLink."""
 
     def __init__(self, pipeline: Pipeline, *, follow: bool = True) -> None:
         self._pipeline = pipeline
@@ -104,7 +105,7 @@ class Replay:
         self._now_us: int | None = None
 
     def feed(self, row: Line) -> Iterator[tuple[int, Outputs]]:
-        """Process one row, a change of settings, a note, or a state to restore."""
+        """Process one row, a change of settings, a note, or a state to be restored."""
         if isinstance(row, TableHeader):
             if self._follow:
                 now_us = self._now_us or 0
@@ -118,7 +119,7 @@ class Replay:
         if isinstance(row, FusionState):
             self._pipeline.restore(row)
             return
-        # In the order in which they were processed; counts before SI values.
+        # In the order in which they were processed; raw counts are preferred to SI values.
         records = [row] if isinstance(row, NodeStatus) else [row.baro, row.gps, row.raw or row.imu]
         for record in records:
             if record is None:
@@ -128,7 +129,7 @@ class Replay:
             yield now_us, self._pipeline.feed_record(record, now_us)
 
     def _wait(self, until_us: int) -> Iterator[tuple[int, Outputs]]:
-        """Run the timed actions before the next record; the clock never goes back."""
+        """Run the timed actions before the next record; time never decreases."""
         now_us = until_us if self._now_us is None else max(self._now_us, until_us)
         if self._now_us is None or now_us - self._now_us > LONGEST_GAP_US:
             self._now_us = now_us
@@ -143,10 +144,11 @@ class Replay:
 def aircraft_for(
     files: Sequence[Path], table: RecordedTable, options: ReadOptions, given_s: float | None = None
 ) -> AircraftSettings:
-    """Choose the settings for a flight, and complete them from its log.
+    """Choose the settings for a flight, and complete them from the values in its log.
 
-    `given_s` is the GPS latency that the user gives. Where it has to be estimated, the table is
-    read here and kept for the next reader. FlightError if a value in a # line is out of range.
+    `given_s` is the GPS latency that the user gives. If it must be estimated, the table is read
+    here, and its rows are kept for the next reader. FlightError if a value in a # line is out of
+    range.
     """
     aircraft = aircraft_of(table, options)
     facts = {} if is_table(files[0]) else facts_of(files[0])
@@ -171,7 +173,7 @@ def aircraft_for(
 
 
 def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) -> None:
-    """Add a remark where the motion of a recording speaks against the latency that is set."""
+    """Add a remark if the motion in a recording contradicts the GPS latency that is set."""
     set_s = aircraft.estimation.reference.gps_latency_s
     found = estimate_latency(_log_of(table, aircraft))
     if found is None:
@@ -184,14 +186,14 @@ def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) 
 
 
 def estimate_latency(log: SampleLog) -> FoundLatency | None:
-    """Estimate the GPS latency of a whole flight; None where no manoeuvre shows it."""
+    """Estimate the GPS latency of a whole flight; None if no manoeuvre allows it."""
     estimator = KernelEstimator(make_gains(EskfSettings(), USUAL), USUAL)
     estimator.run(log)
     return estimator.found_latency()
 
 
 def smoothed_latency_in_words(used_s: float, set_s: float) -> str:
-    """Describe a GPS latency that a flight was smoothed with, and that was not set."""
+    """Describe the GPS latency of a smoothed flight, if it is not the one that was set."""
     return (
         f"smoothed with a GPS latency of {used_s:.2f} s, which its manoeuvres show; "
         f"gps_latency_s is {set_s:.2f} s"
@@ -217,7 +219,7 @@ def _in_words(latency: FoundLatency) -> str:
 
 
 def facts_of(file: Path) -> dict[str, float]:
-    """Read `key=value` in the comments of another program's CSV; FlightError if no number."""
+    """Read `key=value` in the comments of another program's CSV; FlightError if not a number."""
     facts: dict[str, float] = {}
     if format_of(file) != CSV:
         return facts
@@ -250,7 +252,7 @@ def with_facts(aircraft: AircraftSettings, facts: dict[str, float]) -> AircraftS
 
 
 def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
-    """Write a table of states only; unknown values are left blank."""
+    """Write a table of states only; unknown values become empty cells."""
     yield f"{FORMAT_LINE}\n{encode_line(header)}{','.join(WRITTEN)}\n".encode()
     table = np.column_stack([time_us, time_us, states])
     for begin in range(0, len(table), LINES):
@@ -258,7 +260,7 @@ def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> I
 
 
 class RecordedFusion:
-    """Recordings in sequence as one flight, fused again; FlightError if they cannot be."""
+    """Recordings in sequence, fused again as one flight; FlightError if that is not possible."""
 
     def __init__(
         self,
@@ -271,7 +273,7 @@ class RecordedFusion:
     ) -> None:
         self._table = table = joined_tables([open_rows(file, options) for file in files])
         self.aircraft = aircraft_for(files, table, options, latency_s)
-        """The settings of the fusion."""
+        """The settings used for the fusion."""
         if smooth or estimator is not None:
             name = SMOOTHED_ESTIMATOR if smooth or estimator is None else estimator
             self.aircraft = with_estimator(self.aircraft, name)
@@ -292,7 +294,7 @@ class RecordedFusion:
         self._files = files
 
     def _smooth(self, blocks: Iterable[TableBlock], file: Path) -> tuple[IntArray, FloatArray]:
-        """Smooth the rows; a remark states a latency that is not the one that is set."""
+        """Smooth the rows; a remark is added if the latency used is not the one that was set."""
         samples = samples_of(blocks, self.aircraft.calibration)
         try:
             estimator = samples.estimator(self.aircraft.estimation)
@@ -311,13 +313,13 @@ class RecordedFusion:
 
     @property
     def remarks(self) -> list[str]:
-        """Remarks about the states for the user, as far as the rows were read."""
+        """Remarks for the user on the states, as far as the rows were read."""
         refused = (f"{self._files[0]}: {NOT_RESTORED.format(why)}" for why in self._refused)
         return [*refused, *self._table.remarks, *self._of_rate()]
 
     @property
     def summary(self) -> str:
-        """Count and rate of the samples that were fused, and the estimator."""
+        """Number and rate of the fused samples, and the estimator."""
         count = counted(sum(map(len, self._time_us)), "sample")
         return f"{count} at {self._rate_hz():.3g} Hz fused by {self._name}"
 
@@ -325,18 +327,18 @@ class RecordedFusion:
         if 0.0 < (rate_hz := self._rate_hz()) < LEAST_RATE_HZ:
             yield (
                 f"{self._files[0]}: its IMU samples come at {rate_hz:.2g} Hz; below "
-                f"{LEAST_RATE_HZ:.0f} Hz the turns between them are not seen, so attitude and "
+                f"{LEAST_RATE_HZ:.0f} Hz rotation between them is not measured, so attitude and "
                 "position may be wrong"
             )
 
     def _rate_hz(self) -> float:
-        """Return the rate of samples by their median interval; 0 of a single one."""
+        """Return the rate of samples from their median interval; 0 for a single one."""
         intervals_us = np.diff(np.concatenate([np.empty(0, np.int64), *self._time_us]))
         intervals_us = intervals_us[intervals_us > 0]
         return US_PER_S / float(np.median(intervals_us)) if len(intervals_us) else 0.0
 
     def introduction(self) -> Iterator[bytes]:
-        """Yield the frames with the vehicle's version and the parameters that it is fused with."""
+        """Yield frames with the version of the vehicle and the parameters of the fusion."""
         vehicle = Aircraft(self._table.header.vehicle_id, self.aircraft).vehicle
         return (sent.frame for sent in vehicle.introduction())
 
@@ -365,9 +367,9 @@ class RecordedFusion:
                         yield TlogRecord(stamper.stamp(now_us), sent.frame)
 
     def table(self) -> RecordedTable:
-        """Return the rows with the new states, under a head that says how they were fused."""
+        """Return the rows with the new states, under a head with the settings of the fusion."""
         blocks = map(self._fusion().block, self._table.blocks)
-        # The first may hold nothing but the head of the file.
+        # The first block may contain only the head of the file.
         first = next((block for block in blocks if len(block) or block.comments), None)
         at_begin = [] if first is None else [c for row, c in first.comments if row == 0]
         begins_cold = not any(isinstance(comment, FusionState) for comment in at_begin[:1])
@@ -388,7 +390,7 @@ def header_of_states(known: TableHeader, aircraft: AircraftSettings) -> TableHea
 
 
 def end_of(file: Path, options: ReadOptions) -> int | None:
-    """Return the civil time of a table's last row without reading all of it; None if unknown."""
+    """Return the civil time of a table's last row without reading it all; None if unknown."""
     kind = format_of(file)
     if kind not in (TABLE, CSV):
         return None
@@ -406,6 +408,6 @@ def end_of(file: Path, options: ReadOptions) -> int | None:
 
 
 def _blocks_of(files: Iterable[Path], options: ReadOptions) -> Iterator[TableBlock]:
-    """Read all once more, before the rows or along with them."""
+    """Read all files again, in addition to the reader of the rows."""
     quiet = replace(options, progress=None)
     return joined_tables([open_rows(file, quiet) for file in files]).blocks

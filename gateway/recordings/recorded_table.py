@@ -1,4 +1,4 @@
-"""A recorded flight as rows with a head, and the settings to fuse it with."""
+"""A recorded flight as rows with a head, and the settings for its fusion."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -32,22 +32,22 @@ Line = TableRow | TableHeader | TableNote | FusionState | NodeStatus
 
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
-    """How to read and fuse flights."""
+    """Options for reading and fusing flights."""
 
     current: PipelineSettings
-    """The settings of today."""
+    """The current settings."""
     choice: SettingsChoice = "recorded"
-    """Settings to fuse a table with; the current ones if it has none."""
+    """Settings to fuse a table with; a table without settings is fused with the current ones."""
     position: Position = "causal"
     columns: ColumnMap | None = None
-    """For a CSV that is not ours; by default those of a tracker log."""
+    """Column map for another program's CSV; default: that of a tracker log."""
     system_id: int | None = None
-    """The vehicle of a tlog to take."""
+    """System id of the vehicle to use from a tlog."""
     progress: Progress | None = None
     sensors: tuple[tuple[str, int], ...] = ()
-    """Which of several sensors of a kind to take: ("GPS", 1) is the second."""
+    """Sensors to use where there are several of a kind: ("GPS", 1) is the second GPS."""
     unpacked_limit: int = MAX_UNPACKED
-    """Maximum unpacked size of a packed file that is read as a whole, in bytes."""
+    """Maximum unpacked size of a packed file that is read as a whole, bytes."""
 
 
 @dataclass(slots=True)
@@ -63,7 +63,7 @@ class RecordedTable:
 
     @property
     def rows(self) -> Iterator[Line]:
-        """The same one by one, but for faults."""
+        """The rows and comments one by one, without faults."""
         events = (e for block in self.blocks for e in block.events(self.header.vehicle_id))
         return (event for event in events if isinstance(event, Line))
 
@@ -87,13 +87,13 @@ def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
 
 
 def settings_of(header: TableHeader) -> AircraftSettings:
-    """Return the settings with which a table was recorded."""
+    """Return the settings that were used to record a table."""
     sections = {**header.settings, "calibration": header.calibration}
     return msgspec.convert(migrate_sections(sections)[0], AircraftSettings)
 
 
 def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:
-    """Choose the settings for one table: its own, or those of today."""
+    """Choose the settings for a table: its own, or the current ones."""
     if options.choice == "current" or not table.header.settings:
         return options.current.aircraft.get(table.header.vehicle_id, options.current.default)
     try:
@@ -106,7 +106,7 @@ def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:
 
 
 def table_of_blocks(path: Path, reader: TableReader, blocks: Iterator[TableBlock]) -> RecordedTable:
-    """Begin to read a table; raises FlightError if its head is damaged, or there is no row."""
+    """Begin to read a table; raises FlightError if its head is damaged, or it has no row."""
     head: list[TableBlock] = []
     for block in blocks:
         head.append(block)
@@ -114,7 +114,7 @@ def table_of_blocks(path: Path, reader: TableReader, blocks: Iterator[TableBlock
             if isinstance(comment, TableFault) and comment.line <= HEAD_LINES:
                 raise FlightError(
                     f"{path}: line {comment.line}: {comment.reason}; `mavgate recover` writes the "
-                    "rows that are sound"
+                    "intact rows"
                 )
         if len(block):
             return RecordedTable(reader.header or TableHeader(), chain(head, blocks))
@@ -127,7 +127,7 @@ def table_of_rows(
     vehicle_id: int = 1,
     unix_us_at_zero: int | None = None,
 ) -> RecordedTable:
-    """Give rows of another program the head of a table, with the current settings."""
+    """Combine rows from another program with the head of a table of the current settings."""
     header = header_of_today(options, vehicle_id, unix_us_at_zero)
     blocks = (block_of(some) for some in iter(lambda: [*islice(rows, BLOCK_ROWS)], []))
     return RecordedTable(header, blocks)
@@ -138,7 +138,7 @@ def header_of_today(
 ) -> TableHeader:
     """Return the head of a table of calibrated values, with the current settings."""
     current = options.current.aircraft.get(vehicle_id, options.current.default)
-    # Its values are calibrated already, whatever the calibration of the aircraft of that number.
+    # The values are calibrated already, so no calibration is applied to them.
     calibrated = msgspec.structs.replace(current, calibration=NodeCalibration())
     known = header_for(calibrated, vehicle_id)
     return msgspec.structs.replace(known, unix_us_at_zero=unix_us_at_zero)

@@ -1,6 +1,6 @@
-"""Records of a tlog that are kept: by sender, message, time, and state of a vehicle.
+"""Select records of a tlog by sender, message, time, and state of a vehicle.
 
-All of these take batches and return batches with fewer records; the frames stay as they are.
+All functions take batches and return batches with fewer records; frames are not changed.
 """
 
 import difflib
@@ -25,14 +25,14 @@ from gateway.wire.mavlink_messages import MESSAGE_IDS
 BoolArray = NDArray[np.bool_]
 
 MAX_MARGIN_S: Final = 600.0
-"""Records of so long before arming are held in memory: some 30 MB at 50 kB/s."""
+"""Maximum margin before arming; its records are held in memory: about 30 MB at 50 kB/s."""
 _LONG_AGO_US: Final = -(1 << 62)
 _NEVER_US: Final = 1 << 62
 
 
 @dataclass(frozen=True, slots=True)
 class FrameChoice:
-    """Frames by sender and message; an empty set does not restrict."""
+    """Selection of frames by sender and message; an empty set does not restrict."""
 
     systems: frozenset[int] = frozenset()
     components: frozenset[int] = frozenset()
@@ -41,7 +41,7 @@ class FrameChoice:
     """Ids of messages that are left out."""
 
     def apply(self, batch: Batch) -> Batch:
-        """Return the batch with the chosen frames only."""
+        """Return the batch with the selected frames only."""
         wanted = np.ones(len(batch), np.bool_)
         for values, chosen in (
             (batch.origins >> 8, self.systems),
@@ -56,9 +56,9 @@ class FrameChoice:
 
 
 def message_ids_of(patterns: Iterable[str]) -> frozenset[int]:
-    """Return the ids of messages given by id, name, or pattern as `CAMERA_*`.
+    """Return the ids of messages given by id, name, or a pattern such as `CAMERA_*`.
 
-    Raises FlightError if a pattern fits no message.
+    Raises FlightError if a pattern matches no message.
     """
     found: set[int] = set()
     for pattern in patterns:
@@ -92,15 +92,15 @@ def within(
 
 @dataclass(frozen=True, slots=True)
 class StateChoice:
-    """The time while a vehicle is armed, or in one of some modes, and a margin on both sides."""
+    """Selection of the time while a vehicle is armed or in certain modes, with margins."""
 
     armed: bool = False
     modes: frozenset[str] = frozenset()
-    """Names in capitals, or numbers as text; an empty set does not restrict."""
+    """Names in upper case, or numbers as text; an empty set does not restrict."""
     margin_s: float = 0.0
 
     def includes(self, beat: Any) -> bool:
-        """Return whether the time after a heartbeat is chosen."""
+        """Return whether the time after this heartbeat is selected."""
         number = int(beat["custom_mode"])
         mode = mode_name(int(beat["autopilot"]), int(beat["type"]), number)
         return (
@@ -109,14 +109,14 @@ class StateChoice:
 
 
 class ChosenState:
-    """Whether any vehicle is in a state, by the heartbeats of the autopilots."""
+    """Whether any vehicle is in the selected state, from the heartbeats of the autopilots."""
 
     def __init__(self, senders: Senders, choice: StateChoice) -> None:
         self._senders, self._choice = senders, choice
         self._chosen: set[int] = set()
 
     def during(self, batch: Batch) -> BoolArray:
-        """Return for each record whether a vehicle is in the state then."""
+        """Return for each record whether a vehicle is in the state at that time."""
         found = np.empty(len(batch), np.bool_)
         rows = np.flatnonzero(batch.message_ids == HEARTBEAT_ID)
         at = 0
@@ -137,10 +137,10 @@ class ChosenState:
 def while_in_state(
     batches: Iterable[Batch], senders: Senders, choice: StateChoice
 ) -> Iterator[Batch]:
-    """Yield the records while a vehicle is in a state, and those of a margin before and after.
+    """Yield the records while a vehicle is in a state, with a margin before and after.
 
-    Batches are held until their records are further back than the margin; raises ValueError if
-    that is too long.
+    Batches are held until their records are older than the margin; raises ValueError if the margin
+    is too long.
     """
     if not 0.0 <= choice.margin_s <= MAX_MARGIN_S:
         raise ValueError(f"a margin of {choice.margin_s:g} s; 0 to {MAX_MARGIN_S:g}")

@@ -1,8 +1,8 @@
 """The senders of a recording: ground stations, vehicles, and their best messages.
 
 A vehicle is one component of a system: the autopilot by its heartbeat, else component 1, else the
-one that sends positions. So the attitude of a gimbal or the position of a camera, which have the
-system id of their aircraft, are not the aircraft's.
+one that sends the most positions. So the attitude of a gimbal or the position of a camera, which
+have the system id of their aircraft, are not taken for the aircraft's.
 """
 
 from collections import Counter
@@ -27,7 +27,7 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 FIRST_GROUND_STATION: Final = 250
-"""System ids from here on are by custom ground stations, which keep their id."""
+"""System ids from here on are ground stations by convention, and keep their id."""
 AUTOPILOT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1."""
 HIGH_LATENCY2_ID: Final = MESSAGE_IDS["HIGH_LATENCY2"]
@@ -35,7 +35,7 @@ ATTITUDE_ID: Final = MESSAGE_IDS["ATTITUDE"]
 ATTITUDE_QUATERNION_ID: Final = MESSAGE_IDS["ATTITUDE_QUATERNION"]
 _COUNTED: Final = (*POSITION_SOURCES, ATTITUDE_ID, ATTITUDE_QUATERNION_ID)
 LEAST_SHARE: Final = 0.5
-"""A better message is preferred if it covers at least this share of the longest time."""
+"""Minimum share of the longest time for which a better message must be present to be used."""
 
 
 def is_station(origin: int, stations: Set[int]) -> bool:
@@ -45,21 +45,21 @@ def is_station(origin: int, stations: Set[int]) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RecordedSender:
-    """The component of a system that is its vehicle, and the messages to take of it."""
+    """The component of a system that is its vehicle, and its messages to use."""
 
     origin: int
-    """System << 8 | component."""
+    """Sender: system << 8 | component."""
     position_id: int | None = GLOBAL_POSITION_INT_ID
     """Message with its positions, one of `POSITION_SOURCES`; None if it sent no valid one."""
     attitude_id: int | None = ATTITUDE_QUATERNION_ID
     heartbeat: tuple[int, int] | None = None
     """MAV_TYPE and MAV_AUTOPILOT."""
     frame_origin: Position | None = None
-    """Origin of LOCAL_POSITION_NED until another one is sent."""
+    """Origin of LOCAL_POSITION_NED until the vehicle sends another one."""
 
     @property
     def component(self) -> int:
-        """Its component id."""
+        """The component id."""
         return self.origin & 0xFF
 
 
@@ -68,13 +68,13 @@ class Senders:
 
     def __init__(self) -> None:
         self.origins: set[int] = set()
-        """All that sent: system << 8 | component."""
+        """All senders, as system << 8 | component."""
         self.stations: set[int] = set()
-        """Those among them with heartbeats of a ground station."""
+        """Senders of a ground station's heartbeat."""
         self.heartbeats: dict[int, tuple[int, int]] = {}
         """MAV_TYPE and MAV_AUTOPILOT by sender."""
         self.seconds: Counter[tuple[int, int]] = Counter()
-        """By sender and message: how many seconds have a valid one."""
+        """Number of seconds with a valid message, by sender and message id."""
         self.frame_origins: dict[int, Position] = {}
         """First origin of LOCAL_POSITION_NED by sender."""
 
@@ -98,7 +98,7 @@ class Senders:
                 self.seconds[int(origin), message_id] += int(count)
 
     def vehicle(self, system_id: int) -> RecordedSender:
-        """Return the vehicle of a system; component 1 of one that sent nothing."""
+        """Return the vehicle of a system; component 1 if the system sent nothing."""
         components = [
             origin
             for origin in sorted(self.origins)
@@ -163,6 +163,6 @@ class Senders:
 
 
 def _best(seconds: dict[int, int]) -> int | None:
-    """Return the first message that covers nearly as much time as any other."""
+    """Return the best message that covers nearly as much time as any other."""
     longest = max(seconds.values())
     return next((key for key, n in seconds.items() if n and n >= LEAST_SHARE * longest), None)

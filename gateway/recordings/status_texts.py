@@ -1,4 +1,4 @@
-"""Texts in MAVLink: UTF-8, and those of several STATUSTEXT joined to one."""
+"""Texts in MAVLink: UTF-8, and texts joined from several STATUSTEXT."""
 
 import re
 from dataclasses import dataclass, field
@@ -11,28 +11,28 @@ from gateway.wire.mavlink_splitter import origin_of
 
 STATUSTEXT_ID: Final = MESSAGE_IDS["STATUSTEXT"]
 TEXT_BYTES: Final = 50
-"""Of a chunk; a shorter one is the last."""
+"""Bytes of a chunk; a shorter chunk is the last one of a text."""
 _SIZE: Final = 54
-"""Severity, text, id in two bytes, number of the chunk."""
+"""Bytes of the payload: severity, text, id (two bytes), number of the chunk."""
 TIMEOUT_US: Final = 3 * US_PER_S
-"""A chunk that has not come within this time after the one before is lost."""
+"""Timeout after which the next chunk is considered lost."""
 MAX_OPEN: Final = 100
-"""Incomplete texts; a flood of them must not fill the memory."""
+"""Maximum number of incomplete texts, so that a flood of them cannot fill the memory."""
 ELLIPSIS: Final = "\N{HORIZONTAL ELLIPSIS}"
 _CUT: Final = re.compile(f"\N{REPLACEMENT CHARACTER}*{ELLIPSIS}\N{REPLACEMENT CHARACTER}*")
 
 
 def text_of(data: bytes) -> str:
-    """Decode a field of characters: UTF-8, up to its first zero."""
+    """Decode a character field as UTF-8, up to its first zero."""
     return data.split(b"\0", 1)[0].decode("utf-8", "replace")
 
 
 @dataclass(frozen=True, slots=True)
 class JoinedText:
-    """A text as its sender wrote it; an ellipsis stands for lost chunks."""
+    """A text as its sender wrote it; an ellipsis replaces lost chunks."""
 
     time_us: int
-    """When its first chunk came."""
+    """When its first chunk arrived."""
     origin: int
     """Sender: system << 8 | component."""
     severity: int
@@ -47,11 +47,11 @@ class _OpenText:
     severity: int
     chunks: dict[int, bytes] = field(default_factory=dict)
     is_done: bool = False
-    """It was returned; the same chunks by another link are left out."""
+    """Whether the text was returned; copies of its chunks by another link are ignored."""
 
     @property
     def is_whole(self) -> bool:
-        """Whether every chunk up to the last has come."""
+        """Whether all chunks up to the last have arrived."""
         last = max(self.chunks)
         return len(self.chunks) == last + 1 and len(self.chunks[last]) < TEXT_BYTES
 
@@ -62,7 +62,7 @@ class _OpenText:
             if number != expected:
                 joined, data = joined + data.decode(errors="replace") + ELLIPSIS, b""
             data, expected = data + chunk, number + 1
-        # One full chunk may be a text of exactly that length, which does not end in a blank.
+        # A single full chunk may be a complete text of this length, which does not end in a blank.
         if len(chunk) == TEXT_BYTES and (expected > 1 or chunk.endswith(b" ")):
             return _CUT.sub(ELLIPSIS, joined + data.decode(errors="replace").rstrip() + ELLIPSIS)
         return _CUT.sub(ELLIPSIS, joined + data.decode(errors="replace"))
@@ -73,10 +73,10 @@ class TextJoiner:
 
     def __init__(self) -> None:
         self._open: dict[tuple[int, int], _OpenText] = {}
-        """By sender and id."""
+        """Incomplete texts by sender and id."""
 
     def feed(self, frame: bytes, time_us: int) -> list[JoinedText]:
-        """Process a STATUSTEXT, and return the texts that are complete now, or wait no longer."""
+        """Process a STATUSTEXT, and return the texts that are complete now, or timed out."""
         found = self.poll(time_us)
         payload = payload_of(frame, _SIZE)
         text = payload[1 : 1 + TEXT_BYTES].split(b"\0", 1)[0]
@@ -88,7 +88,7 @@ class TextJoiner:
         key = (origin, number)
         joined = self._open.get(key)
         if joined is not None and joined.chunks.get(chunk, text) != text:
-            # The id was used again.
+            # The sender has reused the id.
             found += self._end(key)
             joined = None
         if joined is None:
@@ -102,14 +102,14 @@ class TextJoiner:
         return found
 
     def poll(self, time_us: int) -> list[JoinedText]:
-        """Return the texts whose next chunk has not come for too long."""
+        """Return the texts whose next chunk has timed out."""
         if not self._open:
             return []
         late = [k for k, one in self._open.items() if not 0 <= time_us - one.newest_us < TIMEOUT_US]
         return [text for key in late for text in self._end(key)]
 
     def flush(self) -> list[JoinedText]:
-        """Return all texts that are not complete."""
+        """Return all incomplete texts."""
         return [text for key in list(self._open) for text in self._end(key)]
 
     def _end(self, key: tuple[int, int]) -> list[JoinedText]:

@@ -52,9 +52,9 @@ if TYPE_CHECKING:
 
 
 GAP_US: Final = 2 * US_PER_S
-"""Every vehicle sends a heartbeat a second: a longer pause is a gap."""
+"""Minimum pause that is a gap: every vehicle sends a heartbeat once a second."""
 MAX_GAPS: Final = 1000
-DAMAGED_TIME: Final = "{} with a damaged time, each taken to be as old as the one before"
+DAMAGED_TIME: Final = "{} with a damaged time, replaced by that of the record before"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Gap:
     """A gap in the data."""
 
     time_us: int
-    """When it began, in the recording's own time."""
+    """Start of the gap, in the recording's own time."""
     duration_s: float
 
 
@@ -83,9 +83,9 @@ class VehicleInfo:
     mav_type: int | None
     autopilot: int | None
     distance_m: float | None
-    """Along the ground; None without a position."""
+    """Distance over ground; None without a position."""
     positions: str | None
-    """What the positions are of: a MAVLink message, or states or fixes of a table."""
+    """Source of the positions: a MAVLink message, or states or fixes of a table."""
     rates: tuple[Rate, ...]
 
 
@@ -97,25 +97,25 @@ class FileInfo:
     size: int
     records: int
     first_us: int | None
-    """In µs since 1970 for a tlog, on the gateway clock for a table."""
+    """µs since 1970 for a tlog, on the gateway clock for a table."""
     last_us: int | None
     duration_s: float
-    """From the first record to the last; where its clock leaped by days, without that."""
+    """Time from the first record to the last, without jumps of the clock by days."""
     vehicles: tuple[VehicleInfo, ...]
     gaps: tuple[Gap, ...]
     damaged_bytes: int
     damaged_runs: int
     unfinished_bytes: int = 0
-    """Of a last record or line that is not whole: it is being written, or was cut."""
+    """Bytes of an incomplete last record or line: it is being written, or was cut off."""
     header: TableHeader | None = None
     notes: tuple[TableNote, ...] = ()
     remarks: tuple[str, ...] = ()
-    """Remarks of its reader for the user."""
+    """Remarks of the reader for the user."""
 
 
 @dataclass(slots=True)
 class TimesSpan:
-    """Sum up how long records last; a clock that leaps by days adds nothing."""
+    """Sum up the duration of records; a clock jump of more than a day adds nothing."""
 
     first_us: int | None = None
     gaps: list[Gap] = field(default_factory=list)
@@ -123,15 +123,15 @@ class TimesSpan:
     last_us: int | None = None
     """Greatest time."""
     _begin_us: int = 0
-    """Begin of the stretch since the last leap."""
+    """Start of the part since the last clock jump."""
     _newest_us: int = 0
     _last_us: int = 0
     _before_us: int = 0
-    """Length of the stretches before that."""
+    """Total length of the parts before it."""
 
     @property
     def length_us(self) -> int:
-        """From the first record to the last, without leaps."""
+        """Duration from the first record to the last, without clock jumps."""
         return self._before_us + self._newest_us - self._begin_us
 
     def add(self, time_us: int) -> None:
@@ -309,9 +309,9 @@ def _rate(name: str, count: int, duration_s: float) -> Rate:
 
 
 def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOptions]) -> FileInfo:
-    """Summarise a tlog, a table, or a file that can be read as one; FlightError if it is none.
+    """Summarise a tlog, a table, or another program's file; FlightError for any other file.
 
-    `options` is called for other programs' files alone.
+    `options` is called for other programs' files only.
     """
     kind, size = format_of(file), file.stat().st_size
     if kind == TLOG:
@@ -333,7 +333,7 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
 
 
 def _describe_by_rows(file: Path, kind: str, options: ReadOptions) -> FileInfo:
-    # They import every stage, which a summary of a recording of our own does not need.
+    # These import all stages, which the summary of our own recordings does not need.
     from gateway.recordings.joining import shifted
     from gateway.recordings.reading import has_record, is_table, open_record, open_rows
 

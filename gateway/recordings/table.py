@@ -1,4 +1,4 @@
-"""The table format: a CSV with all that is needed to fuse a flight again.
+"""The table format: a CSV with everything that is needed to fuse a flight again.
 
     # mavgate table 1
     # header: {"mavgate_version": …, "vehicle_id": …, "settings": {…}, "calibration": {…}, …}
@@ -10,10 +10,10 @@
     # header: {…}
 
 A node reports the state of its board once a second. A second header means that the rows after it
-were fused with other settings. A state line is the internal state of filters and estimator at that
-row, so that a file that begins in flight can be fused again from its first row. Lines that begin
-with `#` hold JSON; spreadsheets and pandas (`comment="#"`) skip them. An empty cell means not
-known, or nothing new.
+were fused with other settings. A state line contains the internal state of filters and estimator at
+that row, so that a file that begins in flight can be fused again from its first row. Lines that
+begin with `#` contain JSON; spreadsheets and pandas (`comment="#"`) skip them. An empty cell means
+not known, or no new value.
 """
 
 from collections.abc import Iterable, Iterator
@@ -45,25 +45,26 @@ HEADER_PREFIX: Final = "# header: "
 STATE_PREFIX: Final = "# state: "
 NOTE_PREFIX: Final = "# note: "
 FORMER_NOTE_PREFIX: Final = "# mark: "
-"""Of notes in tables that were recorded when they were called marks."""
+"""Prefix of notes in older tables, in which they were called marks."""
 NODE_PREFIX: Final = "# node: "
 
 HEAD_LINES: Final = 3
-"""Version, header, names."""
+"""Lines of the head: version, header, names."""
 MAX_LINE: Final = 1 << 20
-"""Longer than any settings; a disk's zeros without a line's end must not fill the memory."""
+"""Maximum length of a line, more than any settings require; it bounds the memory for a file of
+zeros without line ends."""
 
 
 TimeUs = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
 """A time in µs; the sum of two fits 64 bits."""
 IntArray = NDArray[np.int64]
 NOTE: Final = "Note: "
-"""Begin of the STATUSTEXT with an operator's remark."""
+"""Prefix of the STATUSTEXT with an operator's remark."""
 FORMER_NOTE: Final = "Mark: "
-"""The same in recordings of that time."""
+"""The prefix in older recordings."""
 NO_ROWS: Final = np.empty((0, len(COLUMNS)))
 BLOCK_ROWS: Final = 1000
-"""Of another program's file that are laid out as columns at once."""
+"""Number of another program's rows that are converted to columns at a time."""
 
 
 class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
@@ -72,15 +73,15 @@ class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
     mavgate_version: str = ""
     vehicle_id: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
     session: str = ""
-    """Recording that the file is a part of."""
+    """Recording to which the file belongs."""
     part: int = 1
-    """Part of the recording; the states of a later part carry on those of the one before."""
+    """Number of the part; the states of a later part continue those of the one before."""
     cold_start: bool = True
-    """Whether the first row is the first sample that the estimator ever saw."""
+    """Whether the first row is the first sample that the estimator processed."""
     unix_us_at_zero: TimeUs | None = None
-    """Civil time of `time_us` zero in µs since 1970, as far as it was known at the start."""
+    """Civil time at `time_us` zero, µs since 1970, as far as it was known at the start."""
     settings: dict[str, Any] = {}
-    """The settings, as in the settings file."""
+    """Settings in the form of the settings file."""
     calibration: dict[str, Any] = {}
     """The calibration of the aircraft's IMU node."""
 
@@ -94,14 +95,14 @@ class TableNote(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class TableFault:
-    """A line, or the end of one, that could not be read."""
+    """A line, or a part of one, that could not be read."""
 
     line: int
-    """Counted from 1."""
+    """Line number, from 1."""
     size: int
     reason: str
     is_cut: bool = False
-    """Whether the file ends within the line: it is being written, or was cut."""
+    """Whether the file ends within the line: it is being written, or was cut off."""
 
 
 _COMMENTS: Final[dict[str, Any]] = {
@@ -113,11 +114,11 @@ _COMMENTS: Final[dict[str, Any]] = {
 }
 
 TableEvent = TableRow | TableNote | TableFault | TableHeader | FusionState | NodeStatus
-"""A header here is one after rows: the settings were changed."""
+"""A TableHeader here is one between rows: the settings were changed."""
 
 
 def encode_head(header: TableHeader) -> str:
-    """Write everything before the first row."""
+    """Write all lines before the first row."""
     return f"{FORMAT_LINE}\n{encode_line(header)}{','.join(COLUMNS)}\n"
 
 
@@ -135,18 +136,18 @@ TableComment = TableHeader | TableNote | TableFault | FusionState | NodeStatus
 
 @dataclass(frozen=True, slots=True)
 class TableBlock:
-    """Rows of a stretch of a table as columns, and the lines between them."""
+    """Some rows of a table as columns, and the lines between them."""
 
     cells: FloatArray
     """Shape (n, len(COLUMNS)); NaN is an empty cell."""
     comments: tuple[tuple[int, TableComment], ...] = ()
-    """In the order of the file, each with the number of the row before which it stands: up to n."""
+    """Comments in the order of the file, each with the index of the row after it, up to n."""
 
     def __len__(self) -> int:
         return len(self.cells)
 
     def events(self, vehicle_id: int) -> Iterator[TableEvent]:
-        """Yield rows and the lines between them, one by one, as of this aircraft."""
+        """Yield rows and the lines between them one by one, for this aircraft."""
         begin = 0
         for row, comment in (*self.comments, (len(self), None)):
             for cells in self.cells[begin:row].tolist():
@@ -156,7 +157,7 @@ class TableBlock:
                 yield comment
 
     def pieces(self, rows: int) -> "Iterator[TableBlock]":
-        """Cut the block into smaller ones of so many rows."""
+        """Split the block into smaller ones of this number of rows."""
         for begin in range(0, max(len(self), 1), rows):
             end = begin + rows if begin + rows < len(self) else len(self) + 1
             comments = ((row - begin, c) for row, c in self.comments if begin <= row < end)
@@ -164,7 +165,7 @@ class TableBlock:
 
 
 def block_of(events: Iterable[TableEvent]) -> TableBlock:
-    """Lay rows out as columns, and keep the lines between them."""
+    """Arrange rows as columns, and keep the lines between them."""
     rows: list[tuple[Cell, ...]] = []
     comments: list[tuple[int, TableComment]] = []
     for event in events:
@@ -190,13 +191,13 @@ def encode_block(block: TableBlock) -> bytes:
 class TableReader:
     """Decode any chunks of a table into rows, notes and faults; never raises on data.
 
-    Columns are found by name, so a file with more or fewer columns, or in another order, can be
+    Columns are identified by name, so files with more or fewer columns, or in another order, can be
     read too.
     """
 
     def __init__(self) -> None:
         self.header: TableHeader | None = None
-        """None until it is read, or if the file has none."""
+        """None before it is read, or if the file has none."""
         self.lines = 0
         self._rest = b""
         self._skipped = 0
@@ -205,7 +206,7 @@ class TableReader:
 
     @property
     def vehicle_id(self) -> int:
-        """The aircraft of the table; 1 where it has none."""
+        """The aircraft of the table; 1 if the table does not state it."""
         return 1 if self.header is None else self.header.vehicle_id
 
     def feed(self, data: bytes, *, final: bool = False) -> list[TableEvent]:
@@ -232,7 +233,7 @@ class TableReader:
         return block
 
     def _read_text(self, text: bytes) -> TableBlock:
-        """Read whole lines: all at once if all of them are rows."""
+        """Read whole lines, all at once if they are all rows."""
         if self._width and not self._skipped and b"#" not in text:
             cells = self._read(text)
             if cells is not None and not normalise(cells):
@@ -256,7 +257,7 @@ class TableReader:
     def _joined(
         self, rows: list[bytes], lines: IntArray, comments: list[tuple[int, TableComment]]
     ) -> TableBlock:
-        """Read rows, and put the other lines between them by the numbers of lines."""
+        """Read rows, and put the other lines between them by their line numbers."""
         if not rows:
             return TableBlock(NO_ROWS, tuple((0, comment) for _, comment in comments))
         text = b"\n".join([*rows, b""])
@@ -278,11 +279,11 @@ class TableReader:
         cells = read_lines(text, self._width)
         if cells is None or self._indices is None:
             return cells
-        # The last column is none of the file's.
+        # The appended column of NaN replaces columns that the file lacks.
         return np.column_stack([cells, np.full(len(cells), np.nan)])[:, self._indices]
 
     def _read_singly(self, rows: list[bytes]) -> tuple[FloatArray, dict[int, str]]:
-        """Read rows one by one; malformed ones are reported, and stay empty."""
+        """Read rows one by one; malformed ones are reported, and their cells stay empty."""
         cells = np.full((len(rows), len(COLUMNS)), np.nan)
         faults: dict[int, str] = {}
         for row, line in enumerate(rows):
@@ -293,7 +294,7 @@ class TableReader:
         return cells, faults
 
     def _comment_of(self, line: bytes) -> TableComment | None:
-        """Read a line of the head, or one between rows that is no row."""
+        """Read a line of the head, or a line between rows that is not a row."""
         try:
             return self._read_other(line)
         except ValueError as error:
@@ -305,7 +306,7 @@ class TableReader:
             self._read_names(text.split(","))
         elif text.startswith(FORMAT_PREFIX) and text != FORMAT_LINE:
             version = text.removeprefix(FORMAT_PREFIX)
-            raise ValueError(f"table version {version!r}; this mavgate reads 1, a newer one more")
+            raise ValueError(f"table version {version!r}; this mavgate reads version 1 only")
         for prefix, kind in _COMMENTS.items():
             if text.startswith(prefix):
                 found: TableComment = msgspec.json.decode(text.removeprefix(prefix), type=kind)

@@ -1,4 +1,4 @@
-"""Texts, events, subtitles and geotags of a recorded vehicle, each with its time."""
+"""Extract a recorded vehicle's texts, events, subtitles and geotags, each with its time."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -36,13 +36,13 @@ WANTED: Final = (
 SUBTITLE_FIELDS: Final = ("mode", "height", "speed", "distance", "battery", "coordinates")
 MAX_RATE_HZ: Final = 60.0
 MAX_GAP_US: Final = 5 * US_PER_S
-"""A state that is older is not shown."""
+"""Maximum age of a state that is shown."""
 _LANDED: Final = {1: "on the ground", 2: "in flight", 3: "taking off", 4: "landing"}
-"""MAV_LANDED_STATE."""
+"""Texts by MAV_LANDED_STATE."""
 
 
 def _mode_of(fields: Any) -> str:
-    """Return the mode in a heartbeat, by the autopilot's names or as a number."""
+    """Return the mode in a heartbeat under the autopilot's name for it, or as a number."""
     number = fields["custom_mode"]
     return mode_name(fields["autopilot"], fields["type"], number) or str(number)
 
@@ -83,7 +83,7 @@ def _event_values(message: VehicleMessage) -> list[tuple[str, str]]:
 
 
 def images(messages: Iterable[VehicleMessage]) -> str:
-    """Write the location of each image as CSV: angles of CAMERA_FEEDBACK, names of the other."""
+    """Write the location of each image as CSV: CAMERA_FEEDBACK has angles, the other one names."""
     found: list[tuple[object, ...]] = []
     for message in messages:
         fields, at = message.fields, iso_time(message.time_us)
@@ -138,7 +138,7 @@ class _Shown:
 
 @dataclass(frozen=True, slots=True)
 class Subtitle:
-    """A text and when it is shown, in s of the video."""
+    """A text and its interval, in s of the video."""
 
     begin_s: float
     end_s: float
@@ -151,7 +151,7 @@ def subtitles(
     names: Sequence[str] = SUBTITLE_FIELDS,
     rate_hz: float = 5.0,
 ) -> Iterator[Subtitle]:
-    """Yield the state of a vehicle at a rate; `begin` returns when the video begins, in µs."""
+    """Yield the state of a vehicle at a rate; `begin` returns the start of the video in µs."""
     shown, step, number = _Shown(), US_PER_S / rate_hz, 0
     begin_us: int | None = None
     for message in messages:
@@ -161,7 +161,7 @@ def subtitles(
         while begin_us + number * step <= message.time_us:
             now_us = begin_us + number * step
             if shown.newest_us and now_us - shown.newest_us > MAX_GAP_US:
-                # Nothing is known until the next message.
+                # No data until the next message.
                 number = max(number + 1, math.ceil((message.time_us - begin_us) / step))
                 break
             if (text := shown.text(names)) and now_us >= shown.newest_us:

@@ -1,8 +1,8 @@
 """The tlog format: bytes to records, records to bytes, an index for seeking, and its times.
 
-A ground station considers a tlog corrupt if its times lie in the future or do not grow. So the
-offset from the gateway clock to civil time stays fixed as long as a file is open, and a jump needs
-a new file.
+Ground stations consider a tlog corrupt if its times are in the future or do not increase. So the
+offset from the gateway clock to civil time is constant while a file is open, and a clock jump
+requires a new file.
 """
 
 from collections.abc import Iterator
@@ -29,30 +29,30 @@ from gateway.wire.mavlink_splitter import PAYLOAD_V1, PAYLOAD_V2, START_V2, mess
 from gateway.wire.timesync import GpsTime
 
 DAY_US: Final = 86_400 * US_PER_S
-"""Records that lie further apart are of different days: nothing is known of the time between."""
+"""Records further apart are of different days: the time between them is not counted."""
 ORDER_US: Final = 2 * US_PER_S
-"""A time that is further before the record before, or behind the next one, is damaged."""
+"""A time before that of the previous record, or after that of the next, by more is damaged."""
 
 Times = TypeVar("Times", int, NDArray[np.int64])
 STRIDE: Final = 256
-"""Records between two entries of the index: a seek scans at most this many, some 15 kB."""
+"""Records per entry of the index: a seek scans at most this many, about 15 kB."""
 SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
 BACK_US: Final = 60 * US_PER_S
-"""Frames of two links may be out of order by seconds; a clock that was set back shows more."""
+"""Maximum backward step from reordering of two links' frames; more means a clock change."""
 FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
-"""The year 2000: an earlier time counts from the start of a clock."""
+"""The year 2000; an earlier time counts from the start of a clock."""
 MAX_JUMPS: Final = 1000
 HEARTBEAT_ID: Final = MESSAGE_IDS["HEARTBEAT"]
 LENGTH_AT: Final = 1
-"""Offset of the payload's length in a frame."""
+"""Offset of the payload length in a frame."""
 UNRECORDED: Final = ids_of("HIGH_LATENCY2")
-"""For links too narrow for the rest: next to these in a recording a ground station
-would take each one for another state of the vehicle."""
+"""Messages for narrow links. Recorded next to the messages that they summarise, a ground
+station would take them for another state of the vehicle."""
 JUMP_US: Final = 2 * US_PER_S
-"""Larger differences between the known time and the true one are worth a new file. GPS arrival
-lags by up to a second, and NTP slews smaller errors away."""
+"""Minimum error of the assumed civil time that requires a new file. The arrival of GPS time lags
+by up to a second, and NTP slews smaller errors away."""
 STEP_US: Final = 4
-"""Least distance of two stamps: readers take the low two bits for a link's number."""
+"""Minimum difference of two timestamps: readers use the low two bits as a link number."""
 _LINK_BITS: Final = 3
 
 
@@ -65,7 +65,7 @@ def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDAr
 
 
 def _crc_extra_table() -> ExtraArray:
-    """Lay the messages' checksum seeds out as an array by message id, -1 where unknown."""
+    """Return the messages' checksum seeds as an array by message id, -1 for unknown ids."""
     table = np.full(KNOWN_IDS, -1, np.int16)
     for message_id, extra in CRC_EXTRA.items():
         if message_id < KNOWN_IDS:
@@ -77,20 +77,20 @@ _EXTRA: Final = _crc_extra_table()
 
 
 def payload_of(frame: bytes, size: int) -> bytes:
-    """Return the first bytes of a frame's payload, with the zeros that version 2 cuts off."""
+    """Return the first bytes of a payload, with the zeros that MAVLink 2 truncates."""
     begin = PAYLOAD_V2 if frame[0] == START_V2 else PAYLOAD_V1
     return frame[begin : begin + min(frame[LENGTH_AT], size)].ljust(size, b"\0")
 
 
 def fields_of(frame: bytes) -> dict[str, Any]:
-    """Return the fields of a frame of the dialect, as Python's own values."""
+    """Return the fields of a frame of the dialect, as Python's built-in types."""
     layout = layout_of(message_id_of(frame))
     values = np.frombuffer(payload_of(frame, layout.itemsize), layout)[0].item()
     return dict(zip(layout.names or (), values, strict=True))
 
 
 def columns_of(batch: "Batch", wanted: IntArray, message_id: int) -> NDArray[np.void]:
-    """Read the fields of some frames of one message; those cut off or unknown are zero."""
+    """Read the fields of some frames of one message; truncated or unknown ones are zero."""
     layout = layout_of(message_id)
     data = np.frombuffer(batch.data, np.uint8)
     starts = batch.starts[wanted] + TIME_SIZE
@@ -105,7 +105,7 @@ def columns_of(batch: "Batch", wanted: IntArray, message_id: int) -> NDArray[np.
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A run of bytes of a file that belongs to no record."""
+    """A run of bytes in a file that belong to no record."""
 
     offset: int
     size: int
@@ -126,11 +126,11 @@ def encode_record(time_us: int, frame: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """The records of one stretch of a file, as columns."""
+    """Consecutive records of a file, as columns."""
 
     data: bytes
     offset: int
-    """Where `data` begins in the file."""
+    """Offset of `data` in the file."""
     starts: IntArray
     """Offset of each record in `data`."""
     sizes: IntArray
@@ -141,20 +141,20 @@ class Batch:
     message_ids: IntArray
     damage: tuple[Damage, ...]
     mended: int = 0
-    """How many of the times were damaged, and are those of the record before."""
+    """Number of damaged times, which were replaced by those of the previous record."""
     unfinished: int = 0
-    """Bytes at the end of the file that begin a record: it is being written, or was cut."""
+    """Bytes of an incomplete record at the end of the file: it is being written, or was cut off."""
 
     def __len__(self) -> int:
         return len(self.starts)
 
     def frame(self, index: int) -> bytes:
-        """Return one frame's own bytes."""
+        """Return the bytes of one frame."""
         begin = int(self.starts[index]) + TIME_SIZE
         return self.data[begin : begin + int(self.sizes[index])]
 
     def chosen(self, wanted: NDArray[np.bool_]) -> "Batch":
-        """Return the batch with some of its records only; its damage is still listed."""
+        """Return the batch with the chosen records only, and all of its damage."""
         if wanted.all():
             return self
         columns = (self.starts, self.sizes, self.time_us, self.origins, self.message_ids)
@@ -165,7 +165,7 @@ class Batch:
         )  # fmt: skip
 
     def encoded(self) -> bytes:
-        """Return the records as the bytes of a tlog, at the times of the batch."""
+        """Return the records as the bytes of a tlog, with the times of the batch."""
         edited = bytearray(self.data)
         times = np.maximum(self.time_us, 0).astype(">u8")
         np.frombuffer(edited, np.uint8)[self.starts[:, None] + np.arange(TIME_SIZE)] = times.view(
@@ -179,7 +179,7 @@ class Batch:
         return b"".join([view[begin:end] for begin, end in zip(begins, stops, strict=True)])
 
     def records(self, wanted: IntArray | None = None) -> Iterator[TlogRecord]:
-        """Yield the records, or some of them by their numbers."""
+        """Yield the records, or those with the given indices."""
         data = self.data
         times, starts, sizes = self.time_us, self.starts, self.sizes
         if wanted is not None:
@@ -229,8 +229,8 @@ class TlogScanner:
         )  # fmt: skip
 
     def _mend(self, times: IntArray, following: bytes) -> int:
-        """Give records whose time is damaged, which no checksum shows, that of the one before."""
-        # A time begins with a zero, or it is none.
+        """Replace damaged times, which no checksum detects, by that of the previous record."""
+        # The first byte of a time is zero; otherwise the following bytes are not a time.
         is_known = self._in_step and len(following) == TIME_SIZE and following[0] == 0
         next_us = int.from_bytes(following, "big") if is_known else int(times[-1])
         last_us = int(times[0]) if self._last_us is None else self._last_us
@@ -243,7 +243,7 @@ class TlogScanner:
         mended = -2
         count = 0
         for i in np.flatnonzero(is_damaged(before, times, after)).tolist():
-            # Behind a record that was damaged the order is as it should be.
+            # After a damaged record the next one only seems out of order.
             if i != mended + 1:
                 times[i] = before[i]
                 mended, count = i, count + 1
@@ -253,19 +253,19 @@ class TlogScanner:
 
 @dataclass(frozen=True, slots=True)
 class ClockJump:
-    """A step of a recording's clock, which the timeline leaves out."""
+    """A step of a recording's clock that the timeline removes."""
 
     offset_us: int
-    """Time since the first record at which it happened."""
+    """Time of the step since the first record."""
     step_us: int
 
 
 class Timeline:
-    """One growing time for a tlog whose clock was set while it was written.
+    """A continuous time for a tlog whose clock was set while it was written.
 
-    A step of the clock between two records that is longer than a day, or goes back by more than a
-    minute, is a jump: the time runs on without it. The date is that of the first stretch between
-    jumps whose clock showed a possible civil date; without one it is that of the first stretch.
+    A step of the clock between two records by more than a day, or back by more than a minute, is
+    a jump, and is removed from the time. The date is that of the first section between jumps whose
+    clock had a possible civil date; without one, that of the first section.
     """
 
     def __init__(self) -> None:
@@ -312,7 +312,7 @@ class Timeline:
 
 
 class CivilClock:
-    """The best estimate of civil time: GPS if available, else the machine's clock."""
+    """The best estimate of civil time: from GPS if available, else from the machine's clock."""
 
     def __init__(self) -> None:
         self._offset_us: int | None = None
@@ -321,18 +321,18 @@ class CivilClock:
 
     @property
     def offset_us(self) -> int | None:
-        """Civil time of gateway time zero in µs since 1970; None before the first time is known."""
+        """Civil time at gateway time zero, µs since 1970; None before any time is known."""
         return self._offset_us
 
     def update_machine(self, unix_us: int, now_us: int) -> None:
-        """Note the machine's civil time; it counts until GPS time is known."""
+        """Process the machine's civil time, which is used until GPS time is known."""
         if not self._from_gps:
             self._offset_us = unix_us - now_us
 
     def update_gps(self, vehicle_id: int, utc_us: int, time_us: int) -> None:
-        """Note the time of an aircraft's fix and when it arrived.
+        """Process the time of an aircraft's fix and its time of arrival.
 
-        A machine that agrees within `JUMP_US` keeps its own, finer time.
+        If the machine's time agrees within `JUMP_US`, it is kept, as it is more precise.
         """
         offset_us = self._gps.update(vehicle_id, utc_us, time_us)
         if offset_us is None:
@@ -343,19 +343,19 @@ class CivilClock:
 
 
 class Stamper:
-    """The time stamps of one file: they grow, and follow one fixed offset."""
+    """Timestamps of one file, which increase and have a constant offset to the gateway clock."""
 
     def __init__(self, offset_us: int) -> None:
         self.offset_us = offset_us
         self._last_us = 0
 
     def stamp(self, now_us: int) -> int:
-        """Return the civil time of a moment, later than every stamp before."""
+        """Return the civil time of a moment, greater than all timestamps before."""
         wanted_us = max(now_us + self.offset_us, 0) & ~_LINK_BITS
         self._last_us = max(wanted_us, self._last_us + STEP_US)
         return self._last_us
 
     def has_jumped(self, clock: CivilClock) -> bool:
-        """Return whether the clock now knows a time that differs too much for this file."""
+        """Return whether the clock now has a time that differs too much from this file's."""
         offset_us = clock.offset_us
         return offset_us is not None and abs(offset_us - self.offset_us) > JUMP_US

@@ -1,7 +1,7 @@
-"""Tlogs made of tlogs: joined or merged, cut, chosen, and edited frame by frame.
+"""Create tlogs from tlogs: joined or merged, cut, filtered, and edited frame by frame.
 
-Each step takes the batches of the one before, so a file of any size needs the same memory. What is
-not edited stays byte for byte.
+Each step processes the batches of the previous one, so the memory needed does not depend on the
+size of the files. Parts that are not edited are copied byte for byte.
 """
 
 from collections import Counter
@@ -27,11 +27,11 @@ from gateway.wire.system_ids import FIELDS, rename_systems
 
 BoolArray = NDArray[np.bool_]
 
-NOTHING_LEFT: Final = "no record fits all of these options"
+NOTHING_LEFT: Final = "no record matches all of these options"
 
 
 def first_position(sources: Sequence[TlogSource]) -> tuple[float, float] | None:
-    """Return latitude and longitude of the first valid position of a vehicle, deg."""
+    """Return latitude and longitude of a vehicle's first valid position, deg."""
     for source in sources:
         reader = VehicleReader(source.senders, with_attitude=False)
         for batch in source.batches():
@@ -42,18 +42,18 @@ def first_position(sources: Sequence[TlogSource]) -> tuple[float, float] | None:
 
 
 class Renumbering:
-    """Other system ids, in headers and in all fields that hold one."""
+    """Change system ids in headers and in all fields that contain one."""
 
     def __init__(self, system_ids: Mapping[int, int]) -> None:
         self._system_ids = system_ids
 
     def affects(self, batch: Batch) -> BoolArray:
-        """Return which records may hold a system id that changes."""
+        """Return which records may contain a system id that changes."""
         is_from: BoolArray = np.isin(batch.origins >> 8, [*self._system_ids])
         return is_from | np.isin(batch.message_ids, [*FIELDS])
 
     def edit(self, frame: bytes) -> bytes | None:
-        """Return a frame with other ids; None of an unknown message, which has no checksum."""
+        """Return a frame with changed ids; None for an unknown message, as its CRC is unknown."""
         read = frame_of(frame)
         sender = self._renamed(read.origin[0])
         found = rename_systems(read, sender, self._renamed, drop_signature=True)
@@ -65,35 +65,35 @@ class Renumbering:
 
 @dataclass(frozen=True, slots=True)
 class TlogEdits:
-    """The changes between the files that are read and the tlog that is written."""
+    """The edits between the files that are read and the tlog that is written."""
 
     choice: FrameChoice = field(default_factory=FrameChoice)
     state: StateChoice | None = None
-    """Keep only the time while a vehicle is in a state."""
+    """If given, keep only the time while a vehicle is in a state."""
     merge: bool | None = None
-    """Leave out copies of frames that several files hold; by default if the files overlap."""
+    """Leave out copies of frames that are in several files; default: if the files overlap."""
     frames: tuple[Renumbering | Anonymiser, ...] = ()
     anonymity: Anonymity | None = None
-    """Where and when to an anonymised recording is moved."""
+    """Location and day to which an anonymised recording is moved."""
 
     @property
     def are_none(self) -> bool:
-        """Whether the records stay as they are."""
+        """Whether the records are not edited."""
         return self == TlogEdits(merge=self.merge)
 
 
 class TlogEditor:
-    """Apply edits to the records of some files; the remarks are complete at the end."""
+    """Apply edits to the records of some files; remarks are complete at the end."""
 
     def __init__(self, edits: TlogEdits, limits: Limits, remark: Callable[[str], None]) -> None:
         self._edits, self._limits, self._remark = edits, limits, remark
         self._left_out: Counter[int] = Counter()
-        """Frames that could not be edited, by message."""
+        """Number of frames that could not be edited, by message."""
 
     def joined(
         self, sources: Sequence[TlogSource], progress: Progress | None = None
     ) -> Iterator[Batch]:
-        """Yield the records of all files in order of time; copies are left out by a merge."""
+        """Yield the records of all files in order of time; a merge leaves out copies."""
         if len(sources) == 1:
             yield from self._intact(sources[0], progress)
             return
@@ -117,7 +117,7 @@ class TlogEditor:
             self._remark_merge(sources, alignment, copies)
 
     def apply(self, batches: Iterable[Batch], senders: Senders) -> Iterator[bytes]:
-        """Yield the bytes of the new tlog; raises FlightError if nothing is left."""
+        """Yield the bytes of the new tlog; raises FlightError if no record is left."""
         total = 0
         for batch in self.chosen(batches, senders):
             total += len(batch)
@@ -129,7 +129,7 @@ class TlogEditor:
             self._remark(f"left out {counted(count, 'frame')} of {name}")
 
     def chosen(self, batches: Iterable[Batch], senders: Senders) -> Iterator[Batch]:
-        """Yield the records that are kept, not edited; raises FlightError if nothing is left."""
+        """Yield the selected records, not edited; raises FlightError if no record is left."""
         edits, total, kept = self._edits, 0, 0
 
         def all_records() -> Iterator[Batch]:
@@ -171,11 +171,11 @@ class TlogEditor:
         return b"".join(pieces)
 
     def _intact(self, source: TlogSource, progress: Progress | None) -> Iterator[Batch]:
-        """Yield the records of a file, and report the bytes that belong to none."""
+        """Yield the records of a file, and report the bytes that belong to no record."""
         runs = size = end = 0
         for batch in source.batches(progress):
             for damage in batch.damage:
-                # A run may go on in the next batch.
+                # A run may continue in the next batch.
                 runs += damage.offset != end or not runs
                 end = damage.offset + damage.size
                 size += damage.size
@@ -185,7 +185,7 @@ class TlogEditor:
         if size:
             self._remark(
                 f"{source.path}: left out {counted(size, 'byte')} in {counted(runs, 'place')}, "
-                "which hold no record"
+                "which contain no record"
             )
 
     def _remark_merge(
@@ -196,7 +196,7 @@ class TlogEditor:
                 self._remark(f"{source.path}: has too few copies to compare clocks; times are kept")
             else:
                 self._remark(
-                    f"{source.path}: moved by {offset.offset_us / US_PER_S:+.3f} s to the clock of "
-                    f"{sources[0].path}, by {counted(offset.copies, 'frame')} of a sample"
+                    f"{source.path}: shifted by {offset.offset_us / US_PER_S:+.3f} s to the clock "
+                    f"of {sources[0].path}, by {counted(offset.copies, 'copied frame')}"
                 )
         self._remark(f"left out {counted(copies.count, 'copied frame')}")

@@ -1,4 +1,4 @@
-"""Index of a tlog: where to begin reading for a time, its senders, its damage."""
+"""Index of a tlog: offsets to read from for a time, its senders, its damage."""
 
 from array import array
 from bisect import bisect_left
@@ -11,35 +11,35 @@ from gateway.recordings.tlog import STRIDE, Batch, Damage, Timeline
 from gateway.recordings.tlog_scan import TIME_SIZE
 
 MAX_DAMAGE_RUNS: Final = 1000
-"""Runs that are listed one by one; a file that is damaged throughout must not fill the memory."""
+"""Runs that are listed, so that a file damaged throughout cannot fill the memory."""
 
 
 class TlogIndex:
-    """Index of a file: where to begin reading for a time, and a summary.
+    """Index of a file: offsets to read from for a time, and a summary.
 
-    One entry every `STRIDE` records, so the index of a file of any size is about a thousandth of
-    it. The time stamps of other programs' files may jump back; the index searches by the greatest
-    time so far, which never does.
+    There is one entry per `STRIDE` records, so the index has about a thousandth of the size of the
+    file. Timestamps of other programs' files may step back; the index searches by the greatest time
+    so far, which never decreases.
     """
 
     def __init__(self, timeline: Timeline | None = None) -> None:
         self.timeline = timeline or Timeline()
         """Corrects the times of batches that are read again."""
         self.count = 0
-        """Records."""
+        """Number of records."""
         self.size = 0
-        """Bytes that were seen, damage included."""
+        """Number of bytes processed, including damage."""
         self.first_us: int | None = None
         self.last_us: int | None = None
         """Greatest time."""
         self.senders = Senders()
         self.damage: list[Damage] = []
-        """The first `MAX_DAMAGE_RUNS` runs."""
+        """The first `MAX_DAMAGE_RUNS` runs of damaged bytes."""
         self.damaged_bytes = 0
         self.mended = 0
-        """Records whose time was damaged."""
+        """Number of records whose time was damaged."""
         self.unfinished = 0
-        """Bytes of a last record that is not whole."""
+        """Bytes of an incomplete last record."""
         self._offsets = array("q")
         self._times = array("q")
 
@@ -64,7 +64,7 @@ class TlogIndex:
         self.size = max(self.size, batch.offset + end)
 
     def offset_before(self, time_us: int, records: int = 0) -> int:
-        """Return where to begin reading to find the first record that is not before a time."""
+        """Return an offset before the first record that is not earlier than a time."""
         if not self._offsets:
             return 0
         entry = bisect_left(self._times, time_us) - 1 - -(-records // STRIDE)
@@ -75,7 +75,7 @@ class TlogIndex:
         self.size = max(self.size, run.offset + run.size)
         last = self.damage[-1] if self.damage else None
         if last is not None and last.offset + last.size == run.offset:
-            # A run across two chunks arrives in two pieces.
+            # A run across two batches arrives in two pieces.
             self.damage[-1] = Damage(last.offset, last.size + run.size)
         elif len(self.damage) < MAX_DAMAGE_RUNS:
             self.damage.append(run)

@@ -1,4 +1,4 @@
-"""Cut a table at a begin and an end."""
+"""Cut a table to a start and an end."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -19,7 +19,7 @@ NOTHING_WITHIN: Final = (
 
 
 def trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
-    """Cut a table at its begin and end, each a moment or None."""
+    """Cut a table to a start and an end, each a moment or None."""
     begin, end = limits
     zero_us = table.header.unix_us_at_zero or 0
 
@@ -36,7 +36,7 @@ def trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
             if not begun and begin is not None and first_us is not None:
                 start = first_true(times_us[:stop] >= time_us_of(begin, first_us))
                 begun = start < stop
-            # What was changed before the begin still holds, but a state from there does not.
+            # Settings changed before the start still apply, but a state from there does not.
             comments = tuple(
                 (max(k - start, 0), c)
                 for k, c in block.comments
@@ -54,6 +54,6 @@ def trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
 
 
 def first_true(where: BoolArray) -> int:
-    """Return the number of the first that is true, or how many there are."""
+    """Return the index of the first True, or the length if there is none."""
     found = np.flatnonzero(where)
     return int(found[0]) if len(found) else len(where)

@@ -1,8 +1,8 @@
-"""The one reader of the vehicles in recorded MAVLink, for all files, figures and pages.
+"""Read the vehicles in recorded MAVLink, for all files, figures and pages.
 
-Of each vehicle it yields the positions of its best source, the attitude of its best message, its
-texts joined, and any other message that is wanted. Frames of ground stations and of the other
-components of a system are left out, except their texts. See `Senders`.
+It yields, for each vehicle, the positions of its best source, the attitude of its best message, its
+joined texts, and any other requested message. Frames of ground stations and of the other components
+of a system are left out, except for their texts. See `Senders`.
 """
 
 import math
@@ -22,7 +22,7 @@ from gateway.wire.mavlink_messages import DEFINITIONS
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
 BOOT_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "timestamp": 1000}
-"""Fields with the sender's time, and their units; a civil time is not that since its boot."""
+"""Fields with the time since boot, and their unit in µs; a civil time in one is ignored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,21 +31,21 @@ class VehicleMessage:
 
     system_id: int
     time_us: int
-    """Recorded time; of a text that of its first chunk, which may lie before other messages."""
+    """Recorded time; for a text, that of its first chunk, so it may precede other messages."""
     message_id: int
     fields: Mapping[str, Any]
-    """By name, as they are sent; empty for a text."""
+    """Fields by name, as they were sent; empty for a text."""
     position: Position | None = None
-    """Of the vehicle, if this message is that of its best source and holds a valid one."""
+    """The vehicle's position, if this message is from its best source and contains a valid one."""
     q_nb: Quat | None = None
-    """Attitude of the vehicle, body FRD to NED, if this is its best message with a valid one."""
+    """The vehicle's attitude, body FRD to NED, if this is its best message with a valid one."""
     text: JoinedText | None = None
     frame: bytes = b""
-    """The whole frame; of a text none."""
+    """The whole frame; empty for a text."""
 
     @property
     def boot_us(self) -> int | None:
-        """Time since the boot of the vehicle; None where the message has none."""
+        """Time since the boot of the vehicle; None if the message does not contain it."""
         for name, unit_us in BOOT_UNITS_US.items():
             if name in self.fields:
                 own_us: int = self.fields[name] * unit_us
@@ -56,8 +56,8 @@ class VehicleMessage:
 class VehicleReader:
     """Read the vehicles of a recording, or one of them, frame by frame or batch by batch.
 
-    `senders` is the survey of the whole recording; a system that it lacks is taken to be one of the
-    gateway's own. `wanted` are ids of further messages.
+    `senders` is the survey of the whole recording; a system that it does not contain is treated as
+    one of the gateway's own. `wanted` are the ids of further messages.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class VehicleReader:
             yield self._message(vehicle, message_id, record)
 
     def flush(self) -> Iterator[VehicleMessage]:
-        """Return the texts that will not become longer."""
+        """Yield the texts that will not be continued."""
         return map(_of_text, self._joiner.flush())
 
     def _message(
@@ -141,7 +141,7 @@ def _of_text(text: JoinedText) -> VehicleMessage:
 
 
 def attitude_of(fields: Mapping[str, Any]) -> Quat | None:
-    """Return the attitude in ATTITUDE or ATTITUDE_QUATERNION; None if it is not known."""
+    """Return the attitude in ATTITUDE or ATTITUDE_QUATERNION; None if it is invalid."""
     if "roll" in fields:
         angles = (fields["roll"], fields["pitch"], fields["yaw"])
         return from_euler(*angles) if math.isfinite(sum(angles)) else None

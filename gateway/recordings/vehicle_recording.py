@@ -16,9 +16,9 @@ from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 
 
 class VehicleRecording:
-    """The vehicle of a recording that `options` choose, or the only one with an autopilot.
+    """The vehicle that `options` select in a recording, or the only one with an autopilot.
 
-    Raises FlightError if it holds no vehicle, or several to choose from; OSError if it cannot be
+    Raises FlightError if there is no vehicle, or several to choose from; OSError if it cannot be
     read.
     """
 
@@ -27,9 +27,9 @@ class VehicleRecording:
         if not self.flight.has_messages:
             raise FlightError(f"{files[0]}: is neither MAVLink nor the log of an autopilot")
         self.first_us = 0
-        """Time of the first record, once it was read."""
+        """Time of the first record; 0 before it is read."""
         self._answers = LogAnswers()
-        # Those of the flight must be complete or empty.
+        # The flight's senders are either complete, or empty and not usable here.
         self._senders = self.flight.senders if self.flight.is_mavlink else Senders()
         self._batches: Iterator[Batch] | None = self.flight.chosen()
         self.system_id = options.system_id
@@ -37,7 +37,7 @@ class VehicleRecording:
             self.system_id = _only_vehicle(files, self.flight.senders)
 
     def batches(self) -> Iterator[Batch]:
-        """Yield the records, of all senders; parameters and plans are known after that."""
+        """Yield the records of all senders; afterwards parameters and plans are known."""
         batches, self._batches = self._batches or self.flight.chosen(), None
         self._answers = LogAnswers()
         self.first_us = 0
@@ -49,14 +49,14 @@ class VehicleRecording:
             yield batch
 
     def messages(self, wanted: Iterable[int]) -> Iterator[VehicleMessage]:
-        """Yield the positions and texts of the vehicle, and other messages by id."""
+        """Yield the positions and texts of the vehicle, and other messages given by id."""
         reader = self.reader(wanted)
         for batch in self.batches():
             yield from reader.feed_batch(batch)
         yield from reader.flush()
 
     def read(self) -> None:
-        """Read all, for its parameters and plans."""
+        """Read all records, to find parameters and plans."""
         for _ in self.batches():
             pass
 
@@ -65,7 +65,7 @@ class VehicleRecording:
         return VehicleReader(self.flight.senders, wanted, self.system_id, with_attitude=False)
 
     def plan(self) -> RecordedPlan:
-        """Return its parameters and plans at the end of what was read."""
+        """Return its parameters and plans at the end of the records read so far."""
         system_id = self.system_id or next(iter(self._senders.systems()), 1)
         return RecordedPlan(self._answers, self._senders.vehicle(system_id))
 
@@ -75,7 +75,7 @@ def _only_vehicle(files: Sequence[Path], senders: Senders) -> int:
     piloted = [one for one in systems if _has_autopilot(senders.vehicle(one).heartbeat)]
     found = piloted or systems
     if not found:
-        raise FlightError(f"{files[0]}: no vehicle in it")
+        raise FlightError(f"{files[0]}: contains no vehicle")
     if len(found) > 1:
         listed = ", ".join(map(str, found))
         raise FlightError(f"{files[0]}: several vehicles; choose one with --system: {listed}")

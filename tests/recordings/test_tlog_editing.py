@@ -90,7 +90,7 @@ def test_chosen_frames_are_kept_byte_for_byte(
         (("--message", "ATITUDE"), "did you mean ATTITUDE"),
         (("--without", "NONE_SUCH_AT_ALL_*"), "no MAVLink message is named"),
         (("--system", 99), "no vehicle 99 in this file; it has 1, 2, 7"),
-        (("--system", 1, "--message", "CAMERA_TRIGGER"), "no record fits all of these options"),
+        (("--system", 1, "--message", "CAMERA_TRIGGER"), "no record matches all of these options"),
         (("--as", "1"), "write OLD:NEW"),
         (("--as", "1:256"), "write OLD:NEW"),
         (("--as", "1:3", "--as", "1:4"), "write OLD:NEW"),
@@ -140,7 +140,7 @@ def test_intact_records_of_a_damaged_file_are_kept_and_the_rest_counted(
     kept, text = convert(path, "--message", "*", folder=tmp_path)
     assert set(kept) <= set(MIXED)
     assert len(kept) == len(MIXED) - lost if lost is not None else len(kept) >= len(MIXED) - 2
-    assert "which hold no record" in text
+    assert "which contain no record" in text
     if left_out > 300:
         assert f"{left_out} bytes in 1 place" in text
 
@@ -294,7 +294,7 @@ def test_files_of_two_receivers_are_merged_without_copies(
     assert [r.frame for r in kept] == [r.frame for r in whole if r.frame not in missing]
     assert all(abs(k.time_us - w.time_us) < 1000 for k, w in zip(
         kept, [r for r in whole if r.frame not in missing], strict=True))  # fmt: skip
-    printed = re.search(r"moved by ([+-][0-9.]+) s", text)
+    printed = re.search(r"shifted by ([+-][0-9.]+) s", text)
     assert printed is not None
     assert float(printed[1]) == pytest.approx(-offset_us / 1e6, abs=1e-3)
     assert f"left out {len(first) + len(second) - len(kept)} copied frames" in text

@@ -1,1 +1,1 @@
-"""One file a format: its reader, its writer, or both."""
+"""One file per format: its reader, its writer, or both."""

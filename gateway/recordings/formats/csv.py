@@ -1,4 +1,4 @@
-"""CSV files of other programs as rows, by a map of their columns."""
+"""Read CSV files of other programs as rows, with a map of their columns."""
 
 import csv
 import math
@@ -21,34 +21,34 @@ from gateway.settings import Settings, setting
 from gateway.units import US_PER_S
 
 EXTRA_FIELDS: Final = ("baro_alt_m", "gps_speed_mps", "gps_course_deg")
-"""May be mapped though the table has no such columns: heights become pressures, speed and course
-the velocity where it is not given."""
+"""Names that may be mapped in addition to the columns of the table: heights are converted to
+pressures, speed and course to a velocity if none is given."""
 VECTORS: Final = tuple(
     frozenset(f"{quantity}_{axis}_b_{unit}" for axis in "xyz")
     for quantity, unit in (("accel", "mps2"), ("gyro", "radps"), ("mag", "ut"))
 )
-"""Of each all axes are needed, or none."""
+"""Groups of axes of which all or none must be present."""
 NEEDED: Final = frozenset({"time_us"}).union(*VECTORS[:2])
-"""Without these there is nothing to fuse."""
+"""Columns without which fusion is not possible."""
 DELIMITERS: Final = {",": "commas", ";": "semicolons", "\t": "tabs"}
 MAX_HEAD_LINES: Final = 1000
-"""The names of the columns are looked for in so many lines."""
+"""Lines that are searched for the names of the columns."""
 MAX_SHOWN: Final = 200
-"""Characters of the found names in an error."""
+"""Characters of found names that are quoted in an error."""
 EMPTY: Final = frozenset({"-", "--", "?", "null", "nil", "none", "n/a", "#n/a", "na"})
-"""Cells without a value, in small letters, in addition to empty ones and NaN."""
+"""Cells without a value, lower case, in addition to empty ones and NaN."""
 CLOCK: Final = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:[.,]\d*)?)")
-"""A time of the day."""
+"""Pattern of a time of day."""
 DAY_S, HOUR_S, MINUTE_S = 86_400, 3600, 60
 EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 MAX_CELL: Final = 40
-"""Characters of an unreadable cell in a message."""
+"""Characters of an unreadable cell that are quoted in a message."""
 LATE_US: Final = 60 * US_PER_S
-"""A value measured this long before or after its line has a damaged time, or another clock's."""
+"""Maximum difference of a value's time from its row's; beyond it, damaged or of another clock."""
 
 
 MAX_LISTED: Final = 20
-"""Unknown columns that are named."""
+"""Maximum number of unknown columns that are listed."""
 _GROUPS_NEED: Final = [
     (group, [COLUMNS.index(name) for name in names])
     for group, names in (
@@ -58,7 +58,7 @@ _GROUPS_NEED: Final = [
         (GPS, ("gps_lat_dege7", "gps_lon_dege7")),
     )
 ]
-"""Without these columns there is no such record."""
+"""Columns that a record requires, by the group of its columns."""
 
 
 class Column(Settings, frozen=True):
@@ -70,7 +70,7 @@ class Column(Settings, frozen=True):
 
 
 class ColumnMap(Settings, frozen=True):
-    """Columns of another program's file by the names of ours."""
+    """Maps columns of another program's file to our names."""
 
     columns: Annotated[
         dict[str, Column | str],
@@ -78,18 +78,20 @@ class ColumnMap(Settings, frozen=True):
     ]
 
     def __post_init__(self) -> None:
-        """Refuse a map to an unknown column."""
+        """Reject a map to an unknown column."""
         unknown = sorted(set(self.columns) - set(COLUMNS) - set(EXTRA_FIELDS))
         if unknown:
-            raise ValueError(f"no such column here: {', '.join(unknown[:MAX_LISTED])}")
+            raise ValueError(f"unknown column names: {', '.join(unknown[:MAX_LISTED])}")
         if "time_us" not in self.columns:
             raise ValueError("time_us must be mapped")
         if absent := _begun(self.columns) - self.columns.keys():
-            raise ValueError(f"of the same vector must be mapped too: {', '.join(sorted(absent))}")
+            raise ValueError(
+                f"the other axes of a vector must be mapped too: {', '.join(sorted(absent))}"
+            )
 
 
 class CsvReader:
-    """Turn the lines of another program's CSV into rows."""
+    """Convert the lines of another program's CSV to rows."""
 
     def __init__(self, column_map: ColumnMap, *, lenient: bool = False) -> None:
         self._columns = {
@@ -100,22 +102,22 @@ class CsvReader:
         }
         self._lenient = lenient
         self.unix_us_at_zero: int | None = None
-        """Civil time of the rows' time zero, where their times have dates."""
+        """Civil time of the rows' time zero, if their times have dates."""
         self.skipped = 0
-        """Lines of text before that with the names of the columns."""
+        """Number of lines of text before the column names."""
         self.faults = 0
-        """Lines that could not be read, or whose time is not between its neighbours."""
+        """Number of lines that could not be read, or whose time is not between its neighbours."""
         self.odd_cells = 0
-        """Cells that could not be read in other lines."""
+        """Number of unreadable cells in other lines."""
         self.first_fault = ""
-        """The first of all that: line, column and text."""
+        """The first of these faults: line, column and text."""
         self._has_decimal_comma = False
         self._day_s, self._clock_s = 0, 0.0
-        """Midnights that times of the day have passed, and the newest of them."""
+        """For times without dates: days since the first line and newest time of day, both in s."""
 
     def blocks(self, lines: Iterable[str]) -> Iterator[TableBlock]:
         """Read a whole file; raises ValueError if it lacks needed columns."""
-        # Lines that are left out stay empty, so that their numbers are those of the file.
+        # Skipped lines become empty, so that line numbers stay those of the file.
         kept = ("" if line.startswith("#") else line for line in lines)
         head = [*islice(kept, MAX_HEAD_LINES)]
         delimiter, names, begin = self._find_names(head)
@@ -143,7 +145,7 @@ class CsvReader:
     def _values(
         self, table: Any, names: Sequence[str], begin: int
     ) -> Iterator[tuple[int, list[float]]]:
-        """Yield number and mapped values of each line; NaN is an empty cell."""
+        """Yield the line number and the mapped values of each line; NaN is an empty cell."""
         at = {name: number for number, name in enumerate(names)}
         wanted = [(at[c.column], c.scale, c.offset) for c in self._columns.values()]
         while True:
@@ -172,7 +174,7 @@ class CsvReader:
             yield begin + table.line_num, values
 
     def _odd_values(self, texts: Sequence[str], number: int) -> list[float] | None:
-        """Read a line whose cells are not all plain numbers; None without a time."""
+        """Read a line with cells that are not plain numbers; None if it has no time."""
         values = []
         for (ours, column), text in zip(self._columns.items(), texts, strict=True):
             value = self._value(ours, column, text)
@@ -197,7 +199,7 @@ class CsvReader:
                 return time_us
         with suppress(ValueError):
             return float(text) * column.scale + column.offset
-        # Quoted, so that it does not separate.
+        # A quoted cell with a decimal comma.
         if "," not in text or "." in text:
             return None
         with suppress(ValueError):
@@ -207,7 +209,7 @@ class CsvReader:
         return None
 
     def _time_us(self, ours: str, text: str) -> float | None:
-        """Read a time of the day, or a date and time of ISO 8601, UTC without a zone."""
+        """Read a time of day, or a date and time in ISO 8601; UTC if it has no zone."""
         if clock := CLOCK.fullmatch(text):
             hours, minutes, seconds = (float(part.replace(",", ".")) for part in clock.groups())
             clock_s = hours * HOUR_S + minutes * MINUTE_S + seconds
@@ -228,7 +230,7 @@ class CsvReader:
         return NAN if self.unix_us_at_zero is None else unix_us - self.unix_us_at_zero
 
     def _invalid(self, cells: FloatArray, numbers: Sequence[int]) -> list[int]:
-        """Return which rows are invalid; of one with an invalid fix or pressure only that is."""
+        """Return the invalid rows; an invalid fix or pressure is cleared, and its row kept."""
         for row, why in normalise(cells).items():
             group = {"gps": GPS, "baro": BARO}.get(why.partition("_")[0])
             if group is not None:
@@ -275,7 +277,7 @@ class CsvReader:
 
 
 def _cells(values: dict[str, FloatArray]) -> FloatArray:
-    """Lay mapped values of some lines out as rows of the table."""
+    """Arrange mapped values of some lines as rows of the table."""
     time_us = np.rint(values["time_us"])
     cells = np.full((len(time_us), len(COLUMNS)), NAN)
 
@@ -316,7 +318,7 @@ def _cells(values: dict[str, FloatArray]) -> FloatArray:
 
 
 def _cells_of(line: str, delimiter: str) -> list[str]:
-    """Split a line; one that is no CSV has no cells."""
+    """Split a line into cells; empty if it is not CSV."""
     try:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
     except csv.Error:
@@ -324,18 +326,18 @@ def _cells_of(line: str, delimiter: str) -> list[str]:
 
 
 def _begun(names: Iterable[str]) -> frozenset[str]:
-    """Return all axes of the vectors that have at least one axis among the names."""
+    """Return all axes of each vector that has at least one axis among the names."""
     return frozenset[str]().union(*(axes for axes in VECTORS if not axes.isdisjoint(names)))
 
 
 def _measured_us(own_us: FloatArray, row_us: FloatArray) -> FloatArray:
-    """Return when values were measured; their lines' time if that is on another clock."""
+    """Return the times of measurement; the time of the row if that is on another clock."""
     return np.where(np.abs(own_us - row_us) <= LATE_US, np.rint(own_us), row_us)
 
 
 def level_velocity(speed_mps: FloatArray, course_deg: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the velocities north and east of speeds and courses over ground."""
-    # Not numpy's sine: its last digit is another one on some processors.
+    """Return north and east velocity from speed and course over ground."""
+    # Not NumPy's sine: its last digit differs between processors.
     course_rad = [*map(math.radians, np.where(np.isfinite(course_deg), course_deg, NAN).tolist())]
     north, east = [*map(math.cos, course_rad)], [*map(math.sin, course_rad)]
     return speed_mps * np.array(north), speed_mps * np.array(east)

@@ -1,9 +1,10 @@
-"""DataFlash, the log of ArduPilot, in binary (.bin) and as text (.log), read by pymavlink.
+"""DataFlash, ArduPilot's log, as binary (.bin) or text (.log), read with pymavlink.
 
-IMU, MAG (milligauss, offsets taken off), BARO, GPS with the accuracies of GPA, and what the
-autopilot estimated: ATT, POS and the velocities of its Kalman filter (XKF1, of old NKF1). All in
-body FRD and NED, in us since the start. Of several sensors of a kind one is taken; firmware before
-3.3 counts milliseconds (TimeMS, and T in GPS), and names the second sensor IMU2, GPS2 and so on.
+Messages read: IMU, MAG (milligauss, offsets subtracted), BARO, GPS with the accuracies in GPA, and
+the autopilot's estimates: ATT, POS and the velocities of its Kalman filter (XKF1, formerly NKF1).
+All are in body FRD and NED, in µs since the start. Of several sensors of a kind one is used.
+Firmware before 3.3 counts milliseconds (TimeMS; T in GPS) and names the second sensor IMU2, GPS2
+and so on.
 """
 
 import contextlib
@@ -48,54 +49,54 @@ from gateway.records import (
 from gateway.units import DEG_PER_DEGE7, US_PER_S, UT_PER_GAUSS, counted
 
 LATE_US: Final = US_PER_S
-"""Messages of one loop are not quite in order; one later than this has a damaged time."""
+"""Messages of one loop are not quite in order; one that is older than this has a damaged time."""
 AHEAD_US: Final = 3_600 * US_PER_S
-"""And so has one that jumps ahead by more."""
+"""Maximum step forward; a message further ahead has a damaged time as well."""
 AGREEING: Final = 50
-"""So many messages in a row that agree about another time are right: the clock has leaped."""
+"""Consecutive messages with consistent deviating times that prove a jump of the clock."""
 LEAST_AGREEING: Final = 3
-"""And so many that nothing follows."""
+"""The same at the end of the log, where no more messages follow."""
 FIX_2D: Final = 2
 TIME_COLUMNS: Final = ("TimeUS", "TimeMS")
 SENSOR_NUMBERS: Final = ("I", "C")
-"""Columns with the number of the sensor, or Kalman filter, of a message."""
+"""Columns with the number of the message's sensor or Kalman filter."""
 KINDS: Final = {
     "IMU": "IMU", "IMU2": "IMU", "IMU3": "IMU", "MAG": "MAG", "MAG2": "MAG", "MAG3": "MAG",
     "BARO": "BARO", "BAR2": "BARO", "BAR3": "BARO", "GPS": "GPS", "GPS2": "GPS",
     "GPA": "GPA", "GPA2": "GPA",
 }  # fmt: skip
-"""Kind of sensor by the name of its messages."""
+"""Kind of sensor, by message name."""
 SENSORS: Final = {
     "IMU": ("AccX", "AccY", "AccZ"),
     "MAG": ("MagX", "MagY", "MagZ"),
     "BARO": ("Press",),
     "GPS": ("Status",),
 }
-"""Kinds of which a log may hold several, and columns that are not all zero where one has data."""
+"""Kinds of sensor with several instances; value: columns that are not all zero if it has data."""
 ROLLOVER_US: Final = 1024 * WEEK_US
 FIRST_LOG_US: Final = 1_262_304_000 * US_PER_S - GPS_EPOCH_UNIX_US
-"""The year 2010, as GPS time: nobody wrote this format before, so a receiver with an earlier date
-has lost count of the weeks, which begin again every 1024."""
+"""The year 2010, as GPS time: the format is not older, so a receiver with an earlier date has a
+wrong week number, which restarts every 1024 weeks."""
 
 Message = Any
-"""With the columns of its format as attributes, in the units of the format."""
+"""A message with its columns as attributes, in the units of the format."""
 Item = TypeVar("Item")
 MAGIC: Final = b"\xa3\x95"
 MAX_LOOKED_AT: Final = 20_000
-"""Messages of a kind that are read to find the first sensor with data: an hour of GPS."""
+"""Messages of a kind that are searched for the first sensor with data: an hour of GPS."""
 SYSTEM_IDS: Final = ("SYSID_THISMAV", "MAV_SYSID")
 _AS_TEXT: Final = bytes(range(128)) + b"?" * 128
 _SKIPPED: Final = re.compile(r"Skipped (\d+) bad bytes")
 
 
 def sensor_of(name: str, message: Message) -> int:
-    """Return which sensor, or Kalman filter, sent a message; counted from 0."""
+    """Return the number of a message's sensor or Kalman filter, counted from 0."""
     number = next((n for column in SENSOR_NUMBERS if (n := getattr(message, column, None))), 0)
     return int(number) or (int(name[-1]) - 1 if name in KINDS and name[-1].isdigit() else 0)
 
 
 def in_era(gps_us: int) -> int:
-    """Add the weeks that a GPS receiver has lost count of."""
+    """Add the multiple of 1024 weeks that a GPS receiver lacks."""
     lost = -(-(FIRST_LOG_US - gps_us) // ROLLOVER_US) if gps_us < FIRST_LOG_US else 0
     return gps_us + lost * ROLLOVER_US
 
@@ -109,29 +110,29 @@ def own_us_of(name: str, message: Message) -> int:
 
 
 class LogClock(Generic[Item]):
-    """The times of one log, which grow from 0: damaged ones are left out, a leap is followed."""
+    """Map autopilot times to times from 0: damaged times are discarded, clock jumps followed."""
 
     def __init__(self) -> None:
         self.dropped = 0
         """Messages with an impossible time."""
         self.leaps = 0
-        """How often the autopilot's clock jumped forward by more than that."""
+        """Number of jumps of the autopilot's clock forward by more than `AHEAD_US`."""
         self.restarts = 0
-        """How often it began again."""
+        """Number of restarts of the autopilot's clock."""
         self.is_rolled_over = False
-        """Whether a receiver has lost count of the weeks."""
+        """Whether a receiver's week number has rolled over."""
         self.is_beyond_leaps = False
-        """Whether a date is later than the leap seconds are known."""
+        """Whether a date is later than the time up to which leap seconds are known."""
         self.zero_us: int | None = None
-        """The autopilot's time at zero."""
+        """Autopilot time at zero of the records' clock."""
         self._newest_us = 0
         self._held: list[tuple[int, Item]] = []
-        """Items whose times agree with each other, but not with those before."""
+        """Items with consistent times that deviate from the times before them."""
 
     def feed(self, own_us: int | None, item: Item) -> list[tuple[int, Item]]:
-        """Process an item with its time on the autopilot's clock; return those that are timed.
+        """Process an item with its time on the autopilot's clock; return the items that are timed.
 
-        One without a time is as old as the one before.
+        An item without a time gets that of the one before.
         """
         if own_us is None:
             return [(self._newest_us, item)]
@@ -146,13 +147,13 @@ class LogClock(Generic[Item]):
         return self._follow() if len(self._held) == AGREEING else []
 
     def flush(self) -> list[tuple[int, Item]]:
-        """Return the items that still wait at the end of the log."""
+        """Return the items that are still held at the end of the log."""
         held = self._follow() if len(self._held) >= LEAST_AGREEING else []
         self._drop_held()
         return held
 
     def utc_us(self, message: Message) -> int | None:
-        """Return the civil time of a fix, in µs since 1970; None if the receiver has no week."""
+        """Return the civil time of a fix, µs since 1970; None if it has no week number."""
         week = getattr(message, "GWk", 0) or getattr(message, "Week", 0)
         if not week or message.Status < FIX_2D:
             return None
@@ -163,7 +164,7 @@ class LogClock(Generic[Item]):
         return utc_us
 
     def _timed(self, own_us: int, item: Item) -> tuple[int, Item]:
-        """Return an item with its time on the records' clock, which never goes back."""
+        """Return an item with its time on the records' clock, which never decreases."""
         self._newest_us = max(self._newest_us, own_us - (self.zero_us or 0))
         return self._newest_us, item
 
@@ -177,19 +178,19 @@ class LogClock(Generic[Item]):
         step_us = held[0][0] - (self.zero_us or 0) - self._newest_us
         self.leaps += step_us > 0
         self.restarts += step_us < 0
-        # A log that begins again goes on from where it was.
+        # After a restart, times continue from the last one.
         self.zero_us = (self.zero_us or 0) + min(step_us, 0)
         return [self._timed(*one) for one in held]
 
 
 def week_ms_of(message: Message) -> int:
-    """Return a fix's time of the week, which before 3.3 is in TimeMS."""
+    """Return the time of week of a fix, ms; firmware before 3.3 sends it as TimeMS."""
     week_ms = getattr(message, "GMS", None)
     return int(message.TimeMS if week_ms is None else week_ms)
 
 
 class ArdupilotReader:
-    """Turn the messages of one log into records."""
+    """Convert the messages of one log to records."""
 
     def __init__(self, vehicle_id: int, sensors: Mapping[str, int] = MappingProxyType({})) -> None:
         self.clock: LogClock[tuple[str, Message]] = LogClock()
@@ -197,9 +198,9 @@ class ArdupilotReader:
         self._sensors = {**sensors, "GPA": sensors.get("GPS", 0)}
         self._mag: Vec3 | None = None
         self._fix: GpsFix | None = None
-        """The newest fix, which waits for its accuracies."""
+        """The newest fix, waiting for its accuracies."""
         self._fused_position: tuple[int, Vec3 | None] = (0, None)
-        """When it was estimated; latitude and longitude in degrees, height in m."""
+        """Time of the estimate; latitude and longitude in degrees, height in m."""
         self._motion: tuple[int, Vec3 | None] = (0, None)
         self._handlers: dict[str, Callable[[Message, int], list[Imported]]] = {
             "IMU": self._imu, "MAG": self._magnetometer, "BARO": self._baro,
@@ -210,7 +211,7 @@ class ArdupilotReader:
 
     @property
     def names(self) -> set[str]:
-        """Names of the messages that are used."""
+        """Names of the messages that are read."""
         return {*self._handlers, *KINDS}
 
     def feed(self, name: str, message: Message) -> list[Imported]:
@@ -221,7 +222,7 @@ class ArdupilotReader:
         return self._handle(self.clock.feed(own_us_of(name, message), (kind, message)))
 
     def flush(self) -> list[Imported]:
-        """Return the records that still wait at the end of the log."""
+        """Return the records that are still held at the end of the log."""
         return [*self._handle(self.clock.flush()), *self._flush_fix()]
 
     def _handle(self, timed: Iterable[tuple[int, tuple[str, Message]]]) -> list[Imported]:
@@ -233,7 +234,7 @@ class ArdupilotReader:
         return found
 
     def _flush_fix(self) -> list[Imported]:
-        """Return the fix that waits for its accuracies, if one does."""
+        """Return the fix that is waiting for its accuracies, if any."""
         fix, self._fix = self._fix, None
         return [] if fix is None else [fix]
 
@@ -288,7 +289,7 @@ class ArdupilotReader:
         return []
 
     def _accuracies(self, m: Message, time_us: int) -> list[Imported]:
-        """Join a fix with the receiver's accuracies, which follow it."""
+        """Add the receiver's accuracies, which follow a fix, to the fix."""
         fix = self._fix
         if fix is None or fix.time_us != time_us:
             return self._flush_fix()
@@ -311,7 +312,7 @@ class ArdupilotReader:
         return []
 
     def _attitude(self, m: Message, time_us: int) -> list[Imported]:
-        """Take the autopilot's own solution, for comparison."""
+        """Return the autopilot's own solution, for comparison."""
         position, vel_n_mps = (
             value if time_us - newest_us <= VELOCITY_AGE_US else None
             for newest_us, value in (self._fused_position, self._motion)
@@ -323,7 +324,7 @@ class ArdupilotReader:
 
 
 class PrintedDamage(io.TextIOBase):
-    """Count the damage that pymavlink prints to the terminal."""
+    """Count the damage that pymavlink reports on the terminal."""
 
     def __init__(self) -> None:
         self.before = Before()
@@ -331,19 +332,19 @@ class PrintedDamage(io.TextIOBase):
         self.was_printed = False
 
     def write(self, text: str) -> int:
-        """Count the bytes that are reported as skipped."""
+        """Add the number of bytes that are reported as skipped."""
         self.was_printed = True
         self.bytes += sum(map(int, _SKIPPED.findall(text)))
         return len(text)
 
     def counting(self, call: Callable[[], Any]) -> Any:
-        """Call while counting the damage that is printed."""
+        """Make a call, and count the damage that it prints."""
         with contextlib.redirect_stdout(self), contextlib.redirect_stderr(self):
             return call()
 
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
-    """Open a DataFlash log as a flight; raises FlightError if there is none in it."""
+    """Open a DataFlash log as a flight; raises FlightError if it contains none."""
     damage = PrintedDamage()
     log = open_log(path, options, damage)
     vehicle_id = options.system_id or system_id_of(log.params)
@@ -370,17 +371,17 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
 
 
 def system_id_of(parameters: Mapping[str, float]) -> int:
-    """Return the system id among parameters; 1 if there is no valid one."""
+    """Return the system id in the parameters; 1 if there is no valid one."""
     named = (parameters.get(name) for name in SYSTEM_IDS)
     known = next((int(value) for value in named if value is not None), 1)
     return known if 1 <= known <= 255 else 1
 
 
 def unix_us_at(log: Any, own_us: int) -> int | None:
-    """Return the civil time at a time of the autopilot's clock; None without one of GPS.
+    """Return the civil time at a time of the autopilot's clock; None without GPS time.
 
-    It is that of the first week and time of GPS, to which pymavlink applies the leap seconds of
-    today.
+    It is derived from the first GPS week and time, to which pymavlink applies the present number
+    of leap seconds.
     """
     clock = log.clock
     if not clock.timebase:
@@ -390,7 +391,7 @@ def unix_us_at(log: Any, own_us: int) -> int | None:
 
 
 def _why_empty(log: Any, damage: PrintedDamage, reader: ArdupilotReader) -> str:
-    """Return why a log gave no IMU samples."""
+    """Return the reason why a log contains no IMU samples."""
     formats = {known.name: {*known.columns} for known in log.formats.values()}
     if not formats.keys() - {"FMT"}:
         return "it has no list of formats (FMT), without which its messages cannot be decoded"
@@ -400,7 +401,7 @@ def _why_empty(log: Any, damage: PrintedDamage, reader: ArdupilotReader) -> str:
         if KINDS.get(name) == "IMU" and lacking:
             return (
                 f"its {name} messages cannot be decoded: they have no {', '.join(sorted(lacking))}"
-                ", as in a log of sdlog2, PX4's logger before ULog, which is not read"
+                ", as in a log of sdlog2, PX4's logger before ULog, which is not supported"
             )
     if damage.messages or reader.clock.dropped:
         return "none of its IMU messages can be decoded"
@@ -408,7 +409,7 @@ def _why_empty(log: Any, damage: PrintedDamage, reader: ArdupilotReader) -> str:
 
 
 def sensors_of(log: Any, damage: PrintedDamage) -> dict[str, int]:
-    """Find the first sensor of each kind that has data; a GPS that has a fix."""
+    """Find the first sensor of each kind that has data; for GPS, a fix."""
     found: dict[str, int] = {}
     for kind, columns in SENSORS.items():
         names = {name for name, of in KINDS.items() if of == kind}
@@ -425,7 +426,7 @@ def sensors_of(log: Any, damage: PrintedDamage) -> dict[str, int]:
 
 
 def _each(log: Any, damage: PrintedDamage, names: set[str]) -> Iterator[Any]:
-    """Yield the messages of these names up to the first damage, and go back to the begin."""
+    """Yield the messages of these names up to the first damage, and rewind the log."""
     log.type_list = None
     try:
         while message := damage.counting(lambda: log.recv_match(type=names, strict=True)):
@@ -439,35 +440,35 @@ def _each(log: Any, damage: PrintedDamage, names: set[str]) -> Iterator[Any]:
 def open_log(path: Path, options: ReadOptions, damage: PrintedDamage) -> Any:
     """Open a temporary copy of a log, unpacked.
 
-    pymavlink maps a log into the memory, where one that shrinks would end the process.
+    pymavlink memory-maps a log; if the file shrank meanwhile, the process would be killed.
     """
     whole = read_chunks(path, options.progress, options.unpacked_limit)
     content, damage.before = skip_to(DATAFLASH_BEGIN, whole)
     first = next(content, b"")
     is_binary = first.startswith(MAGIC)
     kind = DFReader_binary if is_binary else DFReader_text
-    # A byte that is not text must not stop the reading.
+    # Replace bytes that are not ASCII, so that reading continues.
     all_of_it = chain([first], content)
     sound = all_of_it if is_binary else (data.translate(_AS_TEXT) for data in all_of_it)
     with temporary_copy(path, sound) as plain:
         log = kind.__new__(kind)
-        # The fast indexer prints to the terminal directly, not through Python.
+        # The fast indexer prints to the terminal directly, not through Python's stdout.
         log.init_arrays_fast = log.init_arrays
         try:
             damage.counting(lambda: kind.__init__(log, name_of(plain)))
         except Exception as error:
-            # Damage makes pymavlink raise anything, bare exceptions included.
+            # On damaged logs pymavlink raises any exception, including bare ones.
             log.close()
             raise FlightError(f"{path}: its list of formats is damaged: {error}") from error
         return log
 
 
 class MessageReader(Protocol[Item]):
-    """Processes the messages of a log one by one."""
+    """Process the messages of a log one by one."""
 
     @property
     def names(self) -> set[str]:
-        """Names of the messages that are used."""
+        """Names of the messages that are read."""
         ...
 
     def feed(self, name: str, message: Message) -> list[Item]:
@@ -475,15 +476,15 @@ class MessageReader(Protocol[Item]):
         ...
 
     def flush(self) -> list[Item]:
-        """Return the items that still wait at the end of the log."""
+        """Return the items that are still held at the end of the log."""
         ...
 
 
 def items_of(log: Any, damage: PrintedDamage, reader: MessageReader[Item]) -> Iterator[Item]:
     """Read the whole log; a message that cannot be decoded is counted.
 
-    Of an intact log only the needed messages are decoded. The index of a damaged one ends at the
-    damage, so it is read message by message.
+    If the log is intact, only the needed messages are decoded. The index of a damaged one ends at
+    the damage, so it is read message by message.
     """
 
     def wanted() -> Any:
@@ -495,7 +496,7 @@ def items_of(log: Any, damage: PrintedDamage, reader: MessageReader[Item]) -> It
         begin = log.offset
         try:
             message = damage.counting(take)
-            # For a line that is no message it gives the next one, and that again in its turn.
+            # Instead of an invalid line pymavlink returns the next message, and again later.
             is_again, end = log.offset == end, log.offset
             found = [] if message is None or is_again else reader.feed(message.get_type(), message)
         except Exception:  # noqa: BLE001 - as above
@@ -512,24 +513,24 @@ def items_of(log: Any, damage: PrintedDamage, reader: MessageReader[Item]) -> It
 
 
 def _lines_of(log: Any, names: set[str]) -> int:
-    """Count the lines of a text log that should be such messages, or are of no known format."""
+    """Count the lines of a text log that should be these messages, or have an unknown format."""
     odd = {name for name in log.counts if name.strip() and name not in log.formats}
     return sum(log.counts.get(name, 0) for name in names | odd)
 
 
 def remarks_of(log: Any, damage: PrintedDamage, clock: LogClock[Any]) -> Iterator[str]:
-    """Yield remarks for the user about a log that was read."""
+    """Yield remarks for the user on a log that was read."""
     yield from damage.before.remarks
     if damage.bytes:
-        yield f"is damaged: left out {counted(damage.bytes, 'byte')} without a message"
+        yield f"is damaged: left out {counted(damage.bytes, 'byte')} that belong to no message"
     if log.offset < log.data_len:
         yield f"ends within a message: left out {counted(log.data_len - log.offset, 'byte')}"
     if broken := clock.dropped + damage.messages:
-        yield f"is damaged: left out {counted(broken, 'message')} that cannot be understood"
+        yield f"is damaged: left out {counted(broken, 'message')} that cannot be decoded"
     if clock.leaps:
         yield f"its clock jumped forward {counted(clock.leaps, 'time')}"
     if clock.restarts:
-        yield f"the autopilot restarted {counted(clock.restarts, 'time')}; its times run on"
+        yield f"the autopilot restarted {counted(clock.restarts, 'time')}; its times continue"
     if clock.is_rolled_over:
         yield "its GPS receiver counts 1024 weeks too few; its dates are corrected"
     if clock.is_beyond_leaps:

@@ -1,4 +1,4 @@
-"""A DataFlash log as the record of its autopilot: rows and events for `dataflash.toml`."""
+"""Read a DataFlash log as an autopilot's log: rows and events for `dataflash.toml`."""
 
 import contextlib
 import math
@@ -48,17 +48,17 @@ from gateway.vehicle.encoding import int32
 from gateway.vehicle.plan import FENCE, MISSION, RALLY, Item
 
 ARMED, DISARMED = 10, 11
-"""Ids of EV."""
+"""Event ids in EV."""
 ORIGIN, HOME = 0, 1
-"""Types of ORGN."""
+"""Types of origin in ORGN."""
 INSTANCES: Final = ("I", "C", "Instance", "Inst", "IMU")
 """Columns with the number of a sensor, filter or battery."""
 PLANS: Final = {"CMD": MISSION, "FNCE": FENCE, "RALY": RALLY}
 """Messages with items of plans."""
 EVENTS: Final = frozenset({"PARM", "MODE", "ARM", "EV", "STAT", "MSG", *PLANS})
-"""Messages with events at the begin of a log."""
+"""Messages that are read for the state at the start of a log."""
 EARLY_US: Final = US_PER_S
-"""A mode or armed state that is logged so soon holds from the begin of the log."""
+"""A mode or armed state logged this early is taken as valid from the start of the log."""
 GLOBAL_RELATIVE: Final = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
 FENCE_COMMANDS: Final = {
     92: mavlink.MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION,
@@ -67,9 +67,9 @@ FENCE_COMMANDS: Final = {
     97: mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
     98: mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION,
 }
-"""By the type in FNCE."""
+"""MAVLink command of a fence item, by its type in FNCE."""
 RALLY_HAS_FRAME: Final = 4
-"""Bit of the flags in RALY; two bits above it are the frame."""
+"""Bit of the flags in RALY; if it is set, the next two bits contain the frame."""
 RALLY_FRAMES: Final = {
     0: mavlink.MAV_FRAME_GLOBAL,
     1: GLOBAL_RELATIVE,
@@ -83,11 +83,11 @@ _FRAME_TYPES: Final = {
     11: mavlink.MAV_TYPE_HELICOPTER, 12: mavlink.MAV_TYPE_DODECAROTOR,
     13: mavlink.MAV_TYPE_HELICOPTER,
 }  # fmt: skip
-"""MAV_TYPE by FRAME_CLASS of a copter."""
+"""MAV_TYPE of a copter, by FRAME_CLASS."""
 _SECOND: Final = 2
-"""AHRS_EKF_TYPE of the second Kalman filter."""
+"""Value of AHRS_EKF_TYPE that selects the second Kalman filter (NKF)."""
 _BOAT: Final = 2
-"""FRAME_CLASS of a rover that is a boat."""
+"""Value of FRAME_CLASS for a boat."""
 
 
 @cache
@@ -97,7 +97,7 @@ def table() -> MessageTable:
 
 
 def topic_of(known: Any) -> tuple[str, int]:
-    """Return topic and instance of a format: CURR of volts and amperes is BAT by its old name."""
+    """Return topic and instance of a format; CURR in volts and amperes is a former name of BAT."""
     topic, instance = table().aliases.get(known.name, (known.name, 0))
     if topic == "CURR" and "Volt" in known.columns:
         is_scaled = known.format[known.columns.index("Volt")] != "f"
@@ -106,7 +106,7 @@ def topic_of(known: Any) -> tuple[str, int]:
 
 
 def instance_of(name: str, message: Message) -> int:
-    """Return the number of the sensor, filter or battery that a message is about, from 0."""
+    """Return the number of the sensor, filter or battery in a message, from 0."""
     columns = {message.fmt.instance_field, *INSTANCES} & {*message.fmt.columns}
     found = (getattr(message, column) for column in columns)
     number = next((value for value in found if isinstance(value, int)), 0)
@@ -114,7 +114,7 @@ def instance_of(name: str, message: Message) -> int:
 
 
 class RowReader:
-    """Turn the messages of a log into rows and events."""
+    """Convert the messages of a log to rows and events."""
 
     def __init__(self, unused: frozenset[str]) -> None:
         self.clock: LogClock[tuple[str, Message]] = LogClock()
@@ -130,7 +130,7 @@ class RowReader:
 
     @property
     def names(self) -> set[str]:
-        """Names of the messages that are used."""
+        """Names of the messages that are read."""
         return {*table().topics, "ORGN", *KINDS}
 
     def feed(self, name: str, message: Message) -> list[Entry]:
@@ -143,7 +143,7 @@ class RowReader:
         ]
 
     def flush(self) -> list[Entry]:
-        """Return what still waits at the end of the log."""
+        """Return the entries that are still held at the end of the log."""
         held = self.clock.flush()
         return [entry for time_us, one in held for entry in self._entries(time_us, *one)]
 
@@ -191,7 +191,7 @@ class RowReader:
         return None
 
     def _item(self, name: str, m: Message) -> Event:
-        """Return an item; where it is in the mission already, the vehicle begins with it."""
+        """Return an item; one that is in the mission already is logged because it is executed."""
         item = _item_of(name, m)
         if item.kind != MISSION:
             return item
@@ -221,10 +221,10 @@ def _mode_of(m: Message) -> int | None:
 
 
 def _item_of(name: str, m: Message) -> LoggedItem:
-    """Return an item of a mission, a fence or rally points."""
+    """Return an item of a mission, fence, or rally points."""
 
     def get(name: str) -> float:
-        # One NaN is equal to itself alone.
+        # Always the same NaN object, so that equal items compare equal.
         value = float(getattr(m, name, 0.0))
         return NAN if math.isnan(value) else value
 
@@ -269,7 +269,7 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
     _set_begin(path, found, _begin_of(log, damage))
     reader = RowReader(frozenset(unused))
 
-    # Not the record itself: nothing must keep the log open in a cycle.
+    # Not `found` itself: the reference cycle would keep the log open.
     remarks = found.remarks
 
     def entries() -> Iterator[Entry]:
@@ -308,7 +308,7 @@ def _units_of(log: Any) -> dict[tuple[str, str], str]:
 
 
 def _other_filter(log: Any, present: set[str]) -> set[str]:
-    """Return the topics of the Kalman filter that runs next to the one that is used."""
+    """Return the topics of the Kalman filter that runs in addition to the one in use."""
     second = {name for name in present if name.startswith("NKF")}
     third = {name for name in present if name.startswith("XKF")}
     if not second or not third:
@@ -317,7 +317,7 @@ def _other_filter(log: Any, present: set[str]) -> set[str]:
 
 
 def _begin_of(log: Any, damage: PrintedDamage) -> list[tuple[int, Event]]:
-    """Read the events of a log up to the first damage, and go back to the begin."""
+    """Read the events of a log up to the first damage, and rewind the log."""
     reader, entries = RowReader(frozenset(table().topics)), []
     log.type_list = None
     try:
@@ -331,7 +331,7 @@ def _begin_of(log: Any, damage: PrintedDamage) -> list[tuple[int, Event]]:
 
 
 def _set_begin(path: Path, found: AutopilotLog, entries: list[tuple[int, Event]]) -> None:
-    """Set the parameters, the mission, the type and the state at the begin of a log."""
+    """Set parameters, mission, type and state at the start of a log."""
     begin_us = entries[0][0] if entries else 0
     early_us = begin_us + EARLY_US
     parameters: dict[str, float | int] = {}
@@ -355,7 +355,7 @@ def _set_begin(path: Path, found: AutopilotLog, entries: list[tuple[int, Event]]
     else:
         found.is_armed = True
         found.remarks.append(
-            f"{path}: does not hold whether it was armed; taken to be armed throughout"
+            f"{path}: does not state whether it was armed; assumed armed throughout"
         )
     _find_type(found, [event.text for _, event in entries if isinstance(event, Text)])
 

@@ -1,4 +1,4 @@
-"""Tracks for maps: all vehicles of a flight with their events, as KML, GPX and GeoJSON."""
+"""Map tracks of all vehicles of a flight with their events, as KML, GPX and GeoJSON."""
 
 import json
 import math
@@ -25,21 +25,21 @@ from gateway.units import DEG_PER_DEGE7, US_PER_S
 from gateway.vehicle.plan import is_good_enough
 
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
-"""Of the vehicles' lines: alpha, blue, green, red."""
+"""Colours of the vehicles' lines, as hexadecimal alpha, blue, green, red."""
 _NOT_IN_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 HALF_TURN_DEG = 180.0
 INFO: Final = 6
-"""MAV_SEVERITY_INFO; texts that are less severe are for programmers."""
+"""MAV_SEVERITY_INFO; less severe texts are for programmers and not drawn."""
 _MARKED: Final = re.compile(r"Marked (-?\d+\.\d+), (-?\d+\.\d+)")
 """The gateway's STATUSTEXT for a marked position."""
 INTERVAL_US: Final = US_PER_S // 5
-"""A map shows no more than five points a second."""
+"""Minimum interval between drawn points: five per second suffice on a map."""
 MAX_MARKERS: Final = 10_000
-"""Of one vehicle; a flood of texts must not fill the memory."""
+"""Limit for one vehicle, so that a flood of texts cannot fill the memory."""
 ATTITUDE_AGE_US: Final = US_PER_S
-"""An attitude counts for the positions of so much time before it."""
+"""An attitude also applies to positions up to this time before it."""
 DRAWN_IDS: Final = (HOME_POSITION_ID,)
-"""Messages that are drawn besides positions, attitude and texts."""
+"""Messages that are drawn in addition to positions, attitude and texts."""
 
 
 class MarkerKind(StrEnum):
@@ -53,7 +53,7 @@ class MarkerKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class MapMarker:
-    """Home, a mark, a note, or where the vehicle was when something happened."""
+    """Home, a mark, a note, or the vehicle's position at an event."""
 
     kind: MarkerKind
     name: str
@@ -66,7 +66,7 @@ class VehicleTrack:
 
     name: str
     segments: list[list[TrackPoint]] = field(default_factory=list)
-    """None is empty; between two of them the track is broken."""
+    """Non-empty parts of the track, which is interrupted between them."""
     markers: list[MapMarker] = field(default_factory=list)
 
     @property
@@ -76,7 +76,7 @@ class VehicleTrack:
 
 
 def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
-    """Write a flight as KML 2.2: a folder per vehicle, with its track, attitude and markers."""
+    """Write a flight as KML 2.2: one folder per vehicle, with its track, attitude and markers."""
     yield (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<kml xmlns="http://www.opengis.net/kml/2.2" '
@@ -97,7 +97,7 @@ def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
 
 
 def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
-    # A track has angles for all of its points or for none.
+    # Either all points of a gx:Track have angles, or none.
     tracks = [
         [*points]
         for segment in vehicle.segments
@@ -111,7 +111,7 @@ def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
         yield from (f"<when>{iso_time(point.time_us)}</when>\n" for point in points)
         yield from (f"<gx:coord>{_kml_coordinates(p, ' ')}</gx:coord>\n" for p in points)
         for roll, pitch, yaw in (p.attitude_deg for p in points if p.attitude_deg is not None):
-            # Heading, tilt, roll.
+            # The order of gx:angles: heading, tilt, roll.
             yield f"<gx:angles>{yaw % 360.0:.1f} {pitch:.1f} {roll:.1f}</gx:angles>\n"
         yield "</gx:Track>\n"
     yield "</gx:MultiTrack>" if len(tracks) > 1 else ""
@@ -119,7 +119,7 @@ def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
 
 
 def _kml_mode(points: Iterable[TrackPoint]) -> str:
-    """Return the mode of heights: on the ground where none is known, not at the sea's level."""
+    """Return the altitude mode; clamped to the ground, not at sea level, if no height is known."""
     has_heights = any(math.isfinite(point.alt_amsl_m) for point in points)
     return f"<altitudeMode>{'absolute' if has_heights else 'clampToGround'}</altitudeMode>"
 
@@ -141,8 +141,8 @@ def _kml_coordinates(point: TrackPoint, separator: str) -> str:
 def to_gpx(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
     """Write a flight as GPX 1.1; see `to_kml`.
 
-    Markers are waypoints. GPX has no attitude: it is in the extensions of each point, in a separate
-    namespace, which other programs ignore.
+    Markers become waypoints. GPX has no attitude, so it is in the extensions of each point, in
+    a separate namespace that other programs ignore.
     """
     vehicles = list(vehicles)
     yield (
@@ -172,13 +172,13 @@ def to_gpx(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
 
 
 def _escaped(text: str) -> str:
-    """Write a text in XML, which has no control characters at all, not even escaped ones."""
+    """Escape a text for XML, without control characters, which XML cannot represent at all."""
     return saxutils.escape(_NOT_IN_XML.sub("\N{REPLACEMENT CHARACTER}", text))
 
 
 def _gpx_position(point: TrackPoint) -> str:
     height = f"<ele>{point.alt_amsl_m:.2f}</ele>" if math.isfinite(point.alt_amsl_m) else ""
-    # Its schema ends below 180.
+    # The GPX schema requires a longitude below 180.
     lon_deg = -180.0 if round(point.lon_deg, 7) >= 180.0 else point.lon_deg
     return f'lat="{point.lat_deg:.7f}" lon="{lon_deg:.7f}">{height}'
 
@@ -198,7 +198,7 @@ def _gpx_attitude(point: TrackPoint) -> str:
 
 
 def to_geojson(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
-    """Write a flight: a line per vehicle with `coordTimes`; home, marks and events as points."""
+    """Write a flight: one line per vehicle with `coordTimes`; home, marks and events as points."""
     yield f'{{"type":"FeatureCollection","name":{json.dumps(name)},"features":['
     separator = "\n"
     for vehicle in vehicles:
@@ -222,7 +222,7 @@ def _features(vehicle: VehicleTrack) -> Iterator[dict[str, Any]]:
 def track_feature(
     segments: Iterable[list[TrackPoint]], properties: dict[str, Any], *, with_times: bool = False
 ) -> dict[str, Any]:
-    """Lay a track out as a GeoJSON feature (RFC 7946), cut where it crosses the antimeridian."""
+    """Convert a track to a GeoJSON feature (RFC 7946), cut where it crosses the antimeridian."""
     parts = [part for segment in segments for part in _parts(segment)]
     if with_times:
         times: list[Any] = [[iso_time(point.time_us) for point in part] for part in parts]
@@ -232,7 +232,7 @@ def track_feature(
         if len(lines[0]) == 1:
             return _feature("Point", lines[0][0], properties)
         return _feature("LineString", lines[0], properties)
-    # A line must have two points, even a track of one.
+    # A line must have at least two points, so a single one is repeated.
     lines = [line if len(line) > 1 else line * 2 for line in lines]
     return _feature("MultiLineString", lines, properties)
 
@@ -251,7 +251,7 @@ def _parts(points: list[TrackPoint]) -> list[list[TrackPoint]]:
 
 
 def _crossing(before: TrackPoint, after: TrackPoint) -> TrackPoint:
-    """Find where the line between two points crosses the antimeridian, on the side of the first."""
+    """Find where a line between two points crosses the antimeridian, on the first one's side."""
     edge_deg = math.copysign(HALF_TURN_DEG, before.lon_deg)
     way_deg = (after.lon_deg - before.lon_deg) % (2.0 * HALF_TURN_DEG)
     east_deg = way_deg - 2.0 * HALF_TURN_DEG if way_deg > HALF_TURN_DEG else way_deg
@@ -275,7 +275,7 @@ def _position(point: TrackPoint) -> list[float]:
 
 
 class _Drawing:
-    """One vehicle while its flight is read."""
+    """The track of one vehicle while its flight is read."""
 
     def __init__(self, name: str) -> None:
         self.track = VehicleTrack(name)
@@ -285,7 +285,7 @@ class _Drawing:
         self._continuity = Continuity()
 
     def turn(self, time_us: int, q_nb: Quat) -> None:
-        """Take the attitude for the following points, and those just before the first one."""
+        """Apply an attitude to the following points; the first one also to those just before."""
         is_first, self._attitude_deg = self._attitude_deg is None, angles_deg(q_nb)
         if not is_first or not self.track.segments:
             return
@@ -307,7 +307,7 @@ class _Drawing:
         segments[-1].append(replace(point, attitude_deg=known))
 
     def add_home(self, at: TrackPoint) -> None:
-        """Mark a home, unless it is one of those before."""
+        """Mark a home position, unless it is marked already."""
         if (at.lat_deg, at.lon_deg) not in self.homes and len(self.homes) < MAX_MARKERS:
             self.homes.add((at.lat_deg, at.lon_deg))
             self.track.markers.append(MapMarker(MarkerKind.HOME, "Home", at))
@@ -317,7 +317,7 @@ class _Drawing:
             self._texts.append((time_us, text))
 
     def drawn(self) -> VehicleTrack | None:
-        """Return the track, with its texts at the vehicle's positions; None without a position."""
+        """Return the track, with texts at the vehicle's positions; None without any position."""
         points = self.track.points
         times_us = [point.time_us for point in points]
         for time_us, text in sorted(self._texts) if points else ():
@@ -334,7 +334,7 @@ class _Drawing:
 
 
 def tracks_of_messages(messages: Iterable[VehicleMessage]) -> list[VehicleTrack]:
-    """Collect the tracks of the vehicles in MAVLink; `DRAWN_IDS` are to be among the messages."""
+    """Collect the vehicles' tracks in MAVLink; the messages must include `DRAWN_IDS`."""
     drawings: dict[int, _Drawing] = {}
     for message in messages:
         system_id, time_us = message.system_id, message.time_us
@@ -394,7 +394,7 @@ def _add_row(
 
 
 def point_of_fix(fix: GpsFix, zero_us: int = 0) -> TrackPoint:
-    """Return the position of a fix, given the civil time of the gateway's zero."""
+    """Return the position of a fix, given the civil time of the gateway's time zero."""
     lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
     return TrackPoint(zero_us + fix.time_us, lat_deg, lon_deg, fix.alt_amsl_m)
 

@@ -1,14 +1,15 @@
-"""A flight out of any autopilot's MAVLink, so that it can be fused here.
+"""Read a flight from any autopilot's MAVLink, so that it can be fused here.
 
-The IMU comes from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends it (the units of
-SCALED_IMU) and SCALED_IMU; once one was seen, poorer ones are left out. The axes are body FRD by
-definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), less the first one seen; it
-never falls within a kind of message. The IMU keeps its own time whatever the others contain: theirs
-may be of another clock, as a GPS receiver's.
+The IMU samples come from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends it (in the
+units of SCALED_IMU) and SCALED_IMU; once one was received, inferior ones are left out. The axes are
+body FRD by definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), minus the first one
+received; it never decreases within a kind of message. The IMU keeps its own time whatever times the
+other messages contain: those may be from another clock, for example a GPS receiver's.
 
-GPS_RAW_INT has no velocity down: it is that of GLOBAL_POSITION_INT, or unknown. Heights do not give
-it, for that of a receiver that finds or loses its fix jumps by any amount. Of the autopilot's own
-estimates (ATTITUDE, with the position known then) the last before each sample is kept.
+GPS_RAW_INT has no down velocity: that of GLOBAL_POSITION_INT is used, or it is unknown. It is not
+derived from heights, because a receiver's height jumps by any amount when it gains or loses its
+fix. Of the autopilot's own estimates (ATTITUDE, with the position known at that time) the last one
+before each sample is kept.
 """
 
 import math
@@ -47,7 +48,7 @@ _POSITION_FLAGS: Final = int(
     NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
 )
 VELOCITY_AGE_US: Final = US_PER_S // 2
-"""An older velocity down is not used."""
+"""Maximum age of a down velocity that is used."""
 ATTITUDE: Final = mavlink.MAVLINK_MSG_ID_ATTITUDE
 POSITION: Final = mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
 PRESSURE: Final = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
@@ -60,14 +61,14 @@ IMU_RANK: Final = {
 _WANTED: Final = np.array([*IMU_RANK, ATTITUDE, POSITION, PRESSURE, FIX])
 _POSITION_LAYOUT: Final = layout_of(POSITION)
 _OWN_CLOCKS: Final = frozenset({FIX, PRESSURE, ATTITUDE})
-"""Kinds of messages that may have another clock than the IMU's."""
+"""Kinds of messages whose times may be from another clock than the IMU's."""
 _BARO, _GPS, _IMU = 1, 2, 3
-"""The order of a row: a record that is not behind its predecessor in it begins a row."""
+"""Order of the records in a row; a record out of this order begins a new row."""
 _HEAD: Final = slice(0, 4)
 
 
 def imu_cells(message_id: int, values: Fields, time_us: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return the cells of `HEAD_COLUMNS` and of `SI_COLUMNS` of any of the three IMU messages."""
+    """Return the cells of `HEAD_COLUMNS` and `SI_COLUMNS` for one of the three IMU messages."""
     if message_id == mavlink.MAVLINK_MSG_ID_HIGHRES_IMU:
         accel, gyro, mag = _vectors(values, 1.0, 1.0, UT_PER_GAUSS)
         temperature_degc = values["temperature"].astype(np.float64)
@@ -86,7 +87,7 @@ def imu_cells(message_id: int, values: Fields, time_us: IntArray) -> tuple[Float
 
 
 def baro_cells(values: Fields, time_us: IntArray) -> FloatArray:
-    """Return the cells of `BARO_COLUMNS` of SCALED_PRESSURE."""
+    """Return the cells of `BARO_COLUMNS` for SCALED_PRESSURE."""
     pressure_pa = values["press_abs"].astype(np.float64) * PA_PER_HPA
     temperature_degc = values["temperature"] * CENTI
     node = np.zeros(len(values))
@@ -96,7 +97,7 @@ def baro_cells(values: Fields, time_us: IntArray) -> FloatArray:
 def gps_cells(
     values: Fields, time_us: IntArray, positions: Fields, position_at: IntArray
 ) -> FloatArray:
-    """Return the cells of GPS_RAW_INT; `position_at` is the newest of `positions`, -1 for none."""
+    """Return the cells of GPS_RAW_INT; `position_at` is the index in `positions`, -1 for none."""
     reported = np.minimum(values["fix_type"], FIX_3D)
     fix_type = np.select(
         [reported == FIX_2D, reported == FIX_3D],
@@ -137,7 +138,7 @@ def gps_cells(
 def nav_cells(
     values: Fields, time_us: IntArray, positions: Fields, position_at: IntArray
 ) -> FloatArray:
-    """Return the cells of `NAV_COLUMNS` of ATTITUDE; the positions are as for `gps_cells`."""
+    """Return the cells of `NAV_COLUMNS` for ATTITUDE; the positions are as for `gps_cells`."""
     angles = [values[name].astype(np.float64) for name in ("roll", "pitch", "yaw")]
     rates = [values[name] for name in ("rollspeed", "pitchspeed", "yawspeed")]
     flags = np.where(position_at >= 0, _ATTITUDE_FLAGS | _POSITION_FLAGS, _ATTITUDE_FLAGS)
@@ -157,7 +158,7 @@ def nav_cells(
 
 
 def _vectors(values: Fields, *scales: float) -> list[FloatArray]:
-    """Return acceleration, rate and field, each by its scale."""
+    """Return acceleration, angular rate and magnetic field, each multiplied by its scale."""
     return [
         np.column_stack([values[axis + name].astype(np.float64) for axis in "xyz"]) * scale
         for name, scale in zip(("acc", "gyro", "mag"), scales, strict=True)
@@ -173,7 +174,7 @@ def _unless_zero(values: NDArray[np.int32], scale: float) -> FloatArray:
 
 
 def _of_position(positions: Fields, position_at: IntArray, name: str, scale: float) -> FloatArray:
-    """Return a field of the position that was known at each time; NaN where none was."""
+    """Return a field of the last position known at each time; NaN if there was none."""
     found = np.full(len(position_at), np.nan)
     known = position_at >= 0
     found[known] = positions[name][position_at[known]] * scale
@@ -183,7 +184,7 @@ def _of_position(positions: Fields, position_at: IntArray, name: str, scale: flo
 def autopilot_state(
     time_us: int, q_nb: Quat, position: tuple[float, float, float] | None, vel_n_mps: Vec3
 ) -> NavState:
-    """Make a state of an autopilot's own solution, without standard deviations."""
+    """Make a state from an autopilot's own solution, without standard deviations."""
     flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
     if position is not None:
         flags |= NavFlags.POSITION_VALID | NavFlags.ALTITUDE_VALID
@@ -197,30 +198,30 @@ def autopilot_state(
 
 
 class AutopilotReader:
-    """Turn one vehicle's messages into rows of a table."""
+    """Convert one vehicle's messages to rows of a table."""
 
     def __init__(self, system_id: int | None = None, senders: Senders | None = None) -> None:
         self.system_id = system_id
         self._senders = senders or Senders()
         self.unix_us_at_zero: int | None = None
-        """Civil time of the rows' time zero, by the times of the recording."""
+        """Civil time of the rows' time zero, from the recorded times."""
         self._rank = 0
         self._zero_us = 0
-        """The vehicle's own time at the rows' zero."""
+        """The vehicle's own time at the rows' time zero."""
         self._newest_us: defaultdict[int, int] = defaultdict(int)
-        """Of each of `_OWN_CLOCKS`, and of the IMU under `_IMU`, on the rows' clock."""
+        """Newest time on the rows' clock of each of `_OWN_CLOCKS`, and of the IMU under `_IMU`."""
         self._sampled_us = 0
-        """When the newest IMU sample was recorded, or else the first message."""
+        """Recorded time of the newest IMU sample; before the first one, of the first message."""
         self._positions = np.empty(0, _POSITION_LAYOUT)
         self._positions_us = np.empty(0, np.int64)
-        """The newest GLOBAL_POSITION_INT, if any, and when it was recorded."""
+        """The newest GLOBAL_POSITION_INT, if any, and its recorded time."""
         self._state = np.full((1, NAV.stop - NAV.start), np.nan)
-        """The newest estimate of the autopilot; NaN once a sample has it."""
+        """The newest estimate of the autopilot; NaN once it is stored with a sample."""
         self._open = np.empty((0, len(COLUMNS)))
-        """The row that waits for its sample, if any."""
+        """The row that is still without its sample, if any."""
 
     def feed(self, batch: Batch) -> FloatArray:
-        """Process the next records of the recording; their checksums are right."""
+        """Process the next records of the recording; their checksums must have been verified."""
         taken = self._chosen(batch)
         message_ids, recorded_us = batch.message_ids[taken], batch.time_us[taken]
         fields = {
@@ -233,12 +234,12 @@ class AutopilotReader:
         return self._rows(message_ids, time_us, positions, states, fields)
 
     def flush(self) -> FloatArray:
-        """Return the row that still waits for a sample, if any, without one."""
+        """Return the row that is still without its sample, if any."""
         rows, self._open = self._open, self._open[:0]
         return rows
 
     def _chosen(self, batch: Batch) -> IntArray:
-        """Choose the messages of the vehicle that are no poorer than others of their kind."""
+        """Choose the vehicle's messages; of each kind only the best type received so far."""
         wanted = np.flatnonzero(np.isin(batch.message_ids, _WANTED))
         ranks = np.zeros(len(wanted), np.int64)
         for message_id, rank in IMU_RANK.items():
@@ -259,7 +260,7 @@ class AutopilotReader:
     def _times(
         self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
     ) -> IntArray:
-        """Put messages on the rows' clock."""
+        """Convert the times of messages to the rows' clock."""
         own_us = np.zeros(len(message_ids), np.int64)
         for message_id, values in fields.items():
             if "time_usec" in (values.dtype.names or ()):
@@ -276,7 +277,7 @@ class AutopilotReader:
         return time_us
 
     def _time(self, message_id: int, own_us: int, recorded_us: int) -> int:
-        """Put one message on the rows' clock; it contains no time if `own_us` is 0."""
+        """Convert the time of a message to the rows' clock; an `own_us` of 0 means none."""
         newest_us = self._newest_us
         if self.unix_us_at_zero is None:
             self.unix_us_at_zero = self._sampled_us = recorded_us
@@ -284,8 +285,8 @@ class AutopilotReader:
         stream = message_id if message_id in _OWN_CLOCKS else _IMU
         elapsed_us = (own_us or recorded_us) - self._zero_us
         if not 0 <= elapsed_us - newest_us[_IMU] <= US_PER_S:
-            # Another clock than the IMU's, or a restart: use the time of recording. The two clocks
-            # drift apart, so only since the newest sample.
+            # Another clock than the IMU's, or a restart: use the recorded time, but only the time
+            # since the newest sample, since the two clocks drift.
             elapsed_us = (
                 recorded_us - self.unix_us_at_zero
                 if stream == _IMU
@@ -299,7 +300,7 @@ class AutopilotReader:
     def _positions_at(
         self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
     ) -> tuple[NDArray[np.void], IntArray]:
-        """Return all GLOBAL_POSITION_INT, and which was known at each message; -1 for none."""
+        """Return all GLOBAL_POSITION_INT, and the last one before each message, -1 for none."""
         is_position = message_ids == POSITION
         known = len(self._positions)
         positions = np.concatenate(
@@ -324,7 +325,7 @@ class AutopilotReader:
         """Return the estimate of the autopilot at each sample; NaN where there is none."""
         is_state, is_imu = message_ids == ATTITUDE, np.isin(message_ids, [*IMU_RANK])
         newest = np.cumsum(is_state)
-        # Of states that come one behind another the last counts; the end of all is a sample too.
+        # Of several states in succession the last counts; the end of the batch acts as a sample.
         at = np.append(newest[is_imu], newest[-1:] if len(newest) else 0)
         before = np.concatenate([[0], at[:-1]])
         chosen = np.flatnonzero(is_state)[at[at > before] - 1]

@@ -1,17 +1,17 @@
-"""A flight for Foxglove and PlotJuggler: messages in the schemas that Foxglove publishes.
+"""Write a flight for Foxglove and PlotJuggler, in the schemas that Foxglove publishes.
 
-| topic                              | schema                    | made of                         |
+| topic                              | schema                    | source                          |
 | ---------------------------------- | ------------------------- | ------------------------------- |
 | `/tf`                              | foxglove.FrameTransform   | attitude and position           |
-| `/vehicle_N/pose`                  | foxglove.PoseInFrame      | the same                        |
+| `/vehicle_N/pose`                  | foxglove.PoseInFrame      | attitude and position           |
 | `/vehicle_N/location`              | foxglove.LocationFix      | the best positions              |
 | `/vehicle_N/gps`                   | foxglove.LocationFix      | GPS_RAW_INT                     |
 | `/vehicle_N/state`                 | mavgate.State             | angles, height, speeds          |
 | `/log`                             | foxglove.Log              | STATUSTEXT                      |
 | `/mavlink/SYSTEM/COMPONENT/NAME`   | mavlink.NAME              | every message, field by field   |
 
-Frame `map` is east, north, up from the first position that a vehicle reports; `vehicle_N` is
-forward, left, up: with these the view is upright in Foxglove's 3D panel.
+Frame `map` is east, north, up from the first position that a vehicle reports. `vehicle_N` is
+forward, left, up, so that the view is upright in Foxglove's 3D panel.
 """
 
 import math
@@ -62,7 +62,7 @@ _NUMBERS: Final = {"float": "number", "double": "number", "char": "string"}
 GPS_ID: Final = MESSAGE_IDS["GPS_RAW_INT"]
 ESTIMATOR_ID: Final = MESSAGE_IDS["ESTIMATOR_STATUS"]
 LAST_US: Final = (2**64 - 1) // 1000
-"""Later times are written as this one, the last that the format holds, µs."""
+"""Latest time that the format can hold, µs; later times are replaced by it."""
 
 
 def _object(title: str, **fields: Any) -> dict[str, Any]:
@@ -156,11 +156,11 @@ def plain(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """One message of a topic."""
+    """A message of a topic."""
 
     topic: str
     schema: str
-    """A key of `SCHEMAS`."""
+    """Key of `SCHEMAS`."""
     content: dict[str, Any]
 
 
@@ -173,21 +173,21 @@ class _Vehicle:
     has_attitude: bool = False
     position: Position | None = None
     accuracy_m: tuple[float, float] | None = None
-    """Standard deviations along each level axis, and of the height, by the estimator."""
+    """Standard deviations along each horizontal axis, and of the height, from the estimator."""
     gps_accuracy_m: tuple[float, float] | None = None
-    """The same by the GPS receiver."""
+    """The same from the GPS receiver."""
 
 
 class FoxgloveView:
-    """Convert the messages of all vehicles to those of Foxglove's panels."""
+    """Convert the messages of all vehicles to the schemas of Foxglove's panels."""
 
     def __init__(self) -> None:
         self.origin: Position | None = None
-        """Of the frame `map`."""
+        """Origin of the frame `map`."""
         self._vehicles: dict[int, _Vehicle] = {}
 
     def feed(self, message: VehicleMessage) -> Iterator[Shown]:
-        """Process the next message of a vehicle; GPS_RAW_INT and ESTIMATOR_STATUS are used too."""
+        """Process the next message of a vehicle; these include GPS_RAW_INT and ESTIMATOR_STATUS."""
         frame, time_us = f"vehicle_{message.system_id}", message.time_us
         vehicle = self._vehicles.setdefault(message.system_id, _Vehicle(frame))
         if message.text is not None:
@@ -220,7 +220,7 @@ class FoxgloveView:
         yield self._state(vehicle)
 
     def _on_map_m(self, vehicle: _Vehicle) -> dict[str, float]:
-        """Return the position in the frame `map`; its origin before the first position."""
+        """Return the position in the frame `map`; the origin before the first position."""
         at, zero = vehicle.position, self.origin
         if at is None or zero is None:
             return {"x": 0.0, "y": 0.0, "z": 0.0}
@@ -304,7 +304,7 @@ def _time(time_us: int) -> dict[str, int]:
 
 
 class _Topics:
-    """Channels and schemas of one file, each registered at its first use."""
+    """Channels and schemas of one file, each registered on first use."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
@@ -359,7 +359,9 @@ def write(flight: FlightToWrite) -> Iterator[bytes]:
     for message in reader.flush():
         topics.add_shown(view.feed(message), message.time_us)
     if unknown:
-        flight.remark(f"left out {counted(unknown, 'message')} that no MAVLink dialect here knows")
+        flight.remark(
+            f"left out {counted(unknown, 'message')} that no supported MAVLink dialect contains"
+        )
     if view.origin is not None:
         zero = view.origin
         lat_deg, lon_deg, alt_m = map(str, (zero.lat_deg, zero.lon_deg, zero.alt_amsl_m))

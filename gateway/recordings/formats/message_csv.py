@@ -1,7 +1,7 @@
-"""One MAVLink message as CSV: a row for each, with all its fields.
+"""Write one type of MAVLink message as CSV, one row per message, with all its fields.
 
-Every message is a row of its own, also those of equal times, of other instances and of other
-senders. An array has a column for each of its elements; a text is whole.
+Messages of equal time, of other instances and of other senders have rows of their own as well. An
+array has a column for each element; a text has one column.
 """
 
 import csv
@@ -17,7 +17,7 @@ from gateway.recordings.tlog import Batch, columns_of
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_NAMES, layout_of
 
 HEAD: Final = ("time", "system_id", "component_id")
-"""Columns before the fields; the time is civil, in UTC, with microseconds."""
+"""Columns before the fields; the time is civil, in UTC, to the microsecond."""
 
 
 def write(batches: Iterable[Batch], message_id: int) -> Iterator[bytes]:
@@ -47,7 +47,7 @@ def _names(message_id: int) -> Iterator[str]:
 
 
 def _columns(batch: Batch, message_id: int) -> Iterator[list[str]]:
-    """Yield the columns of some messages of one type; floats have their shortest exact text."""
+    """Yield the columns of some messages of one type; floats as their shortest exact text."""
     times = np.maximum(batch.time_us, 0).astype("datetime64[us]")
     yield [f"{text}Z" for text in np.datetime_as_string(times).tolist()]
     yield (batch.origins >> 8).astype(str).tolist()

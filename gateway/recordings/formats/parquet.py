@@ -1,8 +1,8 @@
 """Parquet: a table as typed columns with units, or one type of MAVLink message.
 
-The comment lines between the rows of a table (changed settings, states, marks, the nodes' reports)
-are in the column `comments` of the next row, written as in a CSV; settings and calibration are in
-the file's metadata. So a CSV can be restored exactly.
+The comment lines between the rows of a table (changed settings, states, marks, node reports) are
+stored in the column `comments` of the next row, as in a CSV; settings and calibration are in the
+metadata of the file. So a CSV can be restored exactly.
 """
 
 from collections.abc import Iterable, Iterator
@@ -30,13 +30,13 @@ from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAME
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
 ROWS: Final = 16_384
-"""Of a row group, all that is in the memory at a time: some 40 MB."""
+"""Rows per row group, which is held in memory as a whole: about 40 MB."""
 COMMENTS: Final = "comments"
 TIME: Final = "time"
-"""Civil time, where it is known."""
+"""Column with the civil time, if it is known."""
 HEADER: Final = b"mavgate.header"
 END: Final = "mavgate.end"
-"""Comments after the last row."""
+"""Metadata key of the comments after the last row."""
 
 _TYPES: Final = {
     **{f"{sign}int{bits}_t": getattr(pa, f"{sign}int{bits}")() for sign in ("", "u")
@@ -54,7 +54,7 @@ def write(flight: FlightToWrite) -> Iterator[bytes]:
 
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
-    """Open a table that was written here; raises FlightError if it is not one."""
+    """Open a table that `write` wrote; raises FlightError for any other file."""
     reader = TableReader()
 
     def blocks() -> Iterator[TableBlock]:
@@ -62,7 +62,7 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
             for text in _lines(path, options):
                 yield reader.feed_block(text)
         except (pa.ArrowException, OSError) as error:
-            # An error of the operating system has a number, one of the library has none.
+            # Errors of the operating system have a number, those of the library have none.
             if getattr(error, "errno", None) is not None:
                 raise
             raise FlightError(f"{path}: cannot be read as Parquet: {error}") from error
@@ -118,7 +118,7 @@ def _column(name: str) -> pa.Field:
 def _batch(rows: list[tuple[Any, ...]], schema: pa.Schema) -> pa.Table:
     columns = zip(*rows, strict=True) if rows else ([] for _ in schema)
     arrays = [
-        # NaN is "not known", as an empty cell is.
+        # NaN becomes null, as it becomes an empty cell in CSV.
         pa.array(column, field.type, from_pandas=pa.types.is_floating(field.type))
         if not pa.types.is_boolean(field.type)
         else pa.array([None if value is None else bool(value) for value in column])
@@ -128,7 +128,7 @@ def _batch(rows: list[tuple[Any, ...]], schema: pa.Schema) -> pa.Table:
 
 
 def _lines(path: Path, options: ReadOptions) -> Iterator[bytes]:
-    """Yield the lines of the CSV that the file was made of, many at once."""
+    """Yield the lines of the CSV that the file was made from, many at a time."""
     with (
         _plain(path, options) as plain,
         pq.ParquetFile(plain, page_checksum_verification=True) as file,
@@ -159,7 +159,7 @@ def _lines(path: Path, options: ReadOptions) -> Iterator[bytes]:
 
 @contextmanager
 def _plain(path: Path, options: ReadOptions) -> Iterator[Path | IO[bytes]]:
-    """Yield a file that can be read at any position: a packed one is copied."""
+    """Yield a file that allows random access: for a packed one, a copy."""
     if not is_packed(path):
         yield path
         return
@@ -174,7 +174,7 @@ def _text(cell: Any) -> str:
 
 
 def _write_messages(flight: FlightToWrite, name: str) -> Iterator[bytes]:
-    """Write every message of one type, of any sender; raises FlightError if there is none."""
+    """Write every message of one type, from any sender; raises FlightError if there is none."""
     message_id = MESSAGE_IDS.get(name)
     if message_id is None:
         raise FlightError(f"no MAVLink message is called {name}")

@@ -1,11 +1,11 @@
-"""ULog, the log of PX4, read by pyulog, by the definitions of its uORB messages.
+"""ULog, PX4's log, read with pyulog by the definitions of its uORB messages.
 
-IMU: `sensor_combined`. Magnetic field: `vehicle_magnetometer`, in old logs among the former's
-fields. Barometer: `vehicle_air_data`, `sensor_baro`, or the former's heights. GPS:
-`vehicle_gps_position` or `sensor_gps`, with positions in 1e-7 degrees or, in newer logs, in
-degrees. What the autopilot estimated: `vehicle_attitude`, `vehicle_global_position`,
-`vehicle_local_position`. All are in body FRD and NED already, in us since the start. Of several
-topics, and instances of a topic, the first with data is taken.
+IMU: `sensor_combined`. Magnetic field: `vehicle_magnetometer`; in old logs, fields of
+`sensor_combined`. Barometer: `vehicle_air_data`, `sensor_baro`, or the heights in
+`sensor_combined`. GPS: `vehicle_gps_position` or `sensor_gps`, with positions in 1e-7 degrees or,
+in newer logs, in degrees. The autopilot's estimates: `vehicle_attitude`,
+`vehicle_global_position`, `vehicle_local_position`. All are in body FRD and NED already, times in
+µs since the start. Of several topics, or instances of a topic, the first with data is used.
 """
 
 import contextlib
@@ -66,22 +66,23 @@ SOURCES: Final = {
     "position": ("vehicle_global_position",),
     "velocity": ("vehicle_local_position", "vehicle_global_position"),
 }
-"""Topics of each kind of data, the best first."""
+"""Topics for each kind of data, the preferred one first."""
 TOPICS: Final = tuple(dict.fromkeys(name for names in SOURCES.values() for name in names))
-"""All that is read."""
+"""All topics that are read."""
 LEAST_PA: Final = 2000.0
-"""A smaller value is in hPa, as in `sensor_baro` before PX4 1.14: no aircraft flies that high."""
+"""Minimum pressure; smaller values are in hPa, as in `sensor_baro` before PX4 1.14. No aircraft
+flies that high."""
 AROUND: Final = 5
-"""Rows whose median time is used."""
+"""Number of rows around a row whose median time it is compared with."""
 FAR_US: Final = US_PER_S
-"""A row so far from that has a damaged time: those of a topic are in order."""
+"""Maximum difference from that median; beyond it the time is damaged, as topics are ordered."""
 AT_ENDS_US: Final = 60 * US_PER_S
-"""And at an end of a topic, where a gap of the record is as far from it."""
+"""The same at the ends of a topic, where a gap of the log causes large differences."""
 NOT_THERE: Final = 0x7FFFFFFF
-"""A time relative to the sample's that means "no new one"."""
+"""Value of a time relative to the sample that means "no new value"."""
 FIX_2D, EXTRAPOLATED = 2, 8
 ORDER: Final[dict[type, int]] = {NavState: 0, BaroRaw: 1, GpsFix: 2, ImuCalibrated: 3}
-"""Of records of one time: that of a row."""
+"""Order of records of the same time, as in a row."""
 
 _FIX_TYPES: Final = {
     0: GpsFixType.NONE, 1: GpsFixType.NONE, FIX_2D: GpsFixType.FIX_2D,
@@ -91,12 +92,12 @@ _FIX_TYPES: Final = {
 Topic = Mapping[str, NDArray[Any]]
 Row = Mapping[str, Any]
 Instance = tuple[str, int]
-"""Name of a topic, and which of its instances it is, counted from 0."""
+"""Name of a topic, and the number of its instance, from 0."""
 _WHOLE: Final = frozenset((
     "time_utc_usec", "fix_type", "satellites_used", "timestamp", "timestamp_time_relative",
     "magnetometer_timestamp_relative", "baro_timestamp_relative",
 ))  # fmt: skip
-"""Fields that are whole numbers."""
+"""Integer fields."""
 _GPS_FIELDS: Final = (
     ("lat", "latitude_deg"), ("lon", "longitude_deg"), ("vel_n_m_s",), ("vel_e_m_s",),
     ("vel_d_m_s",),
@@ -106,18 +107,18 @@ _VELOCITY: Final = (("vx", "vel_n"), ("vy", "vel_e"), ("vz", "vel_d"))
 MS_PER_S: Final = 1000.0
 SYSTEM_ID: Final = "MAV_SYS_ID"
 HEADER: Final = 3
-"""Bytes before the content of a message."""
+"""Size of a message header: length and type."""
 MOST_VALUES: Final = 1 << 16
-"""In a row: a message has no more bytes."""
+"""Maximum number of values in a row, from the maximum size of a message."""
 BROKEN: Final = (
     *(ValueError, TypeError, LookupError, AttributeError, OverflowError),
     *(struct.error, RecursionError),
 )
-"""Exceptions of pyulog on a damaged log, in addition to its own."""
+"""Exceptions that pyulog raises on damaged logs in addition to its own."""
 
 
 def in_order(topic: Topic) -> tuple[Topic, int]:
-    """Sort by time, and leave out rows without one, or with one far from those around it."""
+    """Sort by time, without rows whose time is absent or far from that of adjacent rows."""
     time_us = topic["timestamp"].astype(np.int64)
     sound = (time_us > 0) & (time_us < LARGEST_WHOLE)
     if len(time_us) >= AROUND:
@@ -131,7 +132,7 @@ def in_order(topic: Topic) -> tuple[Topic, int]:
 
 
 def unix_us_at_boot(gps: Topic) -> int | None:
-    """Return the civil time at zero of the autopilot's clock, by its fixes; None without one."""
+    """Return the civil time at zero of the autopilot's clock, from its fixes; None without any."""
     if "time_utc_usec" not in gps:
         return None
     behind = gps.get("timestamp_time_relative", np.zeros(len(gps["timestamp"]), np.int64))
@@ -147,7 +148,7 @@ def unix_us_at_boot(gps: Topic) -> int | None:
 
 
 class Px4Log:
-    """The topics of one log."""
+    """The topics of one log, as records."""
 
     def __init__(
         self,
@@ -156,13 +157,13 @@ class Px4Log:
         sensors: Mapping[str, int] = MappingProxyType({}),
     ) -> None:
         self.dropped = 0
-        """Samples with an impossible time."""
+        """Number of samples with an invalid time."""
         sound = {instance: _sound_columns(topic) for instance, topic in topics.items()}
         kept = {one: topic for one, topic in sound.items() if not _lacks(one[0], topic)}
         self.left_out = sorted({name for name, _ in sound.keys() - kept.keys()})
-        """Topics without the fields that are needed of them."""
+        """Topics that are left out because required fields are missing."""
         self.chosen: list[str] = []
-        """Sources that are not the first of their kind, for the user."""
+        """Remarks for the user on sources that are not the first of their kind."""
         sources = {kind: self._choose(kind, kept, sensors.get(kind)) for kind in SOURCES}
         ordered = {one: self._in_order(kept[one]) for one in {*sources.values()} if one}
         self._topics = {kind: ordered[one] for kind, one in sources.items() if one}
@@ -175,7 +176,7 @@ class Px4Log:
     def _choose(
         self, kind: str, topics: Mapping[Instance, Topic], wanted: int | None
     ) -> Instance | None:
-        """Choose the first source with data; that of IMU and GPS even without."""
+        """Choose the first source with data; for IMU and GPS the first one if none has data."""
         found = [
             (name, k)
             for name in SOURCES[kind]
@@ -192,12 +193,12 @@ class Px4Log:
 
     @property
     def unix_us_at_zero(self) -> int | None:
-        """Civil time of the records' time zero, by GPS; None if GPS never had it."""
+        """Civil time of the records' time zero, from GPS; None without GPS time."""
         boot_us = unix_us_at_boot(self._topics.get("GPS", {}))
         return None if boot_us is None else self._zero_us + boot_us
 
     def records(self) -> Iterator[Imported]:
-        """Yield all records in the order of time, which begins at 0."""
+        """Yield all records in the order of time, starting at 0."""
         streams = (self._imu(), self._baros(), self._fixes(), self._states())
         return heapq.merge(*streams, key=lambda record: (record.time_us, ORDER[type(record)]))
 
@@ -207,7 +208,7 @@ class Px4Log:
         return ordered
 
     def _rows(self, kind: str) -> Iterator[Row]:
-        """Yield the rows of the topic with a kind of data."""
+        """Yield the rows of the topic for a kind of data."""
         topic = self._topics.get(kind, {})
         columns = [column.tolist() for column in topic.values()]
         return (dict(zip(topic, row, strict=True)) for row in zip(*columns, strict=True))
@@ -228,7 +229,7 @@ class Px4Log:
             yield ImuCalibrated(self._time(row), node, accel, gyro, mag, NAN, flags)
 
     def _fields_at_samples(self) -> dict[int, Vec3]:
-        """Return the newest magnetic field of each IMU sample that has a new one, by its number."""
+        """Return the newest magnetic field of IMU samples that have a new one, by their number."""
         imu, mag = self._topics["IMU"], self._topics.get("MAG")
         if mag is None:
             return {}
@@ -302,7 +303,7 @@ class Px4Log:
 
 
 class _Newest:
-    """The newest row of a topic at a time that never goes back, unless it is too old."""
+    """The newest row of a topic at non-decreasing times, unless it is too old."""
 
     def __init__(self, rows: Iterator[Row]) -> None:
         self._rows = rows
@@ -329,11 +330,11 @@ _NEEDED: Final[dict[str, tuple[tuple[str, ...], ...]]] = {
     "vehicle_gps_position": _GPS_FIELDS,
     "sensor_gps": _GPS_FIELDS,
 }
-"""One of each is needed of a topic, in addition to its time."""
+"""Required fields by topic: of each tuple one, in addition to the time."""
 
 
 def _sound_columns(topic: Topic) -> Topic:
-    """Leave out columns that are no numbers, or no whole ones where there are only such."""
+    """Leave out columns that are not numeric, or not integers where these are expected."""
     return {
         name: column
         for name, column in topic.items()
@@ -351,7 +352,7 @@ _DATA: Final = {
     "MAG": _axes("magnetometer_ga"),
     "BARO": ("baro_pressure_pa", "pressure", "baro_alt_meter"),
 }
-"""Fields that are not all zero where a sensor has data."""
+"""Fields of which not all are zero if a sensor has data."""
 
 
 def _has_data(kind: str, topic: Topic) -> bool:
@@ -381,14 +382,14 @@ def _metres(row: Row, metres: str, millimetres: str) -> float:
 
 
 class _Content(io.BufferedReader):
-    """The bytes of a log, read from a file as they are needed.
+    """The content of a log, read from its file on demand.
 
-    pyulog steps back by as much as it has asked for. Where the log is cut that is more than it has
-    got, and it would read the same bytes for ever.
+    pyulog seeks back by the size that it requested. At the end of a cut log it received less, so it
+    would read the same bytes for ever; `seek` allows for the missing bytes.
     """
 
     unread = 0
-    """Bytes behind the last message that pyulog has read whole."""
+    """Bytes after the last message that pyulog has read completely."""
     _missing = _header_at = 0
 
     def __init__(self, name: str) -> None:
@@ -412,7 +413,7 @@ class _Content(io.BufferedReader):
 
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
-    """Open a ULog as a flight; raises FlightError if there is none in it."""
+    """Open a ULog as a flight; raises FlightError if it contains none."""
     log, unread, before = load(path, options, list(TOPICS))
     topics = {(data.name, data.multi_id): data.data for data in reversed(log.data_list)}
     vehicle_id = options.system_id or system_id_of(log)
@@ -437,7 +438,7 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
 
 
 def _lost_head(rest: Iterator[bytes], before: bytes) -> Iterator[bytes]:
-    """Yield a header for a log that lacks it, and the format that lost its name with it."""
+    """Yield a header if the log lacks it, and the format that lost its name together with it."""
     first = next(rest, b"")
     if not first.startswith(ULOG_HEAD):
         yield ULOG_HEAD + bytes(9)
@@ -452,7 +453,7 @@ def _lost_head(rest: Iterator[bytes], before: bytes) -> Iterator[bytes]:
 
 
 def load(path: Path, options: ReadOptions, topics: list[str] | None) -> tuple[Any, int, Before]:
-    """Read some or all topics of a log, and the bytes at its ends that were left out."""
+    """Read some or all topics of a log; also return the bytes left out at its end and start."""
     whole = read_chunks(path, options.progress, options.unpacked_limit)
     rest, before = skip_to(ULOG_BEGIN, whole)
     with temporary_copy(path, chain(_lost_head(rest, before.text), rest)) as content:
@@ -460,14 +461,14 @@ def load(path: Path, options: ReadOptions, topics: list[str] | None) -> tuple[An
 
 
 def system_id_of(log: Any) -> int:
-    """Return the system id among the parameters; 1 if there is no valid one."""
+    """Return the system id in the parameters; 1 if there is no valid one."""
     known = log.initial_parameters.get(SYSTEM_ID, 1)
     return known if isinstance(known, int) and 1 <= known <= 255 else 1
 
 
 def _load(path: Path, copy: str, topics: list[str] | None) -> tuple[Any, int]:
-    """Return the log, and how many bytes at its end could not be read."""
-    # Damage that it prints to the terminal is reported as remarks.
+    """Return the log, and the number of bytes at its end that could not be read."""
+    # Damage that pyulog prints to the terminal is reported as remarks instead.
     with contextlib.redirect_stdout(io.StringIO()):
         try:
             with _Content(copy) as head:
@@ -480,7 +481,7 @@ def _load(path: Path, copy: str, topics: list[str] | None) -> tuple[Any, int]:
 
 
 def _check_formats(formats: dict[str, Any]) -> None:
-    """Raise an error of `BROKEN` for formats that would fill the memory."""
+    """Raise an exception of `BROKEN` for formats that would fill the memory."""
 
     @cache
     def values_of(kind: str) -> int:
@@ -493,15 +494,15 @@ def _check_formats(formats: dict[str, Any]) -> None:
 
 
 def damage_of(log: Any, unread: int) -> Iterator[str]:
-    """Yield remarks for the user about damage and gaps of a log."""
+    """Yield remarks for the user on damage and gaps of a log."""
     if log.file_corruption:
-        yield "is damaged; what is sound of it was read"
+        yield "is damaged; its intact part was read"
     if unread:
         yield f"left out {counted(unread, 'byte')} at its end that cannot be read"
     if log.dropouts:
         lost_s = sum(dropout.duration for dropout in log.dropouts) / MS_PER_S
         slow = counted(len(log.dropouts), "time")
-        yield f"its logger was too slow {slow}, {lost_s:.1f} s are not in it"
+        yield f"its logger was too slow {slow}; {lost_s:.1f} s of data are missing"
 
 
 def _remarks(flight: Px4Log) -> Iterator[str]:
@@ -509,4 +510,4 @@ def _remarks(flight: Px4Log) -> Iterator[str]:
     if flight.left_out:
         yield f"lacks fields that PX4 documents for {', '.join(flight.left_out)}; left out"
     if flight.dropped:
-        yield f"left out {counted(flight.dropped, 'sample')} without a time that can be"
+        yield f"left out {counted(flight.dropped, 'sample')} with an impossible time"

@@ -1,4 +1,4 @@
-"""A ULog as the record of its autopilot: rows and events for `ulog.toml`."""
+"""Read a ULog as an autopilot's log: rows and events for `ulog.toml`."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -35,9 +35,9 @@ from gateway.recordings.recorded_table import ReadOptions
 from gateway.units import counted
 
 ARMED: Final = 2
-"""arming_state of vehicle_status."""
+"""Value of arming_state in vehicle_status."""
 FIRMWARE: Final = 0
-"""Kind of default parameters: those of the firmware, for any vehicle."""
+"""Kind of default parameters: those of the firmware, independent of the vehicle."""
 STATUS: Final = "vehicle_status"
 GPS_TOPICS: Final = ("vehicle_gps_position", "sensor_gps")
 SHOWN: Final = (
@@ -46,12 +46,12 @@ SHOWN: Final = (
     "vehicle_local_position",
     *GPS_TOPICS,
 )
-"""One of these is needed to show anything."""
+"""Topics of which at least one is required to show anything."""
 _KINDS: Final = {
     mavlink.MAV_TYPE_FIXED_WING: "plane", mavlink.MAV_TYPE_GROUND_ROVER: "rover",
     mavlink.MAV_TYPE_SURFACE_BOAT: "rover", mavlink.MAV_TYPE_SUBMARINE: "sub",
 } | dict.fromkeys(range(19, 26), "vtol")  # fmt: skip
-"""By MAV_TYPE; others are copters."""
+"""Kind of vehicle by MAV_TYPE; all others are copters."""
 
 
 @cache
@@ -61,7 +61,7 @@ def table() -> MessageTable:
 
 
 def custom_mode_of(nav_state: int) -> int:
-    """Return PX4's custom mode of a navigation state; 0 for one that is not known."""
+    """Return PX4's custom mode of a navigation state; 0 for an unknown one."""
     _, main, sub = table().nav_states.get(str(nav_state), ("", 0, 0))
     return main << 16 | sub << 24
 
@@ -115,7 +115,7 @@ def _named(kind: str) -> tuple[str, ...]:
 
 
 def _sound_columns(topic: Mapping[str, Any]) -> Topic:
-    """Leave out columns that are no numbers, and those that no message has."""
+    """Leave out columns that are not numeric, or that no message uses."""
     used = _used()
     return {
         name: column
@@ -139,7 +139,7 @@ def _boot_us(topics: Mapping[Instance, Topic]) -> int | None:
 
 
 def _type_of(log: Any, topics: Mapping[Instance, Topic]) -> int:
-    """Return the MAV_TYPE: that of the status, else that of the parameters."""
+    """Return the MAV_TYPE in the vehicle's status, otherwise the one in its parameters."""
     status = topics.get((STATUS, 0), {})
     seen = status.get("system_type")
     if seen is not None and len(seen) and 0 < int(seen[-1]) <= 255:
@@ -157,7 +157,7 @@ def _parameters(known: Mapping[str, Any]) -> dict[str, float | int]:
 
 
 def _events_of(log: Any, topics: Mapping[Instance, Topic]) -> list[tuple[int, Event]]:
-    """Return the events at the autopilot's times, in order."""
+    """Return the events, at times of the autopilot's clock and in their order."""
     found: list[tuple[int, Event]] = []
     status = topics.get((STATUS, 0), {})
     if "nav_state" in status and "arming_state" in status:
@@ -182,7 +182,7 @@ def _events_of(log: Any, topics: Mapping[Instance, Topic]) -> list[tuple[int, Ev
 def _entries(
     topics: Mapping[Instance, Topic], events: list[tuple[int, Event]], zero_us: int
 ) -> Iterator[Entry]:
-    """Yield rows and events in the order of time; of one time, those that send messages last."""
+    """Yield rows and events in order of time; at equal times, topics that send messages last."""
     sent = {name for row in table().messages for name in row.of}
     streams = sorted(topics.items(), key=lambda one: (one[0][0] in sent, one[0]))
     if not streams:

@@ -283,7 +283,7 @@ def test_unknown_vehicle_is_refused_with_those_of_the_file(
 
 def test_files_of_different_kinds_are_refused(tlog: Path, table: Path, tmp_path: Path) -> None:
     text = run("convert", tlog, table, "-o", tmp_path / "x.kml", code=2)
-    assert "the files differ in kind" in text
+    assert "the files differ in format" in text
     assert f"{tlog}: tlog" in text
     (page := tmp_path / "page.html").write_text("<html></html>")
     text = run("convert", tlog, page, "-o", tmp_path / "x.tlog", code=2)

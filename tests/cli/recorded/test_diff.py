@@ -114,7 +114,7 @@ def test_files_without_parameters_or_vehicle_are_refused(
 ) -> None:
     path = tmp_path / "x.param"
     path.write_bytes(b"nothing\xff\n")
-    assert "holds no parameters" in run("diff", flights[0], path, code=2)
+    assert "contains no parameters" in run("diff", flights[0], path, code=2)
     assert "no vehicle 9" in run("diff", *flights, "--system", 9, code=2)
 
 

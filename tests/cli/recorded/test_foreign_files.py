@@ -132,7 +132,7 @@ def test_tlog_with_padded_records_keeps_its_times(tmp_path: Path) -> None:
     plain, padded = tlog(tmp_path / "plain.tlog"), tlog(tmp_path / "padded.tlog", pad=bytes(8))
     run("convert", padded, "-o", tmp_path / "out.tlog")
     assert (tmp_path / "out.tlog").read_bytes() == plain.read_bytes()
-    assert "eight zero bytes more" in run("info", padded)
+    assert "eight extra zero bytes" in run("info", padded)
 
 
 AC31 = (

@@ -332,8 +332,8 @@ def test_invalid_lines_of_a_text_log_are_counted(short: Path, tmp_path: Path) ->
     table, rows = rows_of(flown.write(tmp_path / "odd.log", b"".join(lines)))
     times_us = [row.time_us for row in rows if row.imu is not None]
     assert len(times_us) == len(set(times_us)) == sum(r.imu is not None for r in all_rows) - 3
-    assert [r for r in table.remarks if "left out 3 messages that cannot be understood" in r]
-    assert not any("cannot be understood" in r for r in whole(short / "flight.log")[0].remarks)
+    assert [r for r in table.remarks if "left out 3 messages that cannot be decoded" in r]
+    assert not any("cannot be decoded" in r for r in whole(short / "flight.log")[0].remarks)
 
 
 @pytest.mark.parametrize("name", ["flight.bin", "flight.log"])
