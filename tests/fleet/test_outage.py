@@ -5,7 +5,7 @@ import pytest
 
 from gateway.fleet.settings import FleetSettings
 from tests.fleet.conftest import World
-from tests.hub.test_zenoh import Router, router
+from tests.kit.zenoh_router import Router, router
 
 __all__ = ["router"]
 

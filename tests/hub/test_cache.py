@@ -62,8 +62,7 @@ async def scene(rig: Rig, options: str, station_options: str = "") -> Scene:
         *(f"udp-listen:127.0.0.1:{free_port()}?trusted=yes{each}" for each in chosen)
     )
     ports = hub.listening_ports()
-    vehicle = rig.station(ports[0])
-    vehicle.sender = rig.sender(1)
+    vehicle = rig.station(ports[0], origin=(1, 1))
     stations = [await rig.call(hub, number) for number in (1, 2)]
     one = Scene(rig, hub, vehicle, stations)
     vehicle.send(vehicle.sender.pack(mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)))

@@ -42,7 +42,7 @@ async def test_multicast_is_sent_and_received_without_own_frames(rig: Any) -> No
     port = listener.getsockname()[1]
     hub = await rig.open(f"udp-multicast:{GROUP}:{port}")
     frame = rig.vehicle.attitude()
-    hub.send(rig.out(frame))
+    rig.publish(hub, frame)
     async with asyncio.timeout(START_LIMIT_S):
         data, sender = await asyncio.get_running_loop().sock_recvfrom(listener, 4096)
     assert data == frame

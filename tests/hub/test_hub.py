@@ -5,13 +5,13 @@ import resource
 import socket
 from collections import Counter
 from typing import Any
-from unittest.mock import Mock
 
 import msgspec
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.transports import base, stream
+from gateway.hub.transports import stream
+from gateway.hub.transports.base import STALE_AFTER_US
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 from tests.kit.hub import FlyingHub
@@ -23,17 +23,10 @@ pytestmark = pytest.mark.io
 @pytest.fixture
 async def world(rig: Any) -> Any:
     """One listening port; an autopilot, a station on each of two further clients."""
-    hub = rig.hub("udp-listen:127.0.0.1:0")
-    hub.send(rig.out(rig.vehicle.heartbeat()))
-    port = hub.listening_ports()[0]
-    rig.autopilot, rig.first, rig.second = (rig.station(port) for _ in range(3))
-    rig.autopilot.sender = rig.sender(42, 1)
-    rig.second.sender = rig.sender(254, 190)
-    rig.world = hub
-    for station in (rig.first, rig.second, rig.autopilot):
-        before = len(rig.incoming)
-        station.send(station.sender.heartbeat())
-        await rig.until(lambda count=before: len(rig.incoming) > count)
+    rig.world = hub = rig.hub("udp-listen:127.0.0.1:0")
+    rig.publish(hub, rig.vehicle.heartbeat())
+    rig.first, rig.second = await rig.call(hub), await rig.call(hub, origin=(254, 190))
+    rig.autopilot = await rig.call(hub, origin=(42, 1))
     for station in (rig.first, rig.second):
         assert (await station.receive())[5] == 42
     assert rig.autopilot.is_empty()
@@ -147,31 +140,11 @@ async def test_copy_passes_a_loop_once_at_most(world: Any) -> None:
 
 async def test_first_own_frame_that_returns_is_dropped(rig: Any) -> None:
     echo, other = rig.station(), rig.station()
-    hub = rig.hub(*(f"udp:127.0.0.1:{station.port}" for station in (echo, other)))
-    await rig.until_open(hub)
-    frame = rig.vehicle.attitude()
-    hub.send(rig.out(frame))
-    assert [await echo.receive(), await other.receive()] == [frame, frame]
-    echo.socket.sendto(frame, ("127.0.0.1", hub._clients[1]._port))
+    hub = await rig.open(*(f"udp:127.0.0.1:{station.port}" for station in (echo, other)))
+    await rig.check_passes(hub, other)
+    echo.send(await echo.receive())
     await rig.until(lambda: hub.counters().looped == 1)
     assert other.is_empty()
-
-
-async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
-    trusted = rig.station()
-    hub = await rig.open("udp-listen:127.0.0.1:0?trusted=no", f"udp:127.0.0.1:{trusted.port}")
-    outsider = rig.station(hub.listening_ports()[0])
-    outsider.sender = rig.sender(42, 1)
-    hub.send(rig.out(rig.vehicle.heartbeat()))
-    assert await trusted.receive()
-    for frame in (outsider.sender.heartbeat(), outsider.sender.command(1, 1)):
-        outsider.send(frame)
-        await rig.until(lambda frame=frame: [i.frame for i in rig.incoming][-1:] == [frame])
-        assert not rig.incoming[-1].trusted
-    outsider.send(outsider.sender.command(255, 190))
-    await rig.until(lambda: hub.counters().unroutable == 1)
-    assert trusted.is_empty()
-    assert rig.foreign == []
 
 
 async def test_monitor_gets_all_traffic_and_its_own_frames_are_ignored(world: Any) -> None:
@@ -179,8 +152,6 @@ async def test_monitor_gets_all_traffic_and_its_own_frames_are_ignored(world: An
     monitor = world.station()
     hub.add(f"udp:127.0.0.1:{monitor.port}?monitor=yes&allow=HEARTBEAT")
     await world.until_open(hub)
-    client = hub._clients[hub.clients()[-1].client_id]
-    monitor.target = ("127.0.0.1", client._port)
     request = world.first.sender.command(42, 1)
     world.first.send(request)
     assert await world.autopilot.receive() == await monitor.receive() == request
@@ -200,7 +171,7 @@ async def test_monitor_gets_all_traffic_and_its_own_frames_are_ignored(world: An
     sender = world.sender(77)
     for frame in (sender.heartbeat(), sender.command(42, 1), sender.command(1, 1)):
         monitor.send(frame)
-    await world.until(lambda: client.counters.received == 3)
+    await world.until(lambda: hub.clients()[-1].received == 3)
     assert (len(world.incoming), hub.counters().forwarded) == (count, forwarded)
     await world.quiet()
     received = [frame_of(data) for data in world.first.received()]
@@ -210,13 +181,11 @@ async def test_monitor_gets_all_traffic_and_its_own_frames_are_ignored(world: An
 
 async def test_allow_restricts_round_trip_requests_and_greetings_too(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0?allow=HEARTBEAT", ping_interval_s=1.0)
-    for frame in (rig.vehicle.home(), rig.vehicle.heartbeat()):
-        hub.send(rig.out(frame))
+    rig.publish(hub, rig.vehicle.home(), rig.vehicle.heartbeat())
     station = await rig.call(hub)
     for _ in range(8):
         rig.clock.now_us += 500_000
-        hub.send(rig.out(rig.vehicle.heartbeat()))
-        hub.send(rig.out(rig.vehicle.attitude()))
+        rig.publish(hub, rig.vehicle.heartbeat(), rig.vehicle.attitude())
         rig.tick(hub)
     await rig.quiet()
     got = station.received()
@@ -253,10 +222,10 @@ async def test_slow_second_link_does_not_move_an_aircraft_back(world: Any) -> No
 
 async def test_round_trip_is_measured_by_ping_and_by_timesync(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=5.0)
-    hub.send(rig.out(rig.vehicle.heartbeat()))
+    rig.publish(hub, rig.vehicle.heartbeat())
     station = await rig.call(hub)
     rig.clock.now_us = 5_000_000
-    hub.send(rig.out(rig.vehicle.heartbeat()))
+    rig.publish(hub, rig.vehicle.heartbeat())
     assert (await station.receive())[7] == 0
     assert (await station.receive())[7] == 0
     reader = dialect.MAVLink(None)
@@ -291,7 +260,7 @@ class TestChangesAtRunTime:
         with pytest.raises(ValueError, match="already exists"):
             hub.add(f"udp:127.0.0.1:{station.port}")
         hub.remove("tablet")
-        hub.send(rig.out(rig.vehicle.attitude()))
+        rig.publish(hub, rig.vehicle.attitude())
         assert hub.clients() == ()
         assert station.is_empty()
         with pytest.raises(ValueError, match="tablet"):
@@ -326,9 +295,7 @@ class TestChangesAtRunTime:
         }
         received = {}
         frames = [rig.vehicle.raw_imu(), rig.vehicle.attitude()]
-        for frame in frames:
-            hub.send(rig.out(frame))
-        hub.send(rig.out(rig.vehicle.heartbeat()))
+        rig.publish(hub, *frames, rig.vehicle.heartbeat())
         for name, station in (("stays", stays), ("comes", comes), ("caller", caller)):
             received[name] = []
             while message_id := (await station.receive())[7]:
@@ -345,26 +312,16 @@ class TestChangesAtRunTime:
 
 
 class TestListeningPorts:
-    async def test_full_port_counts_refused_clients_and_looks_for_a_stale_one_only_when_due(
-        self, rig: Any, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        search = Mock(wraps=base.client_to_remove)
-        monkeypatch.setattr(base, "client_to_remove", search)
+    async def test_full_port_counts_refused_clients_until_one_is_stale(self, rig: Any) -> None:
         hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=1)
-
-        async def call(turned_away: int) -> None:
+        for turned_away in (0, 1, 2, 3, 3):
+            if turned_away == hub.listeners()[0].turned_away == 3:
+                rig.clock.now_us += STALE_AFTER_US
             caller = rig.station(hub.listening_ports()[0])
             caller.send(caller.sender.heartbeat())
-            await rig.until(lambda: hub.listeners()[0].turned_away == turned_away)
+            await rig.until(lambda n=turned_away: hub.listeners()[0].turned_away == n)
             await rig.until(lambda: hub.listeners()[0].clients == 1)
-
-        for turned_away in (0, 1, 2, 3):
-            await call(turned_away)
-        assert search.call_count == 1
-        rig.clock.now_us += base.STALE_AFTER_US
-        await call(3)
-        await rig.until(lambda: [client.client_id for client in hub.clients()] == [2])
-        assert search.call_count == 2
+        await rig.until(lambda: hub.clients()[0].client_id == 2)
 
     @pytest.mark.parametrize("kind", ["udp", "tcp"])
     async def test_clients_are_admitted_once_descriptors_are_free_again(
@@ -387,37 +344,31 @@ class TestListeningPorts:
             assert hub.clients() == ()
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-        rig.clock.now_us += 2_000_000
-        rig.tick(hub)
+        rig.tick(hub, 2)
         if kind == "udp":
             caller.send(caller.sender.heartbeat())
         await rig.until(lambda: len(hub.clients()) == 1)
         assert hub.listeners()[0].state == "open"
 
 
-async def test_reports_and_round_trips_take_turns(
-    rig: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each of them takes as long as several frames."""
+async def test_round_trips_are_measured_at_each_interval(rig: Any) -> None:
+    """Next to the reports, which have turns of their own."""
     hub = rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=1.0)
-    done: list[tuple[str, int]] = []
-    for name in ("_report_alerts", "_measure_round_trips"):
-        monkeypatch.setattr(hub, name, lambda now_us, name=name: done.append((name, now_us)))
+    rig.publish(hub, rig.vehicle.heartbeat())
+    station = await rig.call(hub)
     for _ in range(40):
-        rig.clock.now_us += 250_000
-        rig.tick(hub)
-    moments = [now_us for _, now_us in done]
-    assert len(set(moments)) == len(moments)
-    for name in ("_report_alerts", "_measure_round_trips"):
-        assert sum(1 for named, _ in done if named == name) >= 9
+        rig.tick(hub, 0.25)
+        rig.publish(hub, rig.vehicle.heartbeat())
+    await rig.quiet()
+    ids = [message_id_of(frame) for frame in station.received()]
+    assert 9 <= ids.count(MESSAGE_IDS["PING"]) == ids.count(MESSAGE_IDS["TIMESYNC"]) <= 10
 
 
 async def test_antenna_tracker_gets_position_and_pressure_of_its_target(rig: Any) -> None:
     """ArduPilot's requests two streams of the first vehicle whose heartbeat it receives."""
     gateway = FlyingHub(rig, 1, "udp-listen:127.0.0.1:0")
     gateway.fly()
-    tracker = rig.station(gateway.hub.listening_ports()[0])
-    tracker.sender = rig.sender(2)
+    tracker = rig.station(gateway.hub.listening_ports()[0], origin=(2, 1))
     beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_ANTENNA_TRACKER, 3, 0, 0, 4, 3)
     tracker.send(tracker.sender.pack(beat))
     for group in (dialect.MAV_DATA_STREAM_POSITION, dialect.MAV_DATA_STREAM_RAW_SENSORS):

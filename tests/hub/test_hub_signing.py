@@ -24,8 +24,7 @@ def read(receiver: Any, frame: bytes) -> tuple[str, int, int]:
 
 async def test_greetings_requests_answers_and_limited_telemetry_are_signed(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0?rate=RAW_IMU:1", signer=signer())
-    hub.send(rig.out(rig.vehicle.heartbeat()))
-    hub.send(rig.out(rig.vehicle.home()))
+    rig.publish(hub, rig.vehicle.heartbeat(), rig.vehicle.home())
     station, receiver = rig.station(hub.listening_ports()[0]), strict()
     station.send(station.sender.heartbeat())
     await rig.until(lambda: len(hub.clients()) == 1)
@@ -33,11 +32,10 @@ async def test_greetings_requests_answers_and_limited_telemetry_are_signed(rig: 
     got = []
     hub.set_interval(ClientInterval(client.client_id, 1, 30, -1))
     for _ in range(3):
-        hub.send(rig.out(rig.vehicle.raw_imu()))
-        hub.send(rig.out(rig.vehicle.attitude()))
+        rig.publish(hub, rig.vehicle.raw_imu(), rig.vehicle.attitude())
     hub.send(rig.out(rig.vehicle.home(), client.client_id))
     rig.clock.now_us += 5_000_000
-    hub.send(rig.out(rig.vehicle.heartbeat()))
+    rig.publish(hub, rig.vehicle.heartbeat())
     rig.tick(hub)
     while ("TIMESYNC", PROBE_COMPONENT) not in [kind[:2] for kind in got]:
         got.append(read(receiver, await station.receive()))
@@ -54,14 +52,13 @@ async def test_greetings_requests_answers_and_limited_telemetry_are_signed(rig: 
 
 async def test_timestamps_follow_the_order_in_which_frames_leave_a_queue(rig: Any) -> None:
     hub = rig.hub("tcp-listen:127.0.0.1:0", signer=signer())
-    hub.send(rig.out(rig.vehicle.heartbeat()))
+    rig.publish(hub, rig.vehicle.heartbeat())
     client, loop = await rig.connect(hub.listening_ports()[0]), asyncio.get_running_loop()
     await rig.until(lambda: len(hub.clients()) == 1)
     while hub.clients()[0].queued < 50:
-        hub.send(rig.out(rig.vehicle.raw_imu()))
+        rig.publish(hub, rig.vehicle.raw_imu())
     for _ in range(50):
-        hub.send(rig.out(rig.vehicle.raw_imu()))
-        hub.send(rig.out(rig.vehicle.attitude()))
+        rig.publish(hub, rig.vehicle.raw_imu(), rig.vehicle.attitude())
     splitter, receiver, kinds = MavlinkSplitter(), strict(), []
     while hub.clients()[0].queued or kinds.count("ATTITUDE") < 50:
         data = await asyncio.wait_for(loop.sock_recv(client, 65536), START_LIMIT_S)
@@ -71,7 +68,7 @@ async def test_timestamps_follow_the_order_in_which_frames_leave_a_queue(rig: An
 
 async def test_frames_of_others_are_unchanged(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", signer=signer())
-    hub.send(rig.out(rig.vehicle.heartbeat()))
+    rig.publish(hub, rig.vehicle.heartbeat())
     port = hub.listening_ports()[0]
     source, station, receiver = rig.station(port), rig.station(port), strict()
     station.send(station.sender.heartbeat())
@@ -87,7 +84,7 @@ async def test_frames_of_others_are_unchanged(rig: Any) -> None:
     for frame in sent:
         source.send(frame)
     await rig.until(lambda: received() == 1 + len(autopilots) + len(sent))
-    hub.send(rig.out(rig.vehicle.raw_imu()))
+    rig.publish(hub, rig.vehicle.raw_imu())
     got = []
     while not got or (got[-1][5:7], message_id_of(got[-1])) != (b"\1\1", 27):
         got.append(await station.receive())
@@ -99,15 +96,15 @@ async def test_frames_of_others_are_unchanged(rig: Any) -> None:
 async def test_changed_key_applies_from_the_next_frame_on(rig: Any) -> None:
     keys = signer()
     hub = rig.hub("udp-listen:127.0.0.1:0", signer=keys)
-    hub.send(rig.out(rig.vehicle.heartbeat()))
+    rig.publish(hub, rig.vehicle.heartbeat())
     station = await rig.call(hub)
     for key in (KEY, OTHER_KEY):
         keys.keys[1] = key
-        hub.send(rig.out(rig.vehicle.heartbeat()))
+        rig.publish(hub, rig.vehicle.heartbeat())
         receiver = strict(key)
         if key is KEY:
             read(receiver, await station.receive())
         read(receiver, await station.receive())
     del keys.keys[1]
-    hub.send(rig.out(rig.vehicle.heartbeat()))
+    rig.publish(hub, rig.vehicle.heartbeat())
     assert not frame_of(await station.receive()).signed

@@ -111,8 +111,7 @@ class HubMachine(RuleBasedStateMachine):
         self.trusted, self.untrusted, self.tcp = self.hub.listening_ports()
         trusted: Any = self.hub._clients[1]
         self.good.target = ("127.0.0.1", trusted._port)
-        self.autopilot = self.rig.station(self.trusted)
-        self.autopilot.sender = self.rig.sender(*AUTOPILOT)
+        self.autopilot = self.rig.station(self.trusted, origin=AUTOPILOT)
         await self._second()
 
     async def _second(self) -> None:

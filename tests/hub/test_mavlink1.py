@@ -20,7 +20,7 @@ def heartbeat(sequence: int) -> bytes:
 
 async def next_attitude(rig: Any, hub: Any, station: Any) -> bytes:
     """Publish an attitude, and return the frame that the station receives."""
-    hub.send(rig.out(rig.vehicle.attitude()))
+    rig.publish(hub, rig.vehicle.attitude())
     while True:
         frame = await station.receive()
         if (frame[5] if frame[0] == V1 else frame[7]) == dialect.MAVLINK_MSG_ID_ATTITUDE:
@@ -34,7 +34,7 @@ async def test_endpoint_of_version_1_gets_only_messages_of_this_version(rig: Any
         1, 1, 12, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0] * 21, [0] * 21
     )
     sender = dialect.MAVLink(None, 1, 1)
-    hub.send(rig.out(odometry.pack(sender)))
+    rig.publish(hub, odometry.pack(sender))
     first = await next_attitude(rig, hub, station)
     second = await next_attitude(rig, hub, station)
     assert [first[0], second[0]] == [V1, V1]

@@ -225,7 +225,7 @@ class TestHub:
         self, rig: Any
     ) -> None:
         hub, _, _, seat = await self.open(rig, "", "", station="systems=3")
-        hub.send(rig.out(rig.vehicle.heartbeat()))
+        rig.publish(hub, rig.vehicle.heartbeat())
         await self.say(rig, (seat, heartbeat(mavlink.MAV_TYPE_GCS, 8), 255, STATION))
         before = len(rig.incoming)
         await self.say(rig, (seat, command(0, 0), 255, STATION), (seat, command(1), 255, STATION))
@@ -237,7 +237,7 @@ class TestHub:
     ) -> None:
         hub, first, second, _ = await self.open(rig, "not-systems=1", "as=1:21")
         for _ in range(2):
-            hub.send(rig.out(rig.vehicle.attitude()))
+            rig.publish(hub, rig.vehicle.attitude())
         await rig.quiet()
         assert self.origins(first) == []
         # 21 is the vehicle of the link that has the id 1 there: ours would look like it.
@@ -256,7 +256,7 @@ class TestHub:
             sock = await rig.connect(hub.listening_ports()[0])
             await rig.until(lambda: len(hub.clients()) == 1)
         for _ in range(3):
-            hub.send(rig.out(rig.vehicle.attitude()))
+            rig.publish(hub, rig.vehicle.attitude())
         await rig.quiet()
         frames = client.received() if kind == "udp" else [sock.recv(4096)]
         link = mavlink.MAVLink(None, 255, 0)

@@ -52,7 +52,7 @@ class TestTcpListen:
         hub = rig.hub("tcp-listen:127.0.0.1:0")
         await self.narrow_client(rig, hub)
         for _ in range(5000):
-            hub.send(rig.out(rig.vehicle.raw_imu()))
+            rig.publish(hub, rig.vehicle.raw_imu())
             await asyncio.sleep(0)
         assert hub.clients()[0].queued > 1000
         assert hub.clients()[0].bytes_sent < 10_000
@@ -64,7 +64,7 @@ class TestTcpListen:
         await rig.until(lambda: len(hub.clients()) == 1)
         (client,) = hub._clients.values()
         while not client.queued:
-            hub.send(rig.out(rig.vehicle.raw_imu()))
+            rig.publish(hub, rig.vehicle.raw_imu())
         unsent = fcntl.ioctl(client._socket, SIOCOUTQNSD, bytes(4))
         assert int.from_bytes(unsent, sys.byteorder) < 2 * UNSENT_BYTES
 
@@ -76,9 +76,9 @@ class TestTcpListen:
         for now_ms in range(0, 12_000, 20):
             rig.clock.now_us += 20_000
             for _ in range(5):
-                hub.send(rig.out(rig.vehicle.pack(attitude_at(now_ms))))
+                rig.publish(hub, rig.vehicle.pack(attitude_at(now_ms)))
             if now_ms == 8000:
-                hub.send(rig.out(rig.vehicle.pack(dialect.MAVLink_command_ack_message(512, 0))))
+                rig.publish(hub, rig.vehicle.pack(dialect.MAVLink_command_ack_message(512, 0)))
             await asyncio.sleep(0)
             with contextlib.suppress(BlockingIOError):
                 received += [(now_ms, frame) for frame in frames_of(splitter.feed(slow.recv(40)))]
@@ -144,10 +144,10 @@ class TestSerial:
     ) -> None:
         near, device = line
         hub = rig.hub(f"serial:{device}:9600")
-        hub.send(rig.out(rig.vehicle.heartbeat()))
+        rig.publish(hub, rig.vehicle.heartbeat())
         for _ in range(15):
-            hub.send(rig.out(rig.vehicle.raw_imu()))
-        hub.send(rig.out(rig.vehicle.attitude()))
+            rig.publish(hub, rig.vehicle.raw_imu())
+        rig.publish(hub, rig.vehicle.attitude())
         waiting = hub.clients()[0].queued
         assert waiting > 10
         splitter, frames = MavlinkSplitter(), []

@@ -6,8 +6,11 @@ from typing import Any
 
 import pytest
 
+from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.forwarding_step import MAX_DATAGRAM
-from gateway.records import ClientInterval, Incoming
+from gateway.hub.transports.udp import UdpClient
+from gateway.records import Incoming
+from tests.kit.hub import receive
 
 pytestmark = pytest.mark.io
 
@@ -15,30 +18,25 @@ pytestmark = pytest.mark.io
 async def test_configured_client_gets_frames_and_answers_the_same_socket(rig: Any) -> None:
     station = rig.station()
     hub = await rig.open(f"udp:127.0.0.1:{station.port}?name=laptop")
-    attitude, heartbeat = rig.vehicle.attitude(), rig.vehicle.heartbeat()
-    hub.send(rig.out(attitude))
-    assert await station.receive() == attitude
-    hub.send(rig.out(heartbeat))
-    data, station.target = await asyncio.get_running_loop().sock_recvfrom(station.socket, 100)
-    assert data == heartbeat
-    answer = station.sender.heartbeat()
+    sent, answer = [rig.vehicle.attitude(), rig.vehicle.heartbeat()], station.sender.heartbeat()
+    rig.publish(hub, *sent)
+    assert [await station.receive() for _ in sent] == sent
     station.send(answer)
     await rig.until(lambda: bool(rig.incoming))
     (client,) = hub.clients()
     assert rig.incoming == [Incoming(client.client_id, answer, trusted=True, forwarded=True)]
     assert (client.name, client.sent, client.received) == ("laptop", 2, 1)
-    assert client.bytes_sent == len(attitude) + len(heartbeat)
+    assert client.bytes_sent == sum(map(len, sent))
     assert client.systems == ((255, 190),)
 
 
 async def test_new_client_of_a_port_is_greeted_without_a_gap(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
     home, heartbeat = rig.vehicle.home(), rig.vehicle.heartbeat()
-    hub.send(rig.out(home))
-    hub.send(rig.out(heartbeat))
+    rig.publish(hub, home, heartbeat)
     rig.vehicle.link.seq = 77
     station = await rig.call(hub)
-    hub.send(rig.out(rig.vehicle.attitude()))
+    rig.publish(hub, rig.vehicle.attitude())
     frames = [await station.receive() for _ in range(3)]
     assert [frame[7] for frame in frames] == [0, 242, 30]
     assert [frame[4] for frame in frames] == [75, 76, 77]
@@ -47,19 +45,13 @@ async def test_new_client_of_a_port_is_greeted_without_a_gap(rig: Any) -> None:
 
 async def test_clients_of_one_port_are_distinguished(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
-    stations = [rig.station(hub.listening_ports()[0]) for _ in range(5)]
-    for number, station in enumerate(stations):
-        station.sender.link.srcSystem = 200 + number
+    port = hub.listening_ports()[0]
+    stations = [rig.station(port, origin=(200 + number, 190)) for number in range(5)]
+    for station in stations * 4:
         station.send(station.sender.heartbeat())
-    await rig.until(lambda: len(hub.clients()) == 5)
-    for _ in range(3):
-        for station in stations:
-            station.send(station.sender.heartbeat())
     await rig.until(lambda: len(rig.incoming) == 20)
     assert [client.received for client in hub.clients()] == [4] * 5
-    assert {client.systems for client in hub.clients()} == {
-        ((200 + number, 190),) for number in range(5)
-    }
+    assert {client.systems for client in hub.clients()} == {((n, 190),) for n in range(200, 205)}
     answered = hub.clients()[2]
     frame = rig.vehicle.attitude()
     hub.send(rig.out(frame, answered.client_id))
@@ -70,42 +62,48 @@ async def test_clients_of_one_port_are_distinguished(rig: Any) -> None:
 async def test_datagrams_of_unusual_sizes_are_counted(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
     station = rig.station(hub.listening_ports()[0])
-    for data in (station.sender.heartbeat(), b"", b"\xfd" * 65507, station.sender.heartbeat()):
-        station.send(data)
+    station.send(station.sender.heartbeat(), b"", b"\xfd" * 65507, station.sender.heartbeat())
     await rig.until(lambda: len(rig.incoming) == 2)
     assert hub.clients()[0].bytes_garbage == MAX_DATAGRAM
 
 
-async def test_client_is_removed_after_its_host_refuses(rig: Any) -> None:
+async def refused(rig: Any) -> tuple[Any, Any]:
+    """Return a hub and its only client, whose socket is closed."""
     hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=1000.0)
     station = await rig.call(hub)
     station.socket.close()
-    hub.send(rig.out(rig.vehicle.attitude()))
+    rig.publish(hub, rig.vehicle.attitude())
     await rig.until(lambda: hub.clients()[0].state == "refused")
+    return hub, station
+
+
+async def test_client_is_removed_after_its_host_refuses(rig: Any) -> None:
+    hub, _ = await refused(rig)
     rig.clock.now_us = 4_000_000
     await rig.until(lambda: not hub.clients())
 
 
+def listening_again(station: Any) -> socket.socket:
+    """Return a socket at the address of a station that has ended."""
+    again = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    again.setblocking(False)
+    again.bind(("127.0.0.1", station.port))
+    return again
+
+
 async def test_refusing_client_gets_nothing_until_it_sends_again(rig: Any) -> None:
-    hub = rig.hub("udp-listen:127.0.0.1:0")
-    station = await rig.call(hub)
-    station.socket.close()
-    hub.send(rig.out(rig.vehicle.attitude()))
-    await rig.until(lambda: hub.clients()[0].state == "refused")
-    for _ in range(100):
-        hub.send(rig.out(rig.vehicle.attitude()))
+    hub, station = await refused(rig)
+    rig.publish(hub, *(rig.vehicle.attitude() for _ in range(100)))
     (caller,) = hub.clients()
     assert (caller.sent + caller.unheard, caller.dropped) == (101, 0)
     assert caller.unheard >= 99
     assert caller.reason == "nobody listens there"
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
-        again.setblocking(False)
-        again.bind(("127.0.0.1", station.port))
+    with listening_again(station) as again:
         again.sendto(station.sender.heartbeat(), station.target)
         await rig.until(lambda: hub.clients()[0].received == 2)
         frame = rig.vehicle.attitude()
-        hub.send(rig.out(frame))
-        assert await asyncio.get_running_loop().sock_recv(again, 100) == frame
+        rig.publish(hub, frame)
+        assert await receive(again) == frame
     assert len(hub.clients()) == 1
 
 
@@ -125,14 +123,11 @@ async def test_station_that_starts_late_loses_nothing_after_its_start(rig: Any) 
     late = rig.station()
     late.socket.close()
     hub = await rig.open(f"udp:127.0.0.1:{late.port}")
-    for _ in range(5):
-        hub.send(rig.out(rig.vehicle.heartbeat()))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as started:
-        started.setblocking(False)
-        started.bind(("127.0.0.1", late.port))
+    rig.publish(hub, *(rig.vehicle.heartbeat() for _ in range(5)))
+    with listening_again(late) as started:
         frame = rig.vehicle.attitude()
-        hub.send(rig.out(frame))
-        assert await asyncio.get_running_loop().sock_recv(started, 100) == frame
+        rig.publish(hub, frame)
+        assert await receive(started) == frame
 
 
 @pytest.fixture
@@ -152,7 +147,7 @@ async def names(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[tuple[str, in
 async def test_name_that_resolves_later_is_used_then(rig: Any, names: Any) -> None:
     station = rig.station()
     hub = rig.hub("udp:observer.example:14550")
-    hub.send(rig.out(rig.vehicle.attitude()))
+    rig.publish(hub, rig.vehicle.attitude())
     (client,) = hub.clients()
     assert (client.state, client.dropped) == ("resolving", 1)
     names["observer.example"] = [("127.0.0.1", station.port)]
@@ -169,12 +164,12 @@ async def test_second_address_of_a_name_is_used_when_the_first_refuses(
     names["here.example"] = [(host, station.port) for host in ("127.0.0.2", "127.0.0.1")]
     hub = await rig.open(f"udp:here.example:{station.port}")
     assert hub.clients()[0].remote == f"127.0.0.2:{station.port}"
-    hub.send(rig.out(rig.vehicle.attitude()))
+    rig.publish(hub, rig.vehicle.attitude())
     await rig.until(lambda: hub.clients()[0].state == "refused")
     for second in range(1, 5):
         rig.clock.now_us = second * 1_000_000
         rig.tick(hub)
-        hub.send(rig.out(rig.vehicle.attitude()))
+        rig.publish(hub, rig.vehicle.attitude())
         assert hub.clients()[0].remote == f"127.0.0.1:{station.port}"
         assert (await station.receive())[7] == 30
 
@@ -183,28 +178,12 @@ async def test_changed_address_of_a_name_is_followed(rig: Any, names: Any) -> No
     old, new = rig.station(), rig.station()
     names["observer.example"] = [("127.0.0.1", old.port)]
     hub = await rig.open("udp:observer.example:14550")
-    hub.send(rig.out(rig.vehicle.attitude()))
-    _, source = await asyncio.get_running_loop().sock_recvfrom(old.socket, 100)
+    await rig.check_passes(hub, old)
     names["observer.example"] = [("127.0.0.1", new.port)]
-    rig.clock.now_us = 61_000_000
-    rig.tick(hub)
+    rig.tick(hub, 61)
     await rig.until(lambda: hub.clients()[0].remote == f"127.0.0.1:{new.port}")
-    hub.send(rig.out(rig.vehicle.attitude()))
-    assert (await asyncio.get_running_loop().sock_recvfrom(new.socket, 100))[1] == source
-
-
-async def test_answer_and_requested_interval_concern_one_client(rig: Any) -> None:
-    first, second = rig.station(), rig.station()
-    hub = await rig.open(f"udp:127.0.0.1:{first.port}", f"udp:127.0.0.1:{second.port}")
-    one, _ = hub.clients()
-    answer = rig.vehicle.heartbeat()
-    hub.send(rig.out(answer, one.client_id))
-    assert await first.receive() == answer
-    hub.set_interval(ClientInterval(one.client_id, 1, 30, -1))
-    hub.send(rig.out(rig.vehicle.attitude()))
-    assert (await second.receive())[4] == 0
-    assert first.is_empty()
-    assert second.is_empty()
+    await rig.check_passes(hub, new)
+    assert new.target == old.target
 
 
 async def test_packing_without_a_wait_joins_only_frames_of_one_wake_up(
@@ -213,18 +192,15 @@ async def test_packing_without_a_wait_joins_only_frames_of_one_wake_up(
     """Two datagrams that are read at one wake-up go on as one, without a timer."""
     station = rig.station()
     hub = await rig.open("udp-listen:127.0.0.1:0", f"udp:127.0.0.1:{station.port}?pack=1100")
-    source = rig.station(hub.listening_ports()[0])
-    source.sender = rig.sender(42, 1)
+    source = rig.station(hub.listening_ports()[0], origin=(42, 1))
     source.send(source.sender.heartbeat())
     assert (await station.receive())[5] == 42
     frames = [source.sender.attitude() for _ in range(3)]
     loop = asyncio.get_running_loop()
     now_s = loop.time()
     monkeypatch.setattr(loop, "time", lambda: now_s)
-    for frame in frames:
-        source.send(frame)
+    source.send(*frames)
     assert await station.receive() == b"".join(frames)
-    assert hub._gathering == {}
 
 
 async def test_packing_with_a_wait_joins_later_frames(
@@ -237,7 +213,7 @@ async def test_packing_with_a_wait_joins_later_frames(
     monkeypatch.setattr(loop, "time", lambda: now_s[0])
     frames = [rig.vehicle.attitude() for _ in range(3)]
     for frame in frames:
-        hub.send(rig.out(frame))
+        rig.publish(hub, frame)
         now_s[0] += 0.006
         await asyncio.sleep(0)
         assert station.is_empty()
@@ -250,36 +226,32 @@ async def test_client_removed_before_its_flush_causes_no_error(rig: Any) -> None
     asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
     station = rig.station()
     hub = await rig.open(f"udp:127.0.0.1:{station.port}?pack=1100")
-    hub.send(rig.out(rig.vehicle.attitude()))
+    rig.publish(hub, rig.vehicle.attitude())
     hub.remove(f"udp:127.0.0.1:{station.port}")
     await rig.quiet()
     assert errors == []
 
 
 async def test_full_socket_buffer_drops_the_oldest_frames(rig: Any) -> None:
-    station = rig.station()
-    hub = await rig.open(f"udp:127.0.0.1:{station.port}")
-    link = hub._clients[hub.clients()[0].client_id]
-    direct, room = link._direct, [0]
-
-    def stuffed(data: bytes) -> object:
-        if not room[0]:
-            raise BlockingIOError
-        room[0] -= 1
-        return direct(data)
-
-    link.write = link._direct = stuffed
-    frames = [rig.vehicle.attitude() for _ in range(300)]
-    for frame in frames:
-        hub.send(rig.out(frame))
+    hub, pair = rig.hub(), socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    for sock in pair:
+        sock.setblocking(False)
+        rig.closing.append(sock.close)
+    link = UdpClient(hub, hub.new_client_id(), parse_endpoint("udp:127.0.0.1:1"))
+    link.adopt(pair[0])
+    hub.appear(link)
+    frames = list[bytes]()
+    while hub.clients()[0].dropped < 44:
+        frames.append(rig.vehicle.attitude())
+        rig.publish(hub, frames[-1])
     (client,) = hub.clients()
-    assert (client.queued, client.sent, client.dropped) == (256, 256, 44)
-    room[0] = 1000
-    assert [await station.receive() for _ in range(256)] == frames[44:]
+    assert (client.queued, client.sent, client.dropped) == (256, len(frames) - 44, 44)
+    passed = frames[:-300] + frames[-256:]
+    assert [await receive(pair[1]) for _ in passed] == passed
     assert hub.clients()[0].queued == 0
     newest = rig.vehicle.attitude()
-    hub.send(rig.out(newest))
-    assert await station.receive() == newest
+    rig.publish(hub, newest)
+    assert await receive(pair[1]) == newest
 
 
 async def test_ipv6_works_at_configured_and_listening_endpoints(rig: Any) -> None:
@@ -288,8 +260,8 @@ async def test_ipv6_works_at_configured_and_listening_endpoints(rig: Any) -> Non
         station.bind(("::1", 0))
         hub = await rig.open("udp-listen:[::1]:0", f"udp:[::1]:{station.getsockname()[1]}")
         frame = rig.vehicle.attitude()
-        hub.send(rig.out(frame))
-        assert await asyncio.get_running_loop().sock_recv(station, 100) == frame
+        rig.publish(hub, frame)
+        assert await receive(station) == frame
         station.sendto(rig.sender(255, 190).heartbeat(), ("::1", hub.listening_ports()[0]))
         await rig.until(lambda: len(hub.clients()) == 2)
     assert all(client.trusted for client in hub.clients())
@@ -304,9 +276,7 @@ async def test_frames_that_a_bridge_cuts_over_datagrams_are_forwarded(
     port = bridge.port if kind == "udp" else 0
     hub = await rig.open(f"{kind}:127.0.0.1:{port}", f"udp:127.0.0.1:{station.port}")
     if kind == "udp":
-        hub.send(rig.out(rig.vehicle.attitude()))
-        _, bridge.target = await asyncio.get_running_loop().sock_recvfrom(bridge.socket, 100)
-        await station.receive()
+        await rig.check_passes(hub, bridge, station)
     else:
         bridge.target = ("127.0.0.1", hub.listening_ports()[0])
     sender = rig.sender(42)

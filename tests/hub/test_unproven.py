@@ -144,7 +144,7 @@ async def test_program_with_a_hub_and_no_vehicle_proves_itself_by_its_answer(rig
     panel = rig.hub(f"udp:127.0.0.1:{port.gateway.hub.listening_ports()[0]}")
     await rig.until_open(panel)
     await port.fly(1)
-    panel.send(rig.out(rig.sender(255, 190).heartbeat()))
+    rig.publish(panel, rig.sender(255, 190).heartbeat())
     await rig.quiet()
     await port.fly(0.2)
     assert port.state() == "open"

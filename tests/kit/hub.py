@@ -245,6 +245,13 @@ class Rig:
     async def until(self, condition: Callable[[], object]) -> None:
         await until(condition)
 
+    async def tick_until(self, hub: Hub, condition: Callable[[], object]) -> None:
+        """Let the hub tick until something holds: threads of its links take their time."""
+        async with asyncio.timeout(START_LIMIT_S):
+            while not condition():
+                self.tick(hub, 0.1)
+                await asyncio.sleep(0.01)
+
     async def quiet(self) -> None:
         """Let all frames arrive: on loopback each step takes one turn of the loop."""
         for _ in range(200):

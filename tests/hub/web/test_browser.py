@@ -78,8 +78,7 @@ async def test_documented_page_draws_the_horizon(rig: Rig, page: Page) -> None:
 
         def show(roll_rad: float, pitch_rad: float) -> None:
             message = dialect.MAVLink_attitude_message(5, roll_rad, pitch_rad, 0, 0, 0, 0.1)
-            hub.send(rig.out(rig.vehicle.heartbeat()))
-            hub.send(rig.out(rig.vehicle.pack(message)))
+            rig.publish(hub, rig.vehicle.heartbeat(), rig.vehicle.pack(message))
 
         show(0.0, 0.0)
         await until_colour(page, (150, 140), SKY)

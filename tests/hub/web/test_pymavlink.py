@@ -22,18 +22,18 @@ async def receive(link: Any, kind: str) -> Any:
 
 async def test_pymavlink_connects_to_the_hub(rig: Rig) -> None:
     hub = rig.hub("ws-listen:127.0.0.1:0")
-    hub.send(rig.out(rig.vehicle.heartbeat()))
+    rig.publish(hub, rig.vehicle.heartbeat())
     url = f"ws:127.0.0.1:{hub.listening_ports()[0]}"
     link = await asyncio.to_thread(mavutil.mavlink_connection, url, source_system=255)
     try:
-        hub.send(rig.out(rig.vehicle.raw_imu()))
+        rig.publish(hub, rig.vehicle.raw_imu())
         assert (await receive(link, "HEARTBEAT")).get_srcSystem() == 1
         assert (await receive(link, "RAW_IMU")).zmag == 9
         link.mav.command_long_send(1, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0)
         await rig.until(lambda: bool(rig.incoming))
         assert rig.incoming[0].trusted
         for _ in range(200):
-            hub.send(rig.out(rig.vehicle.attitude()))
+            rig.publish(hub, rig.vehicle.attitude())
         got = [await receive(link, "ATTITUDE") for _ in range(200)]
         assert [message.get_seq() for message in got] == list(range(2, 202))
         assert link.mav.total_receive_errors == 0
@@ -50,7 +50,7 @@ async def test_pymavlink_connects_to_the_hub_by_tls(
     link = await asyncio.to_thread(mavutil.mavlink_connection, url, source_system=255)
     try:
         for _ in range(50):
-            hub.send(rig.out(rig.vehicle.attitude()))
+            rig.publish(hub, rig.vehicle.attitude())
         got = [await receive(link, "ATTITUDE") for _ in range(50)]
         assert [message.get_seq() for message in got] == list(range(50))
         link.mav.command_long_send(1, 1, 512, 0, 148, 0, 0, 0, 0, 0, 0)
@@ -66,7 +66,7 @@ async def test_hub_connects_to_pymavlink(rig: Rig) -> None:
     try:
         hub = rig.hub(f"ws:127.0.0.1:{port}")
         await until_read(rig, server, lambda: hub.clients()[0].state == "open")
-        hub.send(rig.out(rig.vehicle.attitude()))
+        rig.publish(hub, rig.vehicle.attitude())
         got: list[Any] = []
 
         def has_come() -> bool:

@@ -45,7 +45,7 @@ class TestPages:
 
     async def test_page_of_an_allowed_origin_may_connect(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(f"{LISTEN}?origins=https://example.org,null&trusted=no")
-        hub.send(rig.out(rig.vehicle.heartbeat()))
+        rig.publish(hub, rig.vehicle.heartbeat())
         page = await visit(hub.listening_ports()[0], "https://example.org")
         assert page.is_open
         assert (await visit(hub.listening_ports()[0], "null")).is_open
@@ -81,19 +81,16 @@ class TestTrouble:
         hub = rig.hub(LISTEN, idle_timeout_s=9)
         page, mute = [await visit(hub.listening_ports()[0]) for _ in range(2)]
         mute.answers_pings = False
-        rig.clock.now_us += 3_000_000
-        rig.tick(hub)
+        rig.tick(hub, 3)
         pings = len(page.events) + 1
         await page.until(lambda: len(page.events) >= pings)
         client: Any = hub._clients[1]
         await rig.until(lambda: client._answers)
         page.answers_pings = False
         for _ in range(2):
-            rig.clock.now_us += 4_000_000
-            rig.tick(hub)
+            rig.tick(hub, 4)
             assert len(hub.clients()) == 2
-        rig.clock.now_us += 4_000_000
-        rig.tick(hub)
+        rig.tick(hub, 4)
         (left,) = hub.clients()
         assert left.client_id == 2, "one that never answered pings is left to the kernel"
 
@@ -104,8 +101,7 @@ class TestTrouble:
         (listener,) = hub._endpoints.values()
         await rig.until(lambda: len(listener._handshakes) == 1)
         assert not hub.clients()
-        rig.clock.now_us += 5_000_000
-        rig.tick(hub)
+        rig.tick(hub, 5)
         assert await hung_up(sock)
         assert not listener._handshakes
 
@@ -134,7 +130,7 @@ class TestTrouble:
             await self.shake_hands(rig, hub, sock)
         await asyncio.get_running_loop().sock_sendall(sock, bytes(range(seed, 250)) * 20)
         await rig.until(lambda: len(hub.clients()) == 1 and not self.callers(hub))
-        hub.send(rig.out(rig.vehicle.attitude()))
+        rig.publish(hub, rig.vehicle.attitude())
         assert len(await page.frames(1)) == 1
 
     @staticmethod
@@ -172,8 +168,7 @@ class TestCalling:
             hub = rig.hub(f"ws:127.0.0.1:{server.getsockname()[1]}")
             client: Any = hub._clients[1]
             await rig.until(lambda: client._socket is not None)
-            rig.clock.now_us += 5_000_000
-            rig.tick(hub)
+            rig.tick(hub, 5)
             assert hub.clients()[0].state == "refused"
             assert hub.clients()[0].reason == "no handshake"
             hub.close()
@@ -187,11 +182,11 @@ class TestTls:
         port = server.listening_ports()[0]
         hub = await rig.open(f"wss:127.0.0.1:{port}", tls_authority=str(certificate))
         page = await visit(port, tls=ssl.create_default_context(cafile=certificate))
-        hub.send(rig.out(rig.sender(7).attitude()))
+        rig.publish(hub, rig.sender(7).attitude())
         (frame,) = await page.frames(1)
         assert frame[5] == 7
         for _ in range(500):
-            server.send(rig.out(rig.vehicle.raw_imu()))
+            rig.publish(server, rig.vehicle.raw_imu())
         await rig.until(lambda: hub.clients()[0].received == 500)
         assert len(await page.frames(501)) == 501
 
@@ -207,7 +202,7 @@ class TestTls:
         sent = 0
         while hub.clients()[0].dropped < 500:
             for _ in range(50):
-                hub.send(rig.out(rig.vehicle.raw_imu()))
+                rig.publish(hub, rig.vehicle.raw_imu())
                 sent += 1
             await asyncio.sleep(0)
         page.reader._transport.resume_reading()
@@ -271,8 +266,7 @@ class TestTls:
         hub = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(file))
         assert hub.listeners()[0].reason == "No such file or directory"
         shutil.copy(certificate, file)
-        rig.clock.now_us += 2_000_000
-        rig.tick(hub)
+        rig.tick(hub, 2)
         assert hub.listeners()[0].state == "open"
 
     def test_settings_without_a_certificate_are_refused(self) -> None:
