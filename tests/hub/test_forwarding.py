@@ -9,15 +9,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.compiled.entry_point import LibraryError
 from gateway.hub import forwarding_step
 from gateway.hub import hub as hub_module
+from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.forwarding import Forwarding
 from gateway.hub.stats import ClientStats
-from gateway.hub.transports.datagram import DatagramPeer
+from gateway.hub.transports.udp import UdpClient
 from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter
 from tests.kit.hub import Rig
 from tests.kit.mavlink import Sender, packed
@@ -119,14 +121,15 @@ class World:
         await self.settle()
 
     async def narrow(self) -> None:
-        """Let the plain client send through a socket whose buffer fills after some datagrams."""
-        (client,) = (c for c in self.hub._clients.values() if c.endpoint.url == self.urls["plain"])
+        """Add a client with a socket whose buffer fills after some datagrams."""
+        url = parse_endpoint("udp:127.0.0.1:1")
+        client = UdpClient(self.hub, self.hub.new_client_id(), url)
         self.pair = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         for sock in self.pair:
             sock.setblocking(False)
             self.rig.closing.append(sock.close)
-        client.close()
-        client.adopt(self.pair[0])  # type: ignore[attr-defined]
+        client.adopt(self.pair[0])
+        self.hub.appear(client)
 
     async def settle(self) -> None:
         """Let everything arrive and be read."""
@@ -199,9 +202,10 @@ class World:
         await self.rig.until(lambda: all(c.state != "resolving" for c in self.hub.clients()))
 
     async def change_options(self, _: int) -> None:
-        client = self.hub._clients[2]
-        denied = frozenset(self.rng.sample([27, 30], self.rng.randrange(3)))
-        client.reconfigure(replace(client.endpoint, deny=denied))
+        urls = list(self.hub.settings.endpoints)
+        denied = self.rng.sample(["27", "30"], self.rng.randrange(3))
+        urls[4] = self.urls["plain"] + (f"?deny={','.join(denied)}" if denied else "")
+        self.hub.apply(msgspec.structs.replace(self.hub.settings, endpoints=tuple(urls)))
 
     def figures(self) -> Any:
         """Return all that may not depend on the mode."""
@@ -237,9 +241,8 @@ async def run(rig: Rig, seed: int) -> Any:
     ("seed", "mode"), [*((seed, MODES[2]) for seed in range(4)), (4, MODES[1]), (5, MODES[1])]
 )
 async def test_all_ways_of_forwarding_deliver_and_count_the_same(
-    seed: int, mode: str, monkeypatch: pytest.MonkeyPatch
+    seed: int, mode: str, proven: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(DatagramPeer, "is_proven", True)
     results = []
     for each in (MODES[0], mode):
         rig = Rig()

@@ -109,9 +109,10 @@ class HubMachine(RuleBasedStateMachine):
         self.hub, self.vehicle = self.gateway.hub, self.gateway.vehicle
         await self.rig.until_open(self.hub)
         self.trusted, self.untrusted, self.tcp = self.hub.listening_ports()
-        trusted: Any = self.hub._clients[1]
-        self.good.target = ("127.0.0.1", trusted._port)
         self.autopilot = self.rig.station(self.trusted, origin=AUTOPILOT)
+        self.gateway.fly()
+        await self.rig.quiet()
+        self._listen()
         await self._second()
 
     async def _second(self) -> None:

@@ -175,8 +175,12 @@ class TestHub:
             for each, text in zip((first, second, seat), (*options, station), strict=True)
         ]
         hub = await rig.open(*urls)
-        for client, each in zip(hub._clients.values(), (first, second, seat), strict=True):
-            each.target = client._socket.getsockname()
+        for client, each in zip(hub.clients(), (first, second, seat), strict=True):
+            # Every filter lets one of them pass.
+            for system in (1, 2, 3):
+                hub.send(rig.out(rig.sender(system).attitude(), client.client_id))
+            await each.receive()
+            each.received()
         return hub, first, second, seat
 
     async def say(self, rig: Any, *frames: tuple[Any, Any, int, int]) -> None:
