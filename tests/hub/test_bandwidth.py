@@ -161,10 +161,8 @@ def test_plan_of_a_link_lasts_until_its_bandwidth_changes(budget: int, is_kept: 
     flight = Flight("udp:h:1?budget=1500")
     flight.run(10)
     sink = flight.sinks[0]
-    before = flight.fanout._subscriptions[1].bandwidth
     sink.endpoint = parse_endpoint(f"udp:h:1?name=radio&budget={budget}")
     flight.fanout.reconfigure(sink)
-    assert (flight.fanout._subscriptions[1].bandwidth is before) is is_kept
     flow = sum(map(len, sink.since(flight.run(10)))) / 10
     assert (flow <= 1.1 * 1500) is is_kept
 

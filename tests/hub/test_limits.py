@@ -103,13 +103,14 @@ def test_client_no_longer_trusted_uses_the_shared_bucket() -> None:
     assert queue.take(0) is None
 
 
-def test_removed_clients_leave_no_requests() -> None:
+def test_removed_client_leaves_neither_requests_nor_a_quota() -> None:
     queue = RequestQueue()
-    for client_id in range(1000):
-        queue.offer(asked(client_id), 0)
-        queue.remove(client_id)
-    assert queue.take(0) is None
-    assert (queue._lines, queue._turns) == ({}, {})
+    queue.offer(asked(1), 0)
+    queue.charge(1, 2 * CLIENT_BURST)
+    queue.remove(1)
+    assert (queue.take(0), queue.wait_us(0)) == (None, None)
+    queue.offer(asked(1), 0)
+    assert queue.take(0) == asked(1)
 
 
 S = US_PER_S

@@ -91,19 +91,17 @@ def test_closed_port_is_reported_until_it_is_open() -> None:
     assert news == [(True, f"here: {taken}")]
     opened = dataclasses.replace(closed, state="open", reason="", port=14550)
     assert watch.update((), (opened,), 21 * S) == [(False, "here is back")]
-    watch.update((), (closed,), 22 * S)
-    assert watch.update((), (), 23 * S) == []
-    assert not watch._away_since_us
+    assert watch.update((), (closed,), 22 * S) == watch.update((), (), 23 * S) == []
+    assert watch.update((), (closed,), 23 * S + ALERT_AFTER_US - 1) == [], "another port"
 
 
 def test_state_of_a_client_that_left_is_discarded() -> None:
     watch = ClientAlerts()
-    for n in range(10):
-        look(watch, client(state="unreachable", dropped=n), n * S)
-        look(watch, client(dropped=n), n * S)
-    assert look(watch, (), 11 * S) == []
-    assert not watch._away_reported
-    assert not watch._dropped
+    reported = [look(watch, client(state="unreachable", dropped=n), n * S) for n in range(20)]
+    assert sum(map(len, reported)) == 1
+    assert look(watch, (), 20 * S) == []
+    assert look(watch, client(dropped=100), 21 * S) == [], "another client"
+    assert look(watch, client(dropped=100, state="unreachable"), 22 * S) == []
 
 
 def test_alerts_of_unknown_clients_are_summed_up_and_of_a_configured_one_named() -> None:
