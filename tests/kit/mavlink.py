@@ -5,10 +5,12 @@ import random
 import struct
 from typing import Any
 
+from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as every_dialect
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.records import Outgoing
+from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_signing import EPOCH_2015_US, TICK_US, FrameSigner, SigningClock
 from gateway.wire.mavlink_splitter import Event, MavFrame, frame_of, message_id_of, split_datagram
 
@@ -73,6 +75,18 @@ def random_message(
             several = [value(name, form) for _ in range(lengths[name] or 1)]
             given[name] = several if lengths[name] else several[0]
     return kind(**given)
+
+
+def frame_with(
+    message_id: int, payload: bytes, origin: tuple[int, int] = (1, 1), *, version: int = 2
+) -> bytes:
+    """Return a frame with any payload bytes, also of a message that no dialect contains."""
+    if version == 1:
+        head = bytes((0xFE, len(payload), 0, *origin, message_id))
+    else:
+        head = bytes((0xFD, len(payload), 0, 0, 0, *origin)) + message_id.to_bytes(3, "little")
+    crc: int = mcrf4xx(CRC_EXTRA.get(message_id, b"\0"), mcrf4xx(head[1:] + payload))
+    return head + payload + crc.to_bytes(2, "little")
 
 
 class Sender:

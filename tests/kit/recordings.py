@@ -7,9 +7,11 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.columns import TableRow, row_to_line
+from gateway.recordings.play import Track
 from gateway.recordings.senders import Senders
 from gateway.recordings.table import TableHeader, encode_head
 from gateway.recordings.tlog import Batch, TlogRecord, TlogScanner, encode_record
+from gateway.recordings.tlog_index import TlogIndex
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from tests.kit.mavlink import Sender, packed
 
@@ -67,6 +69,13 @@ def batch_of(records: Iterable[TlogRecord]) -> Batch:
     return TlogScanner().feed(make_tlog(records), final=True)
 
 
+def index_of(batches: Iterable[Batch]) -> TlogIndex:
+    index = TlogIndex()
+    for batch in batches:
+        index.add(batch)
+    return index
+
+
 def read_tlog(path: Path) -> list[TlogRecord]:
     """Read a tlog without damage."""
     batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
@@ -88,3 +97,28 @@ def messages_of(
     reader = VehicleReader(senders_of(make_tlog(records)), wanted, system_id)
     found = [message for record in records for message in reader.feed(record)]
     return [*found, *reader.flush()]
+
+
+class MemoryTlog:
+    """A tlog in memory as a source of a track."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.index = data, index_of([TlogScanner().feed(data, final=True)])
+        self.last_us = self.index.last_us or 0
+
+    def read(self, offset: int, size: int) -> bytes:
+        return self.data[offset : offset + size]
+
+    def prepare(self, until_us: int) -> bool:
+        return True
+
+
+def make_track(data: bytes, **options: object) -> Track:
+    return Track(MemoryTlog(data), **options)
+
+
+def play_all(track: Track) -> list[TlogRecord]:
+    found = []
+    while (time_us := track.peek_us()) is not None:
+        found.append(TlogRecord(time_us, track.take()))
+    return found

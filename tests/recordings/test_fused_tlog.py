@@ -14,8 +14,7 @@ from gateway.recordings.opening import PIECE, FusedTlog
 from gateway.recordings.play import Player, Track
 from gateway.recordings.tlog import TlogRecord
 from tests.conftest import ManualClock
-from tests.kit.recordings import START_US, STEP_US, make_records
-from tests.recordings.test_track import play_all
+from tests.kit.recordings import START_US, STEP_US, make_records, play_all
 
 pytestmark = pytest.mark.io
 

@@ -7,8 +7,7 @@ import pytest
 from gateway.recordings.play import Player, PlayState
 from gateway.recordings.tlog import TlogRecord
 from gateway.wire.mavlink_splitter import origin_of
-from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog
-from tests.recordings.test_track import make_track
+from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, make_track
 
 MANY = 10_000
 RECORDS = make_records(100)

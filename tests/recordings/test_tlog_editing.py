@@ -2,8 +2,8 @@
 
 import re
 from collections.abc import Callable
+from os import SEEK_END
 from pathlib import Path
-from typing import Protocol
 
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
@@ -18,41 +18,38 @@ from gateway.recordings.selection import (
     while_in_state,
 )
 from gateway.recordings.senders import Senders
-from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
+from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.recordings.tlog_editing import Renumbering, TlogEdits
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 from tests.kit.cli import run
-from tests.kit.mavlink import Sender, packed
-from tests.kit.recordings import START_US, make_records, make_tlog, read_tlog, senders_of
+from tests.kit.mavlink import Sender, frame_with, packed
+from tests.kit.recordings import (
+    SECOND_US,
+    START_US,
+    batch_of,
+    make_records,
+    make_tlog,
+    read_tlog,
+    records_of,
+    records_sent,
+    senders_of,
+    write_tlog,
+)
 
 pytestmark = pytest.mark.io
 
-SECOND_US = 1_000_000
 ATTITUDE = MESSAGE_IDS["ATTITUDE"]
 
 
-class Write(Protocol):
-    """Write records to a file in the folder of the test."""
-
-    def __call__(self, records: list[TlogRecord], name: str = "flight.tlog") -> Path: ...
-
-
-@pytest.fixture
-def write(tmp_path: Path) -> Write:
-    def written(records: list[TlogRecord], name: str = "flight.tlog") -> Path:
-        path = tmp_path / name
-        path.write_bytes(make_tlog(records))
-        return path
-
-    return written
-
-
-def convert(*words: object, folder: Path) -> tuple[list[TlogRecord], str]:
-    """Run `mavgate convert` to a tlog; return its records and the texts."""
-    out = folder / "out.tlog"
-    text = run("convert", *words, "-o", out, "--force")
-    return read_tlog(out), text
+def convert(folder: Path, *words: object) -> tuple[list[TlogRecord], str]:
+    """Run `mavgate convert` to a tlog; lists of records become files. Return records and texts."""
+    files = [
+        write_tlog(folder / f"{k}.tlog", word) if isinstance(word, list) else word
+        for k, word in enumerate(words)
+    ]
+    text = run("convert", *files, "-o", folder / "out.tlog", "--force")
+    return read_tlog(folder / "out.tlog"), text
 
 
 MIXED = sorted(
@@ -77,9 +74,9 @@ MIXED = sorted(
     ],
 )
 def test_chosen_frames_are_kept_byte_for_byte(
-    write: Write, tmp_path: Path, options: tuple[object, ...], is_kept: Callable[[bytes], bool]
+    tmp_path: Path, options: tuple[object, ...], is_kept: Callable[[bytes], bool]
 ) -> None:
-    kept, text = convert(write(MIXED, "a.tlog"), *options, folder=tmp_path)
+    kept, text = convert(tmp_path, MIXED, *options)
     assert kept == [record for record in MIXED if is_kept(record.frame)]
     assert f"kept {len(kept)} of {len(MIXED)} records" in text
 
@@ -98,21 +95,22 @@ def test_chosen_frames_are_kept_byte_for_byte(
     ],
 )
 def test_options_that_fit_nothing_are_refused(
-    write: Write, tmp_path: Path, options: tuple[object, ...], text: str
+    tmp_path: Path, options: tuple[object, ...], text: str
 ) -> None:
-    out = tmp_path / "out.tlog"
-    assert text in run("convert", write(MIXED, "a.tlog"), "-o", out, *options, code=2)
+    path, out = write_tlog(tmp_path / "a.tlog", MIXED), tmp_path / "out.tlog"
+    assert text in run("convert", path, "-o", out, *options, code=2)
     assert not out.exists()
 
 
-def test_options_of_tlogs_are_refused_for_other_formats(write: Write, tmp_path: Path) -> None:
+def test_options_of_tlogs_are_refused_for_other_formats(tmp_path: Path) -> None:
+    path = write_tlog(tmp_path / "a.tlog", MIXED)
     for options in (("--without", "HEARTBEAT"), ("--as", "1:2"), ("--while", "armed")):
-        text = run("convert", write(MIXED), "-o", tmp_path / "x.kml", *options, code=2)
+        text = run("convert", path, "-o", tmp_path / "x.kml", *options, code=2)
         assert "ends in .tlog" in text
 
 
-def test_input_is_never_the_output(write: Write) -> None:
-    path = write(MIXED)
+def test_input_is_never_the_output(tmp_path: Path) -> None:
+    path = write_tlog(tmp_path / "a.tlog", MIXED)
     text = run("convert", path, "-o", path, "--force", "--system", 1, code=2)
     assert "name another" in text
     assert read_tlog(path) == MIXED
@@ -129,15 +127,14 @@ def test_input_is_never_the_output(write: Write) -> None:
     ids=["zeros at the end", "cut at the end", "garbage before", "garbage within"],
 )
 def test_intact_records_of_a_damaged_file_are_kept_and_the_rest_counted(
-    write: Write,
     tmp_path: Path,
     spoil: Callable[[bytes], bytes],
     lost: int | None,
     left_out: int,
 ) -> None:
-    path = write(MIXED)
-    path.write_bytes(spoil(path.read_bytes()))
-    kept, text = convert(path, "--message", "*", folder=tmp_path)
+    path = tmp_path / "a.tlog"
+    path.write_bytes(spoil(make_tlog(MIXED)))
+    kept, text = convert(tmp_path, path, "--message", "*")
     assert set(kept) <= set(MIXED)
     assert len(kept) == len(MIXED) - lost if lost is not None else len(kept) >= len(MIXED) - 2
     assert "which contain no record" in text
@@ -145,54 +142,43 @@ def test_intact_records_of_a_damaged_file_are_kept_and_the_rest_counted(
         assert f"{left_out} bytes in 1 place" in text
 
 
-def test_sparse_file_keeps_the_records_around_its_hole(write: Write, tmp_path: Path) -> None:
-    path = write(MIXED)
-    data = path.read_bytes()
+def test_sparse_file_keeps_the_records_around_its_hole(tmp_path: Path) -> None:
+    path = write_tlog(tmp_path / "a.tlog", MIXED)
     with path.open("r+b") as file:
-        file.seek(len(data) + (32 << 20))
-        file.write(data)
-    kept, text = convert(path, "--system", 2, folder=tmp_path)
+        file.seek(32 << 20, SEEK_END)
+        file.write(make_tlog(MIXED))
+    kept, text = convert(tmp_path, path, "--system", 2)
     assert [r.frame for r in kept] == 2 * [
         r.frame for r in MIXED if frame_of(r.frame).origin[0] == 2
     ]
     assert f"{32 << 20} bytes in 1 place" in text
 
 
-def test_times_run_on_where_the_clock_was_set_back(write: Write, tmp_path: Path) -> None:
+def test_times_run_on_where_the_clock_was_set_back(tmp_path: Path) -> None:
     back_us = 3600 * SECOND_US
     stepped = [TlogRecord(r.time_us - back_us * (i >= 100), r.frame) for i, r in enumerate(MIXED)]
-    kept, text = convert(write(stepped), "--system", 1, folder=tmp_path)
+    kept, text = convert(tmp_path, stepped, "--system", 1)
     assert "jumped back by 3600 s" in text
     times = [record.time_us for record in kept]
     assert times == sorted(times)
     assert times[-1] - times[0] < 3 * SECOND_US
 
 
-def test_messages_of_a_foreign_dialect_are_kept_and_chosen_by_id(
-    write: Write, tmp_path: Path
-) -> None:
-    frame = bytearray(packed(mavlink.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 1.0)))
-    frame[7:10] = (60_001).to_bytes(3, "little")
-    foreign = TlogRecord(MIXED[50].time_us + 1, bytes(frame))
-    path = write([*MIXED[:51], foreign, *MIXED[51:]])
-    assert foreign in convert(path, "--system", 1, folder=tmp_path)[0]
-    assert convert(path, "--message", "60001", folder=tmp_path)[0] == [foreign]
-
-
-def beat(sender: Sender, *, armed: bool) -> bytes:
-    mode = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
-    return sender.pack(mavlink.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3))
+def test_messages_of_a_foreign_dialect_are_kept_and_chosen_by_id(tmp_path: Path) -> None:
+    foreign = TlogRecord(MIXED[50].time_us + 1, frame_with(60_001, b"foreign"))
+    records = [*MIXED[:51], foreign, *MIXED[51:]]
+    assert foreign in convert(tmp_path, records, "--system", 1)[0]
+    assert convert(tmp_path, records, "--message", "60001")[0] == [foreign]
 
 
 def armed_flight(*armed_s: tuple[int, int], length_s: int = 60) -> list[TlogRecord]:
     """Make heartbeats once a second, armed in some ranges, with an attitude 0.5 s after each."""
-    sender, records = Sender(), []
+    sender, frames = Sender(), []
     for second in range(length_s):
-        armed = any(begin <= second < end for begin, end in armed_s)
-        at_us = START_US + second * SECOND_US
-        records.append(TlogRecord(at_us, beat(sender, armed=armed)))
-        records.append(TlogRecord(at_us + SECOND_US // 2, sender.attitude(second)))
-    return records
+        mode = 128 * any(begin <= second < end for begin, end in armed_s)
+        frames.append(sender.pack(mavlink.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3)))
+        frames.append(sender.attitude(second))
+    return records_of(frames, SECOND_US // 2)
 
 
 @pytest.mark.parametrize(
@@ -216,33 +202,20 @@ def test_cut_to_armed_time_keeps_the_margin_on_both_sides(
     batches.append(scanner.feed(b"", final=True))
     cut = while_in_state(batches, senders_of(data), StateChoice(armed=True, margin_s=margin_s))
     found = [(r.time_us - START_US) / SECOND_US for batch in cut for r in batch.records()]
-    # The heartbeat that disarms ends the armed time, so that half a second of margin is left.
-    expected = [
-        (r.time_us - START_US) / SECOND_US
-        for r in records
-        if any(begin <= (r.time_us - START_US) / SECOND_US < end for begin, end in kept_s)
-    ]
-    assert found == [t for t in expected if not _is_in_last_half(t, armed_s, margin_s)]
-
-
-def _is_in_last_half(time_s: float, armed_s: list[tuple[int, int]], margin_s: float) -> bool:
-    return all(not begin - margin_s <= time_s <= end - 0.5 + margin_s for begin, end in armed_s)
+    assert found == [half / 2 for begin, end in kept_s for half in range(2 * begin, 2 * end)]
 
 
 def test_armed_state_of_a_gimbal_or_a_station_does_not_count() -> None:
-    vehicle, other = Sender(), Sender(1, 154)
-    records = [TlogRecord(START_US, beat(vehicle, armed=False))]
+    disarmed = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)
     gimbal = mavlink.MAVLink_heartbeat_message(26, 8, 128, 0, 4, 3)
-    records += [TlogRecord(START_US + k, other.pack(gimbal)) for k in range(1, 20)]
-    data = make_tlog(records)
-    batches = [TlogScanner().feed(data, final=True)]
-    cut = while_in_state(batches, senders_of(data), StateChoice(armed=True))
+    records = records_sent([((1, 1), disarmed), *[((1, 154), gimbal)] * 20])
+    senders = senders_of(make_tlog(records))
+    cut = while_in_state([batch_of(records)], senders, StateChoice(armed=True))
     assert sum(map(len, cut)) == 0
 
 
-def test_armed_parts_are_cut_on_the_command_line(write: Write, tmp_path: Path) -> None:
-    path = write(armed_flight((20, 30)))
-    kept, _ = convert(path, "--while", "armed", "--margin", 2.5, folder=tmp_path)
+def test_armed_parts_are_cut_on_the_command_line(tmp_path: Path) -> None:
+    kept, _ = convert(tmp_path, armed_flight((20, 30)), "--while", "armed", "--margin", 2.5)
     assert kept[0].time_us == START_US + 17_500_000
     assert kept[-1].time_us == START_US + 32 * SECOND_US
 
@@ -256,25 +229,21 @@ def test_armed_parts_are_cut_on_the_command_line(write: Write, tmp_path: Path) -
     ],
 )
 def test_time_in_chosen_modes_is_kept(
-    write: Write, tmp_path: Path, options: tuple[str, ...], kept_s: list[int]
+    tmp_path: Path, options: tuple[str, ...], kept_s: list[int]
 ) -> None:
     """The modes of a copter are STABILIZE, AUTO (3) from 10 and 30 s, and RTL (6) from 20 s."""
-    modes, sender = {10: (0, 3), 20: (0, 6), 30: (128, 3)}, Sender()
-    records = []
-    for second in range(40):
-        armed, mode = modes.get(second // 2 * 2, (0, 0))
-        message = mavlink.MAVLink_heartbeat_message(2, 3, armed, mode, 4, 3)
-        records.append(TlogRecord(START_US + second * SECOND_US, sender.pack(message)))
-    kept, _ = convert(write(records), *options, folder=tmp_path)
+    modes = {10: (0, 3), 20: (0, 6), 30: (128, 3)}
+    states = [modes.get(second // 2 * 2, (0, 0)) for second in range(40)]
+    beats = [mavlink.MAVLink_heartbeat_message(2, 3, *state, 4, 3) for state in states]
+    records = records_sent([((1, 1), message) for message in beats], SECOND_US)
+    kept, _ = convert(tmp_path, records, *options)
     assert [(one.time_us - START_US) // SECOND_US for one in kept] == kept_s
 
 
 def two_receivers(offset_us: int, *, loss: int = 7) -> tuple[list[TlogRecord], ...]:
     """Return what two receivers record of a flight, the second with another clock and delays."""
     sender = Sender()
-    frames = [sender.attitude(k) for k in range(600)]
-    times = [START_US + k * 20_000 for k in range(len(frames))]
-    whole = [TlogRecord(t, f) for t, f in zip(times, frames, strict=True)]
+    whole = records_of(sender.attitude(k) for k in range(600))
     first = [record for k, record in enumerate(whole) if k % loss]
     second = [
         TlogRecord(record.time_us + offset_us + 40 * (k % 11), record.frame)
@@ -285,11 +254,9 @@ def two_receivers(offset_us: int, *, loss: int = 7) -> tuple[list[TlogRecord], .
 
 
 @pytest.mark.parametrize("offset_us", [0, 300_000, -7_200_000_000, 86_400_000_000 * 30])
-def test_files_of_two_receivers_are_merged_without_copies(
-    write: Write, tmp_path: Path, offset_us: int
-) -> None:
+def test_files_of_two_receivers_are_merged_without_copies(tmp_path: Path, offset_us: int) -> None:
     first, second, whole = two_receivers(offset_us)
-    kept, text = convert(write(first, "a.tlog"), write(second, "b.tlog"), folder=tmp_path)
+    kept, text = convert(tmp_path, first, second)
     missing = {r.frame for k, r in enumerate(whole) if k % 35 == 0}
     assert [r.frame for r in kept] == [r.frame for r in whole if r.frame not in missing]
     assert all(abs(k.time_us - w.time_us) < 1000 for k, w in zip(
@@ -300,35 +267,31 @@ def test_files_of_two_receivers_are_merged_without_copies(
     assert f"left out {len(first) + len(second) - len(kept)} copied frames" in text
 
 
-def test_join_keeps_copies_and_times(write: Write, tmp_path: Path) -> None:
+def test_join_keeps_copies_and_times(tmp_path: Path) -> None:
     first, second, _ = two_receivers(1000)
-    paths = write(first, "a.tlog"), write(second, "b.tlog")
-    kept, _ = convert(*paths, "--join", folder=tmp_path)
+    kept, _ = convert(tmp_path, first, second, "--join")
     assert sorted(r.time_us for r in kept) == sorted(r.time_us for r in first + second)
     assert [r.time_us for r in kept] == sorted(r.time_us for r in kept)
 
 
-def test_files_one_behind_another_are_joined_in_order_of_time(write: Write, tmp_path: Path) -> None:
-    paths = [write(part, name) for part, name in ((MIXED[100:], "b.tlog"), (MIXED[:100], "a.tlog"))]
-    kept, text = convert(*paths, folder=tmp_path)
+def test_files_one_behind_another_are_joined_in_order_of_time(tmp_path: Path) -> None:
+    kept, text = convert(tmp_path, MIXED[100:], MIXED[:100])
     assert kept == MIXED
     assert "cop" not in text
 
 
-def test_frames_that_repeat_in_one_file_are_no_copies(write: Write, tmp_path: Path) -> None:
+def test_frames_that_repeat_in_one_file_are_no_copies(tmp_path: Path) -> None:
     same = packed(mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3))
     first, second, _ = two_receivers(0)
     repeated = [TlogRecord(START_US + k * 50_000, same) for k in range(20)]
     first = sorted([*first, *repeated], key=lambda r: r.time_us)
-    kept, _ = convert(write(first, "a.tlog"), write(second, "b.tlog"), "--merge", folder=tmp_path)
+    kept, _ = convert(tmp_path, first, second, "--merge")
     assert sum(record.frame == same for record in kept) == 20
 
 
-def test_vehicles_of_two_links_are_merged_although_nothing_is_equal(
-    write: Write, tmp_path: Path
-) -> None:
+def test_vehicles_of_two_links_are_merged_although_nothing_is_equal(tmp_path: Path) -> None:
     parts = [make_records(90, 1), make_records(90, 2)]
-    kept, text = convert(write(parts[0], "a.tlog"), write(parts[1], "b.tlog"), folder=tmp_path)
+    kept, text = convert(tmp_path, parts[0], parts[1])
     assert sorted(kept, key=lambda r: (r.time_us, r.frame)) == sorted(
         parts[0] + parts[1], key=lambda r: (r.time_us, r.frame)
     )
@@ -347,22 +310,17 @@ def test_third_file_is_aligned_by_copies_of_any_other() -> None:
 
 def test_sample_of_a_long_file_is_bounded() -> None:
     sender, sample = Sender(), FrameSample()
-    records = (
-        TlogRecord(START_US + k * 1000, sender.attitude(k)) for k in range(MAX_SAMPLE + 5000)
-    )
-    for batch in batched(records):
+    for batch in batched(records_of(sender.attitude(k) for k in range(MAX_SAMPLE + 5000))):
         sample.add(batch)
     assert MAX_SAMPLE // 4 < len(sample.frames) < MAX_SAMPLE
     assert sample.step == 2
 
 
-def test_renumbering_changes_headers_and_fields_with_valid_checksums(
-    write: Write, tmp_path: Path
-) -> None:
+def test_renumbering_changes_headers_and_fields_with_valid_checksums(tmp_path: Path) -> None:
     vehicle, station, signed = Sender(1), Sender(255, 190), Sender(1, signed=True)
     frames = [vehicle.heartbeat(), station.command(1, 1), station.command(2, 1), signed.heartbeat()]
-    records = [TlogRecord(START_US + k, frame) for k, frame in enumerate(frames)]
-    kept, _ = convert(write(records), "--as", "1:9", "--as", "255:250", folder=tmp_path)
+    records = records_of(frames)
+    kept, _ = convert(tmp_path, records, "--as", "1:9", "--as", "255:250")
     read = [frame_of(record.frame) for record in kept]
     assert [frame.origin[0] for frame in read] == [9, 250, 250, 9]
     assert [frame.target[0] for frame in read] == [0, 9, 2, 0]
@@ -370,19 +328,15 @@ def test_renumbering_changes_headers_and_fields_with_valid_checksums(
     assert [record.time_us for record in kept] == [record.time_us for record in records]
 
 
-def test_systems_can_swap_their_ids(write: Write, tmp_path: Path) -> None:
-    records = [TlogRecord(START_US + k, Sender(k % 2 + 1).heartbeat()) for k in range(6)]
-    kept, _ = convert(write(records), "--as", "1:2", "--as", "2:1", folder=tmp_path)
+def test_systems_can_swap_their_ids(tmp_path: Path) -> None:
+    records = records_of(Sender(k % 2 + 1).heartbeat() for k in range(6))
+    kept, _ = convert(tmp_path, records, "--as", "1:2", "--as", "2:1")
     assert [frame_of(r.frame).origin[0] for r in kept] == [2, 1, 2, 1, 2, 1]
 
 
-def test_unknown_message_that_cannot_be_renumbered_is_left_out_and_listed(
-    write: Write, tmp_path: Path
-) -> None:
-    frame = bytearray(packed(mavlink.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 1.0)))
-    frame[7:10] = (60_001).to_bytes(3, "little")
-    records = [*make_records(9), TlogRecord(START_US + SECOND_US, bytes(frame))]
-    kept, text = convert(write(records), "--as", "1:9", folder=tmp_path)
+def test_unknown_message_that_cannot_be_renumbered_is_left_out_and_listed(tmp_path: Path) -> None:
+    records = [*make_records(9), TlogRecord(START_US + SECOND_US, frame_with(60_001, b"foreign"))]
+    kept, text = convert(tmp_path, records, "--as", "1:9")
     assert len(kept) == 9
     assert "kept 9 of 10 records" in text
     assert "left out 1 frame of unknown message 60001" in text
@@ -392,7 +346,7 @@ def test_encoded_batch_without_some_records_equals_their_bytes() -> None:
     batch = TlogScanner().feed(b"\xff\xff" + make_tlog(MIXED) + bytes(99), final=True)
     wanted = batch.origins >> 8 == 1
     chosen = batch.chosen(wanted)
-    assert chosen.encoded() == b"".join(encode_record(r.time_us, r.frame) for r in chosen.records())
+    assert chosen.encoded() == make_tlog(chosen.records())
     assert batch.chosen(wanted & False).encoded() == b""
 
 

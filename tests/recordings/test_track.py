@@ -2,38 +2,8 @@
 
 import pytest
 
-from gateway.recordings.play import Track
-from gateway.recordings.tlog import TlogRecord, TlogScanner
-from gateway.recordings.tlog_index import TlogIndex
 from gateway.wire.mavlink_splitter import message_id_of
-from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog
-
-
-class Source:
-    """A tlog in memory."""
-
-    def __init__(self, data: bytes, index: TlogIndex) -> None:
-        self.data, self.index = data, index
-        self.last_us = index.last_us or 0
-
-    def read(self, offset: int, size: int) -> bytes:
-        return self.data[offset : offset + size]
-
-    def prepare(self, until_us: int) -> bool:
-        return True
-
-
-def make_track(data: bytes, **options: object) -> Track:
-    index = TlogIndex()
-    index.add(TlogScanner().feed(data, final=True))
-    return Track(Source(data, index), **options)
-
-
-def play_all(track: Track) -> list[TlogRecord]:
-    found = []
-    while (time_us := track.peek_us()) is not None:
-        found.append(TlogRecord(time_us, track.take()))
-    return found
+from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, make_track, play_all
 
 
 def test_track_yields_every_record() -> None:

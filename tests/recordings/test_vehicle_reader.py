@@ -7,31 +7,22 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.positions import Continuity, GroundDistance
 from gateway.recordings.status_texts import MAX_OPEN, TIMEOUT_US, TextJoiner
-from gateway.recordings.tlog import TlogRecord
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.units import US_PER_S
 from tests.kit.mavlink import packed
-from tests.kit.recordings import START_US, messages_of
+from tests.kit.recordings import START_US, Sent, messages_of, records_sent
 
 LAT, LON = 470_000_000, 85_000_000
 VEHICLE, GIMBAL, CAMERA, STATION = (1, 1), (1, 154), (1, 100), (255, 190)
-STEP_US = US_PER_S // 10
-Sent = list[tuple[tuple[int, int], Any]]
 
 
 def read(sent: Sent) -> list[VehicleMessage]:
-    return messages_of(
-        [TlogRecord(START_US + k * STEP_US, packed(m, *who)) for k, (who, m) in enumerate(sent)]
-    )
+    return messages_of(records_sent(sent, US_PER_S // 10))
 
 
 def positions(sent: Sent) -> list[tuple[float, float, float]]:
-    found = (message.position for message in read(sent))
-    return [
-        (round(at.lat_deg, 6), round(at.lon_deg, 6), round(at.alt_amsl_m, 2))
-        for at in found
-        if at is not None
-    ]
+    found = [message.position for message in read(sent) if message.position is not None]
+    return [(round(p.lat_deg, 6), round(p.lon_deg, 6), round(p.alt_amsl_m, 2)) for p in found]
 
 
 def fused(lat: int = LAT, lon: int = LON, alt_mm: int = 430_000) -> Any:
@@ -43,30 +34,20 @@ def raw(fix_type: int = 3, lat: int = LAT, lon: int = LON) -> Any:
 
 
 def raw2(fix_type: int = 3) -> Any:
-    return mavlink.MAVLink_gps2_raw_message(
-        0, fix_type, LAT, LON, 430_000, 1, 1, 250, 9000, 9, 0, 0
-    )
+    position = (LAT, LON, 430_000)
+    return mavlink.MAVLink_gps2_raw_message(0, fix_type, *position, 1, 1, 250, 9000, 9, 0, 0)
 
 
-def covariance() -> Any:
-    return mavlink.MAVLink_global_position_int_cov_message(
-        0, 1, LAT, LON, 430_000, 0, 1.0, 0.0, 0.0, [0.0] * 36
-    )
+def narrow(kind: Any, groundspeed: int, **known: int) -> Any:
+    fields = dict.fromkeys(kind.fieldnames, 0) | {"latitude": LAT, "longitude": LON}
+    return kind(**fields | known | {"groundspeed": groundspeed})
 
 
-def narrow() -> Any:
-    fields = dict.fromkeys(mavlink.MAVLink_high_latency_message.fieldnames, 0)
-    known = {"latitude": LAT, "longitude": LON, "altitude_amsl": 430}
-    return mavlink.MAVLink_high_latency_message(
-        **fields | known | {"gps_fix_type": 3, "groundspeed": 5}
-    )
-
-
-def narrow2() -> Any:
-    fields = dict.fromkeys(mavlink.MAVLink_high_latency2_message.fieldnames, 0)
-    return mavlink.MAVLink_high_latency2_message(
-        **fields | {"latitude": LAT, "longitude": LON, "altitude": 430, "groundspeed": 25}
-    )
+COVARIANCE = mavlink.MAVLink_global_position_int_cov_message(
+    0, 1, LAT, LON, 430_000, 0, 1.0, 0.0, 0.0, [0.0] * 36
+)
+NARROW = narrow(mavlink.MAVLink_high_latency_message, 5, altitude_amsl=430, gps_fix_type=3)
+NARROW2 = narrow(mavlink.MAVLink_high_latency2_message, 25, altitude=430)
 
 
 def local(north_m: float, east_m: float = 0.0) -> Any:
@@ -87,8 +68,8 @@ HERE = (47.0, 8.5, 430.0)
 @pytest.mark.parametrize(
     ("messages", "speed_mps"),
     [
-        ([fused()], 1.0), ([covariance()], 1.0), ([raw()], 2.5), ([raw(2)], 2.5), ([raw2()], 2.5),
-        ([narrow()], 5.0), ([narrow2()], 5.0), ([frame_origin(), local(0.0)], 5.0),
+        ([fused()], 1.0), ([COVARIANCE], 1.0), ([raw()], 2.5), ([raw(2)], 2.5), ([raw2()], 2.5),
+        ([NARROW], 5.0), ([NARROW2], 5.0), ([frame_origin(), local(0.0)], 5.0),
         ([local(0.0), frame_origin()], 5.0),
     ],
     ids=["fused", "covariance", "GPS", "2D", "second GPS", "narrow", "narrow 2", "local",
@@ -97,10 +78,10 @@ HERE = (47.0, 8.5, 430.0)
 def test_position_is_read_of_every_message_that_holds_one(
     messages: list[Any], speed_mps: float
 ) -> None:
-    assert positions([(VEHICLE, m) for m in messages]) == [HERE]
-    (speed,) = (m.position.groundspeed_mps for m in read([(VEHICLE, m) for m in messages])
-                if m.position is not None)  # fmt: skip
-    assert speed == pytest.approx(speed_mps)
+    sent = [(VEHICLE, message) for message in messages]
+    assert positions(sent) == [HERE]
+    (found,) = (message.position for message in read(sent) if message.position is not None)
+    assert found.groundspeed_mps == pytest.approx(speed_mps)
 
 
 @pytest.mark.parametrize(
