@@ -30,11 +30,10 @@ from tests.kit.ground_station import (
     item,
     kinds,
     load_parameters,
-    of_kind,
     request_item,
     upload,
 )
-from tests.kit.mavlink import KEY, packed
+from tests.kit.mavlink import KEY, frame_with, numbered, packed, read_back
 
 RADIO = 99
 """Client that leads to the vehicle."""
@@ -63,6 +62,8 @@ class CachedLink:
         self.next_due_us = self.cache.next_due_us
         self.remove_client = self.cache.remove_client
         self.mav = mavlink.MAVLink(None)
+        self.first = GroundStation(self, clock)
+        self.second = GroundStation(self, clock, client_id=8, system_id=254)
         self.report(30_000)
 
     def report(self, boot_ms: int) -> list[Outgoing]:
@@ -86,17 +87,30 @@ class CachedLink:
     def poll(self, now_us: int) -> list[Outgoing]:
         return self.cache.poll(now_us)
 
+    def ask(self, message: Any, *, signed: bool = False) -> tuple[list[Outgoing], bool]:
+        """Ask the cache as a station; return its answers, and whether it passes the request on."""
+        frame = frame_of(packed(message, 255, 190, signing=SIGNING if signed else None))
+        answers, passed = self.cache.handle(7, frame, self.clock.now_us, may_answer=True)
+        assert passed in (None, frame)
+        return answers, passed is not None
+
+    def kept(self) -> str:
+        return self.cache.describe(1, self.clock.now_us)
+
+    def passed(self) -> list[str]:
+        """Return the kinds of messages that went over the link since the last call."""
+        found = [message.get_type() for message in self.up]
+        self.up.clear()
+        return found
+
     def _ask(self, data: bytes, now_us: int) -> list[Any]:
         """Return all answers of the vehicle, of a list too."""
         found = self.vehicle.handle(Incoming(RADIO, data, trusted=True), now_us)
         for turn in range(35):
             found += self.vehicle.poll(now_us + turn * 10_000)
         kept = ("PARAM_VALUE", "MISSION_", "COMMAND_ACK", "AUTOPILOT_VERSION", "FILE_", "COMPON")
-        return [
-            each
-            for each in found
-            if isinstance(each, Outgoing) and (MESSAGE_NAMES[each.message_id]).startswith(kept)
-        ]
+        frames = [each for each in found if isinstance(each, Outgoing)]
+        return [each for each in frames if MESSAGE_NAMES[each.message_id].startswith(kept)]
 
     def _receive(self, sent: Iterable[Outgoing]) -> list[Outgoing]:
         found = []
@@ -119,103 +133,92 @@ def link(clock: ManualClock) -> CachedLink:
     return CachedLink(clock)
 
 
-@pytest.fixture
-def first(link: CachedLink, clock: ManualClock) -> GroundStation:
-    return GroundStation(link, clock)
+ITEMS = [item(i) for i in range(3)]
+OTHER_ITEMS = [item(i, param1=9.0) for i in range(3)]
 
 
-@pytest.fixture
-def second(link: CachedLink, clock: ManualClock) -> GroundStation:
-    return GroundStation(link, clock, client_id=8, system_id=254)
+def value(name: bytes, number: float, count: int = 1, index: int = 0) -> Any:
+    return mavlink.MAVLink_param_value_message(name, number, 9, count, index)
 
 
-def test_second_station_gets_parameters_and_missions_without_the_link(
-    link: CachedLink, first: GroundStation, second: GroundStation
-) -> None:
-    values = load_parameters(first)
+def request_value(name: str, index: int = -1) -> Any:
+    return mavlink.MAVLink_param_request_read_message(1, 1, name.encode(), index)
+
+
+def request_list(component: int = 1, system: int = 1) -> Any:
+    return mavlink.MAVLink_param_request_list_message(system, component)
+
+
+def test_second_station_gets_parameters_and_missions_without_the_link(link: CachedLink) -> None:
+    values = load_parameters(link.first)
     items = {kind: [item(i, kind) for i in range(5)] for kind in (MISSION, FENCE)}
     items[FENCE] = [item(i, FENCE, param1=5.0, z=0.0) for i in range(5)]
     for kind, sent in items.items():
-        assert upload(first, sent, kind) == mavlink.MAV_MISSION_ACCEPTED
-    first.request(VERSION)
+        assert upload(link.first, sent, kind) == mavlink.MAV_MISSION_ACCEPTED
+    link.first.request(VERSION)
     link.up.clear()
-    assert load_parameters(second) == values
+    assert load_parameters(link.second) == values
     for kind, sent in items.items():
-        assert [content(each) for each in download(second, kind)] == [*map(content, sent)]
-    assert kinds(second.request(VERSION)) == ["COMMAND_ACK", "AUTOPILOT_VERSION"]
+        assert [content(each) for each in download(link.second, kind)] == [*map(content, sent)]
+    assert kinds(link.second.request(VERSION)) == ["COMMAND_ACK", "AUTOPILOT_VERSION"]
     assert link.up == []
     text = link.cache.describe(1, link.clock.now_us + 4_000_000)
     assert f"parameters ({len(values)}) 4 s" in text
     assert "mission (5)" in text
 
 
-def test_downloaded_mission_is_kept_and_its_end_is_passed_on(
-    link: CachedLink, first: GroundStation, second: GroundStation
-) -> None:
+def test_downloaded_mission_is_kept_and_its_end_is_passed_on(link: CachedLink) -> None:
     link.may_answer = False
-    upload(first, [item(i) for i in range(3)])
+    upload(link.first, ITEMS)
     link.cache.remove(1)
     link.report(31_000)
     link.may_answer = True
-    download(first)
-    assert [each.get_type() for each in link.up][-1] == "MISSION_ACK"
-    link.up.clear()
-    assert len(download(second)) == 3
-    assert link.up == []
+    download(link.first)
+    assert link.passed()[-1] == "MISSION_ACK"
+    assert len(download(link.second)) == 3
+    assert link.passed() == []
 
 
-def test_end_of_a_download_is_passed_on_if_its_mission_was_dropped(
-    link: CachedLink, first: GroundStation, second: GroundStation
-) -> None:
-    upload(first, [item(i) for i in range(3)])
-    first.send(mavlink.MAVLink_mission_request_list_message(1, 1))
-    assert [each.get_type() for each in link.up][-1] != "MISSION_REQUEST_LIST"
+def test_end_of_a_download_is_passed_on_if_its_mission_was_dropped(link: CachedLink) -> None:
+    upload(link.first, ITEMS)
+    link.first.send(mavlink.MAVLink_mission_request_list_message(1, 1))
+    assert link.passed()[-1] != "MISSION_REQUEST_LIST"
     restart(link)
-    download(first)
-    assert [each.get_type() for each in link.up][-1] == "MISSION_ACK"
+    download(link.first)
+    assert link.passed()[-1] == "MISSION_ACK"
 
 
-def test_written_parameter_is_kept_when_it_is_confirmed(
-    link: CachedLink, first: GroundStation, second: GroundStation
-) -> None:
-    name = next(iter(load_parameters(first)))
-    before = load_parameters(second)[name]
+def test_written_parameter_is_kept_when_it_is_confirmed(link: CachedLink) -> None:
+    name = next(iter(load_parameters(link.first)))
+    before = load_parameters(link.second)[name]
     link.loses = lambda message: message.get_type() == "PARAM_VALUE"
-    second.set_parameter(name, before)
+    link.second.set_parameter(name, before)
     link.loses = lambda _: False
-    read = mavlink.MAVLink_param_request_read_message(1, 1, name.encode(), -1)
     for passed in (["PARAM_SET", "PARAM_REQUEST_READ"], []):
-        assert [m.param_value for m in first.send(read)] == [before]
-        assert [each.get_type() for each in link.up[-2:]] == passed
-        link.up.clear()
+        assert [m.param_value for m in link.first.send(request_value(name))] == [before]
+        assert link.passed()[-2:] == passed
 
 
 @pytest.mark.parametrize("lost", ["", "MISSION_ACK"])
-def test_upload_replaces_a_mission_when_it_is_accepted(
-    link: CachedLink, first: GroundStation, second: GroundStation, lost: str
-) -> None:
-    upload(first, [item(i) for i in range(3)])
+def test_upload_replaces_a_mission_when_it_is_accepted(link: CachedLink, lost: str) -> None:
+    upload(link.first, ITEMS)
     link.loses = lambda message: message.get_type() == lost
-    upload(second, [item(i) for i in range(4)])
+    upload(link.second, [item(i) for i in range(4)])
     link.loses = lambda _: False
     link.up.clear()
-    assert len(download(first)) == 4
+    assert len(download(link.first)) == 4
     assert bool(link.up) == bool(lost)
 
 
 def restart(link: CachedLink) -> None:
-    link.clock.now_us += 3_000_000
+    link.clock.advance(3.0)
     link.report(2_000)
 
 
 def fly_on(link: CachedLink) -> None:
     for _ in range(20):
-        link.clock.now_us += 1_000_000
+        link.clock.advance(1.0)
         link.report(30_000 + (link.clock.now_us - 100_000_000) // 1000)
-
-
-def fall_silent(link: CachedLink) -> None:
-    link.clock.now_us += 11_000_000
 
 
 def report_version(link: CachedLink) -> None:
@@ -225,51 +228,32 @@ def report_version(link: CachedLink) -> None:
 
 
 def write_file(link: CachedLink) -> None:
-    client = FtpClient(GroundStation(link, link.clock))
+    client = FtpClient(link.second)
     client.ask(mavlink.MAV_FTP_OPCODE_CREATEFILE, b"@MISSION/mission.dat")
 
 
-def calibrate(link: CachedLink) -> None:
-    GroundStation(link, link.clock).send(command(241, 1))
+EVENTS: dict[str, tuple[Callable[[CachedLink], object], bool]] = {
+    "flight goes on": (fly_on, True),
+    "parameters are stored": (lambda link: link.second.send(command(245, 1)), True),
+    "restart": (restart, False),
+    "timeout": (lambda link: link.clock.advance(11.0), False),
+    "another version": (report_version, False),
+    "file is written": (write_file, False),
+    "calibration": (lambda link: link.second.send(command(241, 1)), False),
+    "group of parameters is switched on": (lambda link: link.down(value(b"NEW", 1.0, 3)), False),
+}
 
 
-def store(link: CachedLink) -> None:
-    GroundStation(link, link.clock).send(command(245, 1))
-
-
-def switch_group_on(link: CachedLink) -> None:
-    link.down(mavlink.MAVLink_param_value_message(b"NEW", 1.0, 9, 3, 0))
-
-
-@pytest.mark.parametrize(
-    ("event", "is_kept"),
-    [
-        (fly_on, True),
-        (store, True),
-        (restart, False),
-        (fall_silent, False),
-        (report_version, False),
-        (write_file, False),
-        (calibrate, False),
-        (switch_group_on, False),
-    ],
-)
+@pytest.mark.parametrize(("event", "is_kept"), EVENTS.values(), ids=EVENTS)
 def test_event_decides_whether_answers_stay_valid(
-    link: CachedLink, first: GroundStation, event: Callable[[CachedLink], None], is_kept: bool
+    link: CachedLink, event: Callable[[CachedLink], object], is_kept: bool
 ) -> None:
-    load_parameters(first)
+    load_parameters(link.first)
     event(link)
     link.up.clear()
-    first.inbox.clear()
-    load_parameters(first)
+    link.first.inbox.clear()
+    load_parameters(link.first)
     assert (link.up == []) == is_kept
-
-
-def current(total: int, *ids: int) -> bytes:
-    """Return MISSION_CURRENT with the ids that pymavlink's definition lacks."""
-    payload = struct.pack("<HHBBIII", 0, total, 0, 0, *ids)
-    head = bytes((0xFD, len(payload), 0, 0, 0, 1, 1, 42, 0, 0)) + payload
-    return head + struct.pack("<H", mavlink.x25crc(bytearray(head[1:]) + b"\x1c").crc)
 
 
 @pytest.mark.parametrize(
@@ -282,88 +266,77 @@ def current(total: int, *ids: int) -> bytes:
     ],
 )
 def test_mission_whose_id_changes_is_dropped(
-    link: CachedLink,
-    first: GroundStation,
-    before: tuple[int, ...],
-    after: tuple[int, ...],
-    kept: set[int],
+    link: CachedLink, before: tuple[int, ...], after: tuple[int, ...], kept: set[int]
 ) -> None:
-    upload(first, [item(i) for i in range(3)])
-    upload(first, [item(i, FENCE, param1=3.0, z=0.0) for i in range(3)], FENCE)
-    for ids in (before, after):
-        assert link.cache.add(frame_of(current(*ids)), link.clock.now_us) is None
-    text = link.cache.describe(1, link.clock.now_us)
-    assert {kind for kind, name in ((MISSION, "mission"), (FENCE, "fence")) if name in text} == kept
+    """MISSION_CURRENT has ids that pymavlink's definition lacks."""
+    upload(link.first, ITEMS)
+    upload(link.first, [item(i, FENCE, param1=3.0, z=0.0) for i in range(3)], FENCE)
+    for total, *ids in (before, after):
+        current = frame_with(42, struct.pack("<HHBBIII", 0, total, 0, 0, *ids))
+        assert link.cache.add(frame_of(current), link.clock.now_us) is None
+    names = {MISSION: "mission", FENCE: "fence"}
+    assert {kind for kind, name in names.items() if name in link.kept()} == kept
 
 
-def test_mission_is_dropped_when_home_moves(link: CachedLink, first: GroundStation) -> None:
-    upload(first, [item(i) for i in range(3)])
+def test_mission_is_dropped_when_home_moves(link: CachedLink) -> None:
+    upload(link.first, ITEMS)
     for x, is_kept in ((5, True), (5, True), (6, False)):
         link.down(mavlink.MAVLink_home_position_message(x, 2, 3, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0))
-        assert ("mission" in link.cache.describe(1, link.clock.now_us)) == is_kept
+        assert ("mission" in link.kept()) == is_kept
 
 
-def checksum(value: float) -> Any:
-    return mavlink.MAVLink_param_value_message(b"_HASH_CHECK", value, 5, 3, 0xFFFF)
+def checksum(number: float) -> Any:
+    return value(b"_HASH_CHECK", number, 3, 0xFFFF)
 
 
 @pytest.mark.parametrize("same", [True, False])
-def test_list_is_checked_by_the_checksum_where_one_is_offered(
-    link: CachedLink, first: GroundStation, second: GroundStation, same: bool
-) -> None:
+def test_list_is_checked_by_the_checksum_where_one_is_offered(link: CachedLink, same: bool) -> None:
     """The vehicle here offers none: it is sent in its name."""
     link.down(checksum(4.0))
-    load_parameters(first)
+    load_parameters(link.first)
     link.up.clear()
-    found = second.ask(mavlink.MAVLink_param_request_list_message(1, 0), "PARAM_VALUE")
+    found = link.second.ask(request_list(0), "PARAM_VALUE")
     assert found[0].param_id == "_HASH_CHECK"
     assert [(m.get_type(), m.param_id) for m in link.up] == [("PARAM_REQUEST_READ", "_HASH_CHECK")]
     link.down(checksum(4.0 if same else 5.0))
-    assert [m.get_type() for m in link.up[1:]] == ([] if same else ["PARAM_REQUEST_LIST"])
+    assert link.passed()[1:] == ([] if same else ["PARAM_REQUEST_LIST"])
 
 
-def test_list_for_all_components_is_passed_on_if_others_have_parameters(
-    link: CachedLink, first: GroundStation, second: GroundStation
-) -> None:
-    load_parameters(first)
-    link.down(mavlink.MAVLink_param_value_message(b"CAM", 1.0, 9, 1, 0), component=100)
+def test_list_for_all_components_is_passed_on_if_others_have_parameters(link: CachedLink) -> None:
+    load_parameters(link.first)
+    link.down(value(b"CAM", 1.0), component=100)
     link.up.clear()
-    second.send(mavlink.MAVLink_param_request_list_message(1, 1))
-    assert link.up == []
-    second.send(mavlink.MAVLink_param_request_list_message(1, 0))
-    assert [m.get_type() for m in link.up] == ["PARAM_REQUEST_LIST"]
+    for component, passed in ((1, []), (0, ["PARAM_REQUEST_LIST"])):
+        link.second.send(request_list(component))
+        assert link.passed() == passed
 
 
 @pytest.mark.parametrize("path", [b"@PARAM/param.pck?withdefaults=1", b"/general.json"])
-def test_file_of_metadata_is_read_once_over_the_link(
-    link: CachedLink, first: GroundStation, second: GroundStation, path: bytes
-) -> None:
-    read = FtpClient(first).read(path)
+def test_file_of_metadata_is_read_once_over_the_link(link: CachedLink, path: bytes) -> None:
+    read = FtpClient(link.first).read(path)
     link.up.clear()
-    assert FtpClient(second).read(path) == read
+    assert FtpClient(link.second).read(path) == read
     assert link.up == []
     is_packed = path.startswith(b"@PARAM")
-    first.set_parameter("TUN_ORDER", 3)
-    assert (FtpClient(second).open(path).session, len(link.up)) == (0, 1 + is_packed)
+    link.first.set_parameter("TUN_ORDER", 3)
+    assert (FtpClient(link.second).open(path).session, len(link.up)) == (0, 1 + is_packed)
 
 
 def test_file_whose_end_is_known_but_not_its_middle_is_left_to_the_vehicle(
-    link: CachedLink, first: GroundStation, second: GroundStation
+    link: CachedLink,
 ) -> None:
-    client = FtpClient(first)
+    client = FtpClient(link.first)
     session = client.open(b"/general.json").session
     for offset in (0, 10**6):
         client.ask(Opcode.READ_FILE, session=session, offset=offset, size=100)
     link.up.clear()
-    FtpClient(second).open(b"/general.json")
+    FtpClient(link.second).open(b"/general.json")
     assert len(link.up) == 1
 
 
-def test_other_file_and_its_session_are_left_to_the_vehicle(
-    link: CachedLink, first: GroundStation, second: GroundStation
-) -> None:
-    FtpClient(first).read(b"/general.json")
-    client = FtpClient(second)
+def test_other_file_and_its_session_are_left_to_the_vehicle(link: CachedLink) -> None:
+    FtpClient(link.first).read(b"/general.json")
+    client = FtpClient(link.second)
     client.open(b"/general.json")
     link.up.clear()
     client.open(b"/parameters.json")
@@ -380,27 +353,21 @@ def test_signed_vehicle_is_answered_for_with_its_signature_only(
 ) -> None:
     link.signs = vehicle_signs
     link.report(30_500)
-    link.down(mavlink.MAVLink_param_value_message(b"ONE", 1.0, 9, 1, 0))
-    listing = mavlink.MAVLink_param_request_list_message(1, 1)
-    request = packed(listing, 255, 190, signing=SIGNING if station_signs else None)
-    found, passed = link.cache.handle(7, frame_of(request), link.clock.now_us, may_answer=True)
-    assert (len(found) == 1, passed is None) == (is_answered, is_answered)
+    link.down(value(b"ONE", 1.0))
+    found, is_passed = link.ask(request_list(), signed=station_signs)
+    assert (len(found) == 1, not is_passed) == (is_answered, is_answered)
     if vehicle_signs and is_answered:
-        reader = mavlink.MAVLink(None)
-        reader.signing.secret_key, reader.signing.timestamp = KEY, 1
-        assert reader.decode(bytearray(found[0].frame)).param_id == "ONE"
+        assert read_back(found[0].frame, KEY).param_id == "ONE"
 
 
-def test_station_that_bypasses_the_cache_still_invalidates_it(
-    link: CachedLink, first: GroundStation, second: GroundStation
-) -> None:
-    name = next(iter(load_parameters(first)))
+def test_station_that_bypasses_the_cache_still_invalidates_it(link: CachedLink) -> None:
+    name = next(iter(load_parameters(link.first)))
     link.may_answer = False
     link.loses = lambda message: message.get_type() == "PARAM_VALUE"
-    second.set_parameter(name, 1.0)
+    link.second.set_parameter(name, 1.0)
     link.may_answer, link.loses = True, lambda _: False
     link.up.clear()
-    first.send(mavlink.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
+    link.first.send(request_value(name))
     assert len(link.up) == 1
 
 
@@ -410,81 +377,66 @@ def test_kept_bytes_and_vehicles_are_bounded(
     monkeypatch.setattr(live_answers, "MAX_BYTES", 400)
     monkeypatch.setattr(answer_cache, "MAX_VEHICLES", 3)
     for index in range(100):
-        link.down(mavlink.MAVLink_param_value_message(f"P{index}".encode(), 1.0, 9, 100, index))
-    assert link.cache._entries[1].live.size < 500
+        link.down(value(b"P%d" % index, 1.0, 100, index))
+    assert sum(not link.ask(request_value(f"P{index}"))[1] for index in range(100)) == 11
     for system in range(2, 9):
-        frame = packed(mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0), system)
-        link.cache.add(frame_of(frame), link.clock.now_us + system)
-    assert list(link.cache._entries) == [6, 7, 8]
+        link.cache.add(numbered(system, 0, value(b"P", 1.0)), link.clock.now_us + system)
+    now_us = link.clock.now_us
+    assert [i for i in range(9) if link.cache.describe(i, now_us)] == [6, 7, 8]
 
 
 def test_damaged_or_foreign_requests_are_passed_on(link: CachedLink) -> None:
-    for message in (
-        mavlink.MAVLink_param_request_list_message(2, 1),
-        mavlink.MAVLink_param_request_list_message(1, 100),
-    ):
-        frame = frame_of(packed(message, 255, 190))
-        found = link.cache.handle(7, frame, link.clock.now_us, may_answer=True)
-        assert found == ([], frame)
+    for message in (request_list(1, system=2), request_list(100)):
+        assert link.ask(message) == ([], True)
 
 
 def test_confirmation_without_index_keeps_the_index_of_a_parameter(link: CachedLink) -> None:
-    values = [mavlink.MAVLink_param_value_message(b"P%d" % i, i, 9, 3, i) for i in range(3)]
-    for message in values:
-        link.down(message)
-    link.down(mavlink.MAVLink_param_value_message(b"P1", 8.0, 9, 3, 0xFFFF))
-    request = mavlink.MAVLink_param_request_read_message(1, 1, b"", 1)
-    frame = frame_of(packed(request, 255, 190))
-    [answer], passed = link.cache.handle(7, frame, link.clock.now_us, may_answer=True)
-    [read] = of_kind([answer], "PARAM_VALUE")
-    assert (read.param_id, read.param_index, read.param_value, passed) == ("P1", 1, 8.0, None)
+    for index in range(3):
+        link.down(value(b"P%d" % index, index, 3, index))
+    link.down(value(b"P1", 8.0, 3, 0xFFFF))
+    [answer], is_passed = link.ask(request_value("", 1))
+    read = read_back(answer.frame)
+    assert (read.param_id, read.param_index, read.param_value, is_passed) == ("P1", 1, 8.0, False)
 
 
-def test_upload_is_kept_without_the_items_of_another_station(
-    link: CachedLink, first: GroundStation, second: GroundStation
-) -> None:
-    sent = [item(i) for i in range(3)]
-    first.send(count(3, MISSION))
-    for each in sent[:2]:
-        first.send(each)
-    for i in range(3):
-        second.send(item(i, param1=9.0))
-    assert kinds(first.send(sent[2])) == ["MISSION_ACK"]
-    assert [content(each) for each in download(second)] == [*map(content, sent)]
+def test_upload_is_kept_without_the_items_of_another_station(link: CachedLink) -> None:
+    for message in (count(3, MISSION), *ITEMS[:2]):
+        link.first.send(message)
+    for message in OTHER_ITEMS:
+        link.second.send(message)
+    assert kinds(link.first.send(ITEMS[2])) == ["MISSION_ACK"]
+    assert [content(each) for each in download(link.second)] == [*map(content, ITEMS)]
 
 
-def test_mission_of_a_download_that_an_upload_interrupts_is_not_mixed(
-    link: CachedLink, first: GroundStation, second: GroundStation
-) -> None:
-    upload(first, [item(i) for i in range(3)])
+def test_mission_of_a_download_that_an_upload_interrupts_is_not_mixed(link: CachedLink) -> None:
+    upload(link.first, ITEMS)
     link.may_answer = False
-    first.send(mavlink.MAVLink_mission_request_list_message(1, 1, MISSION))
+    link.first.send(mavlink.MAVLink_mission_request_list_message(1, 1, MISSION))
     for seq in (0, 1):
-        first.send(request_item(seq, MISSION))
-    sent = [item(i, param1=9.0) for i in range(3)]
-    upload(second, sent)
-    first.send(request_item(2, MISSION))
+        link.first.send(request_item(seq, MISSION))
+    upload(link.second, OTHER_ITEMS)
+    link.first.send(request_item(2, MISSION))
     link.may_answer = True
-    assert [content(each) for each in download(second)] == [*map(content, sent)]
+    assert [content(each) for each in download(link.second)] == [*map(content, OTHER_ITEMS)]
 
 
 def test_parameter_that_changes_while_no_more_can_be_kept_is_not_answered(
-    link: CachedLink, first: GroundStation, monkeypatch: pytest.MonkeyPatch
+    link: CachedLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    values = load_parameters(first)
-    name = next(iter(values)).encode()
+    values = load_parameters(link.first)
+    name = next(iter(values))
     monkeypatch.setattr(live_answers, "MAX_BYTES", 0)
-    link.down(mavlink.MAVLink_param_value_message(name, 7.5, 9, len(values), 0xFFFF))
+    link.down(value(name.encode(), 7.5, len(values), 0xFFFF))
     link.up.clear()
-    first.send(mavlink.MAVLink_param_request_read_message(1, 1, name, -1))
-    assert kinds(link.up) == ["PARAM_REQUEST_READ"]
+    link.first.send(request_value(name))
+    assert link.passed() == ["PARAM_REQUEST_READ"]
 
 
 def test_items_of_unfinished_transfers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_answers, "MAX_BYTES", 1000)
     live = LiveAnswers(1)
     for kind in (77, MISSION):
-        live.add(frame_of(packed(mavlink.MAVLink_mission_count_message(255, 0, 65535, kind))), 0)
+        live.add(numbered(1, 0, mavlink.MAVLink_mission_count_message(255, 0, 65535, kind)), 0)
         for i in range(100):
-            live.add(frame_of(packed(item(i, mission_type=kind))), 0)
+            live.add(numbered(1, 0, item(i, mission_type=kind)), 0)
     assert live.size == pytest.approx(1025, abs=25)
