@@ -28,10 +28,8 @@ from gateway.recordings.formats.maps import (
 from gateway.recordings.positions import TrackPoint
 from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import TableNote, block_of
-from gateway.recordings.tlog import TlogRecord
 from gateway.records import NavFlags
-from tests.kit.mavlink import packed
-from tests.kit.recordings import START_US, messages_of
+from tests.kit.recordings import SECOND_US, Sent, messages_of, records_sent
 from tests.recordings.flights import fly, make_flight, read
 
 POINTS = [
@@ -137,9 +135,9 @@ def test_elements_are_those_of_the_schema_in_its_sequence(
         assert modes == {"absolute" if math.isfinite(alt_m) else "clampToGround"}
 
 
-def test_map_without_points_is_valid_xml() -> None:
-    ET.fromstring("".join(to_kml("x", [])))
-    ET.fromstring("".join(to_gpx("x", [])))
+@pytest.mark.parametrize("write", [to_kml, to_gpx])
+def test_map_without_points_is_valid_xml(write: Callable[..., Iterator[str]]) -> None:
+    ET.fromstring("".join(write("x", [])))
 
 
 @pytest.mark.parametrize("write", [to_kml, to_gpx])
@@ -198,7 +196,6 @@ def test_track_of_one_point_is_a_point_without_an_unknown_height(alt_m: float, l
     assert len(track["geometry"]["coordinates"]) == length
 
 
-SECOND_US = 1_000_000
 ONE, TWO, STATION, OLD_STATION = (1, 1), (7, 1), (255, 190), (42, 190)
 
 
@@ -238,14 +235,8 @@ SAID: list[tuple[tuple[int, int], Any]] = [
 ]
 
 
-def records() -> list[TlogRecord]:
-    return [
-        TlogRecord(START_US + i * SECOND_US, packed(m, *who)) for i, (who, m) in enumerate(SAID)
-    ]
-
-
-def drawn(recorded: list[TlogRecord], system_id: int | None = None) -> list[VehicleTrack]:
-    return tracks_of_messages(messages_of(recorded, DRAWN_IDS, system_id))
+def drawn(sent: Sent = SAID, system_id: int | None = None) -> list[VehicleTrack]:
+    return tracks_of_messages(messages_of(records_sent(sent, SECOND_US), DRAWN_IDS, system_id))
 
 
 def markers(track: VehicleTrack) -> list[tuple[MarkerKind, str]]:
@@ -253,15 +244,15 @@ def markers(track: VehicleTrack) -> list[tuple[MarkerKind, str]]:
 
 
 def test_tracks_are_only_those_of_vehicles() -> None:
-    one, two = drawn(records())
+    one, two = drawn()
     assert (one.name, two.name) == ("system 1", "system 7")
     assert [round(p.lat_deg * 1e7) for p in two.points] == [480_000_000, 480_000_001]
-    assert [track.name for track in drawn(records(), 7)] == ["system 7"]
-    assert drawn(records(), 9) == []
+    assert [track.name for track in drawn(system_id=7)] == ["system 7"]
+    assert drawn(system_id=9) == []
 
 
 def test_points_have_the_attitude_of_their_time() -> None:
-    one, two = drawn(records())
+    one, two = drawn()
     assert one.points[0].attitude_deg == pytest.approx(
         (math.degrees(0.1), math.degrees(-0.2), math.degrees(1.5)), abs=1e-4
     )
@@ -270,13 +261,12 @@ def test_points_have_the_attitude_of_their_time() -> None:
 
 @pytest.mark.parametrize("said", ["Note: lake", "Mark: lake"])
 def test_notes_of_former_recordings_are_notes_too(said: str) -> None:
-    frames = [packed(position(1), *ONE), packed(text(said), *ONE)]
-    (track,) = drawn([TlogRecord(START_US, frame) for frame in frames])
+    (track,) = drawn([(ONE, position(1)), (ONE, text(said))])
     assert (MarkerKind.NOTE, "lake") in markers(track)
 
 
 def test_tracks_of_frames_have_home_marks_and_events() -> None:
-    one, _ = drawn(records())
+    one, _ = drawn()
     assert markers(one) == [
         (MarkerKind.HOME, "Home"),
         (MarkerKind.EVENT, "Attitude valid"),
@@ -293,12 +283,10 @@ def test_tracks_of_frames_have_home_marks_and_events() -> None:
 def test_tracks_of_a_table_have_home_and_notes(rng: np.random.Generator) -> None:
     settings = GatewaySettings().default_aircraft
     header, rows = read(fly(settings, make_flight(rng, 12))[0])
-    rows = [
-        replace(row, gps=msgspec.structs.replace(row.gps, h_acc_m=1.0, satellites=12))
-        if row.gps
-        else row
-        for row in rows
-    ]
+    for k, row in enumerate(rows):
+        if row.gps:
+            fix = msgspec.structs.replace(row.gps, h_acc_m=1.0, satellites=12)
+            rows[k] = replace(row, gps=fix)
     mark = TableNote(rows[-1].time_us, "over the gate")
     (track,) = tracks_of_table(RecordedTable(header, iter([block_of([*rows, mark])])), settings)
     assert markers(track) == [(MarkerKind.HOME, "Home"), (MarkerKind.NOTE, "over the gate")]

@@ -10,10 +10,10 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.geometry.quaternion import to_euler
 from gateway.recordings.columns import Imported, TableRow, row_of_cells
 from gateway.recordings.formats.mavlink import AutopilotReader
-from gateway.recordings.tlog import TlogScanner, encode_record
+from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuCalibrated, ImuFlags, NavFlags, NavState
 from tests.kit.mavlink import packed
-from tests.kit.recordings import START_US, senders_of
+from tests.kit.recordings import START_US, make_tlog, records_sent, senders_of
 
 G = 9.80665
 Message = Any
@@ -41,10 +41,11 @@ def position(time_ms: int, vz_cmps: int) -> Message:
     )
 
 
-def rows_of(reader: AutopilotReader, frames: list[tuple[int, bytes]], chunk: int) -> list[TableRow]:
+def rows_of(
+    reader: AutopilotReader, records: list[TlogRecord], chunk: int = 1 << 20
+) -> list[TableRow]:
     """Read a recording in chunks of so many bytes."""
-    scanner = TlogScanner(strict=True)
-    data = b"".join(encode_record(time_us, frame) for time_us, frame in frames)
+    scanner, data = TlogScanner(strict=True), make_tlog(records)
     cells = [
         reader.feed(scanner.feed(data[begin : begin + chunk], final=begin >= len(data)))
         for begin in range(0, len(data) + chunk, chunk)
@@ -54,15 +55,16 @@ def rows_of(reader: AutopilotReader, frames: list[tuple[int, bytes]], chunk: int
     return [row_of_cells(row, vehicle_id) for rows in cells for row in rows.tolist()]
 
 
-def read(
-    messages: list[tuple[int, Message]], system_id: int = 1, component_id: int = 1
-) -> list[Imported]:
+def read(messages: list[tuple[int, Message]], component_id: int = 1) -> list[Imported]:
     """Return what is read, in the order of the rows."""
-    mav = mavlink.MAVLink(None, system_id, component_id)
-    frames = [(START_US + at_us, bytes(message.pack(mav))) for at_us, message in messages]
-    rows = rows_of(AutopilotReader(), frames, 1 << 20)
+    records = [TlogRecord(START_US + at_us, packed(m, 1, component_id)) for at_us, m in messages]
+    rows = rows_of(AutopilotReader(), records)
     held = [record for row in rows for record in (row.baro, row.gps, row.state, row.imu)]
     return [record for record in held if record is not None]
+
+
+def fixes_of(messages: list[tuple[int, Message]]) -> list[GpsFix]:
+    return [r for r in read([(0, raw(0)), *messages]) if isinstance(r, GpsFix)]
 
 
 def test_highres_imu_is_read_in_si_units() -> None:
@@ -107,11 +109,7 @@ def test_pressure_is_converted_to_pascal() -> None:
 
 def test_velocity_of_a_fix_is_from_its_course_and_the_climb_of_the_position() -> None:
     climb = (100_000, position(100, vz_cmps=-500))
-    first, second = read([(0, raw(0)), (0, gps(1_000)), climb, (200_000, gps(201_000, 431_000))])[
-        1:
-    ]
-    assert isinstance(first, GpsFix)
-    assert isinstance(second, GpsFix)
+    first, second = fixes_of([(0, gps(1_000)), climb, (200_000, gps(201_000, 431_000))])
     assert (first.lat_dege7, first.lon_dege7) == (471_000_000, 85_000_000)
     assert first.fix_type is GpsFixType.FIX_3D
     assert first.pdop == pytest.approx(1.2)
@@ -122,15 +120,13 @@ def test_velocity_of_a_fix_is_from_its_course_and_the_climb_of_the_position() ->
 
 
 def test_message_without_a_fix_is_not_ok() -> None:
-    (fix,) = read([(0, raw(0)), (0, gps(0, fix=1))])[1:]
-    assert isinstance(fix, GpsFix)
+    (fix,) = fixes_of([(0, gps(0, fix=1))])
     assert not fix.fix_ok
 
 
 def test_other_systems_and_components_are_ignored() -> None:
     assert read([(0, raw(0))], component_id=191) == []
-    frame = packed(raw(0))
-    assert rows_of(AutopilotReader(system_id=2), [(START_US, frame)], 100) == []
+    assert rows_of(AutopilotReader(system_id=2), records_sent([((1, 1), raw(0))])) == []
 
 
 def test_clock_never_decreases_for_any_message_times() -> None:
@@ -171,10 +167,6 @@ def test_fix_without_a_time_follows_the_imu_despite_clock_drift() -> None:
     assert fixes == [*range(4_000, 4_000_000, 200_000)]
 
 
-def fixes_of(messages: list[tuple[int, Message]]) -> list[GpsFix]:
-    return [r for r in read([(0, raw(0)), *messages]) if isinstance(r, GpsFix)]
-
-
 @pytest.mark.parametrize(("age_us", "is_known"), [(500_000, True), (500_001, False)])
 def test_climb_rate_is_unknown_once_it_is_outdated(age_us: int, is_known: bool) -> None:
     (fix,) = fixes_of([(0, position(0, -150)), (age_us, gps(age_us))])
@@ -184,9 +176,7 @@ def test_climb_rate_is_unknown_once_it_is_outdated(age_us: int, is_known: bool) 
 def test_climb_rate_is_unknown_after_a_lost_fix() -> None:
     """Without a fix the height may be zero: found again, 484 m would be a climb of 968 m/s."""
     heights = [(484_000, 3), (0, 1), (484_000, 3), (484_500, 3)]
-    flight: list[tuple[int, Message]] = []
-    for n, (alt_mm, fix) in enumerate(heights):
-        flight += [(n * 500_000, gps(n * 500_000 + 1, alt_mm, fix))]
+    flight = [(n * 500_000, gps(n * 500_000 + 1, *height)) for n, height in enumerate(heights)]
     assert [math.isfinite(fix.vel_n_mps[2]) for fix in fixes_of(flight)] == [False] * 4
     lost = fixes_of(flight)[1]
     assert not any(map(math.isfinite, lost.vel_n_mps))
@@ -222,10 +212,10 @@ def test_states_of_the_autopilot_are_read() -> None:
     assert stale.time_us == 600_000, "of two the newer"
 
 
-def recorded(seed: int) -> list[tuple[int, bytes]]:
+def recorded(seed: int) -> list[TlogRecord]:
     """Make messages of two autopilots and a station in any order, with decreasing times too."""
     chance, records, at_us = random.Random(seed), [], 0
-    links = [mavlink.MAVLink(None, *sender) for sender in ((1, 1), (1, 1), (1, 1), (2, 1), (1, 5))]
+    senders = ((1, 1), (1, 1), (1, 1), (2, 1), (1, 5))
     for _ in range(600):
         at_us += chance.choice((0, 4, 1000, 20_000, -30_000, 700_000))
         own_ms = max(0, at_us) // 1000
@@ -241,10 +231,9 @@ def recorded(seed: int) -> list[tuple[int, bytes]]:
                 mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3),
             )
         )
-        link = chance.choice(links)
-        version_1 = chance.random() < 0.2
-        frame = bytes(message.pack(link, force_mavlink1=version_1))
-        records.append((START_US + at_us, frame))
+        version = chance.choice((1, 2, 2, 2, 2))
+        frame = packed(message, *chance.choice(senders), version=version)
+        records.append(TlogRecord(START_US + at_us, frame))
     return records
 
 
@@ -252,26 +241,23 @@ def recorded(seed: int) -> list[tuple[int, bytes]]:
 def test_rows_do_not_depend_on_the_size_of_the_batches(seed: int) -> None:
     records = recorded(seed)
     whole = AutopilotReader()
-    expected = [repr(row) for row in rows_of(whole, records, 1 << 20)]
+    expected = [repr(row) for row in rows_of(whole, records)]
     assert len(expected) > 20
     for size in (60, 300, 5000):
         reader = AutopilotReader()
         assert [repr(row) for row in rows_of(reader, records, size)] == expected
-        assert (reader.system_id, reader.unix_us_at_zero) == (
-            whole.system_id,
-            whole.unix_us_at_zero,
-        )
+        assert reader.system_id == whole.system_id
+        assert reader.unix_us_at_zero == whole.unix_us_at_zero
 
 
 def test_samples_are_those_of_the_autopilots_component() -> None:
-    sent: list[tuple[tuple[int, int], Any]] = [
+    sent = [
         ((1, 3), mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)),
         ((1, 3), mavlink.MAVLink_scaled_imu_message(100, 0, 0, -1000, 0, 0, 0, 0, 0, 0)),
         ((1, 1), mavlink.MAVLink_scaled_imu_message(200, 0, 0, -500, 0, 0, 0, 0, 0, 0)),
     ]
-    frames = [(START_US + k * 100_000, packed(m, *who)) for k, (who, m) in enumerate(sent)]
-    data = b"".join(encode_record(time_us, frame) for time_us, frame in frames)
-    (row,) = rows_of(AutopilotReader(1, senders_of(data)), frames, 1 << 20)
+    records = records_sent(sent, 100_000)
+    (row,) = rows_of(AutopilotReader(1, senders_of(make_tlog(records))), records)
     assert row.imu is not None
     assert row.imu.accel_b_mps2[2] == pytest.approx(-9.80665)
 
@@ -283,7 +269,7 @@ def test_position_before_the_fix_is_no_state_of_the_autopilot() -> None:
         mavlink.MAVLink_attitude_message(160, 0.1, 0.2, 0.3, 0, 0, 0),
         mavlink.MAVLink_scaled_imu_message(200, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
     ]
-    frames = [(START_US + k * 10_000, packed(message)) for k, message in enumerate(sent)]
-    *_, row = rows_of(AutopilotReader(), frames, 1 << 20)
+    records = records_sent([((1, 1), message) for message in sent], 10_000)
+    *_, row = rows_of(AutopilotReader(), records)
     assert row.state is not None
     assert NavFlags.POSITION_VALID not in row.state.flags

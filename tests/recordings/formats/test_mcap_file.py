@@ -15,10 +15,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import rotate
 from gateway.recordings.convert import WRITERS, FlightToWrite
-from gateway.recordings.tlog import TlogRecord
 from tests.kit.cli import invoke
-from tests.kit.mavlink import packed
-from tests.kit.recordings import START_US, make_tlog
+from tests.kit.recordings import records_sent, write_tlog
 from tests.recordings.flights import OPTIONS
 from tests.recordings.formats import flown
 
@@ -133,14 +131,13 @@ def test_every_message_of_a_tlog_is_written(tmp_path: Path) -> None:
         (one, mavlink.MAVLink_param_value_message(b"RATE", 1.5, 9, 3, 0)),
     ]
     senders = {one: (3, 1), station: (255, 190)}
-    said = [(packed(m, *senders[sender]), sender + m.msgname) for sender, m in messages]
-    records = [TlogRecord(START_US + k * 1000, frame) for k, (frame, _) in enumerate(said)]
-    path = tmp_path / "a.tlog"
-    path.write_bytes(make_tlog(records))
+    records = records_sent([(senders[sender], m) for sender, m in messages])
+    path = write_tlog(tmp_path / "a.tlog", records)
     invoke("convert", path, "-o", tmp_path / "a.mcap", code=0)
     found = messages_of(tmp_path / "a.mcap")
     raw = [(topic, ns) for topic, _, ns, _ in found if topic.startswith("/mavlink")]
-    assert raw == [(topic, (START_US + k * 1000) * 1000) for k, (_, topic) in enumerate(said)]
+    topics = [sender + m.msgname for sender, m in messages]
+    assert raw == [(t, 1000 * r.time_us) for t, r in zip(topics, records, strict=True)]
     content = {topic: content for topic, _, _, content in found}
     assert content["/mavlink/3/1/ATTITUDE"]["pitch"] is None
     assert content["/mavlink/3/1/ATTITUDE"]["roll"] == 0.5

@@ -5,26 +5,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fastcrc.crc16 import mcrf4xx
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.tlog import Batch, TlogScanner, columns_of, encode_record
-from gateway.wire.mavlink_messages import CRC_EXTRA, layout_of
+from gateway.recordings.tlog import Batch, columns_of
+from gateway.wire.mavlink_messages import layout_of
+from tests.kit.mavlink import frame_with
+from tests.kit.recordings import batch_of, records_of
 
 KINDS = sorted(mavlink.mavlink_map.items())
 FRAMES = 3
-
-
-def frame_of(message_id: int, payload: bytes, version: int) -> bytes:
-    """Make a frame of any payload bytes."""
-    if version == 1:
-        head = bytes((0xFE, len(payload), 7, 1, 1, message_id))
-    else:
-        head = bytes((0xFD, len(payload), 0, 0, 7, 1, 1)) + message_id.to_bytes(3, "little")
-    crc: int = mcrf4xx(CRC_EXTRA[message_id], mcrf4xx(head[1:] + payload))
-    return head + payload + crc.to_bytes(2, "little")
 
 
 def some_frames(message_id: int, kind: Any, chance: random.Random) -> list[bytes]:
@@ -34,13 +25,12 @@ def some_frames(message_id: int, kind: Any, chance: random.Random) -> list[bytes
     for _ in range(FRAMES):
         length = chance.choice((size, chance.randint(1, size)))
         version = chance.choice((1, 2)) if message_id < 256 else 2
-        frames.append(frame_of(message_id, chance.randbytes(length), version))
+        frames.append(frame_with(message_id, chance.randbytes(length), version=version))
     return frames
 
 
-def batch_of(frames: list[bytes]) -> Batch:
-    data = b"".join(encode_record(1_700_000_000_000_000 + i, f) for i, f in enumerate(frames))
-    batch = TlogScanner().feed(data, final=True)
+def scanned(frames: list[bytes]) -> Batch:
+    batch = batch_of(records_of(frames))
     assert len(batch) == len(frames)
     return batch
 
@@ -52,7 +42,7 @@ def test_columns_of_every_message_match_pymavlink(seed: int) -> None:
     link = mavlink.MAVLink(None)
     for message_id, kind in KINDS:
         frames = some_frames(message_id, kind, chance)
-        rows = columns_of(batch_of(frames), np.arange(FRAMES), kind.id)
+        rows = columns_of(scanned(frames), np.arange(FRAMES), kind.id)
         for frame, row in zip(frames, rows, strict=True):
             message = link.decode(bytearray(frame))
             for name in kind.ordered_fieldnames:
@@ -62,19 +52,17 @@ def test_columns_of_every_message_match_pymavlink(seed: int) -> None:
                     assert row[name] == expected.rstrip(b"\0"), (kind.msgname, name)
                 else:
                     expected = getattr(message, name)
-                    assert np.array_equal(row[name].tolist(), expected, equal_nan=True), (
-                        kind.msgname,
-                        name,
-                    )
+                    same = np.array_equal(row[name].tolist(), expected, equal_nan=True)
+                    assert same, (kind.msgname, name)
 
 
 def test_only_requested_frames_are_read() -> None:
     kind = mavlink.MAVLink_heartbeat_message
-    frames = [frame_of(0, bytes([n, 0, 0, 0, 6]), 2) for n in range(4)]
-    rows = columns_of(batch_of(frames), np.array([1, 3]), kind.id)
+    frames = [frame_with(0, bytes([n, 0, 0, 0, 6])) for n in range(4)]
+    rows = columns_of(scanned(frames), np.array([1, 3]), kind.id)
     assert rows["custom_mode"].tolist() == [1, 3]
     assert rows["mavlink_version"].tolist() == [0, 0]
-    assert len(columns_of(batch_of(frames), np.array([], np.int64), kind.id)) == 0
+    assert len(columns_of(scanned(frames), np.array([], np.int64), kind.id)) == 0
 
 
 @pytest.mark.parametrize("message_id", [0, 30, 331])
@@ -82,7 +70,5 @@ def test_extra_fields_at_the_end_are_ignored(message_id: int) -> None:
     """A later dialect may have added fields at the end."""
     kind = mavlink.mavlink_map[message_id]
     payload = bytes(range(1, layout_of(kind.id).itemsize + 1))
-    rows = columns_of(
-        batch_of([frame_of(message_id, payload + b"\7\7", 2)]), np.array([0]), kind.id
-    )
+    rows = columns_of(scanned([frame_with(message_id, payload + b"\7\7")]), np.array([0]), kind.id)
     assert rows.tobytes() == payload
