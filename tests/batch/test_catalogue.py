@@ -3,7 +3,11 @@ import json
 import os
 import re
 import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from functools import partial
 from pathlib import Path, PurePath
+from shutil import copy
 from typing import Any
 
 import numpy as np
@@ -31,11 +35,12 @@ from gateway.batch.facts import FlightFacts, FlightTally, simplified
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.positions import TrackPoint
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
+from gateway.recordings.tlog import TlogRecord
 from gateway.units import US_PER_S
 from tests.batch.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
 from tests.kit.cli import invoke
 from tests.kit.mavlink import packed
+from tests.kit.recordings import make_records, make_tlog, write_tlog
 
 pytestmark = pytest.mark.io
 
@@ -53,7 +58,7 @@ class InThisProcess(ThisProcess):
         yield from super().run(work, items)
 
 
-def write_tlog(path: Path) -> Path:
+def far_flight() -> list[TlogRecord]:
     """Ten minutes of two vehicles: one flies two sides of a square, the other sends no position."""
     records = []
 
@@ -68,8 +73,9 @@ def write_tlog(path: Path) -> Path:
         north, east = min(second, 300) * 3.5, max(second - 300, 0) * 4.0
         lat, lon = 470_000_000 + round(north / 0.0111319), 80_000_000 + round(east / 0.0075920)
         height = 400_000 + (50_000 if second > 20 else 0)
+        velocity = (350, 0) if second < 300 else (0, 400)
         position = mavlink.MAVLink_global_position_int_message(
-            0, lat, lon, height, 0, 350 if second < 300 else 0, 0 if second < 300 else 400, 0, 0
+            0, lat, lon, height, 0, *velocity, 0, 0
         )
         send(second + 0.1, 1, position)
         fix = 1 if 100 <= second < 110 else 3
@@ -79,9 +85,7 @@ def write_tlog(path: Path) -> Path:
     for number, drop in enumerate((0, 400)):
         status = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 0, 0, 0, drop, 0, 0, 0, 0, 0)
         send(400 + number, 1, status)
-    records.sort(key=lambda record: record.time_us)
-    path.write_bytes(b"".join(encode_record(r.time_us, r.frame) for r in records))
-    return path
+    return sorted(records, key=lambda record: record.time_us)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +94,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("season")
     write_flight(folder / "one_01_v1.csv", vehicle=1, day=0)
     write_flight(folder / "deeper" / "two_01_v2.csv", vehicle=2, day=3, lost=10)
-    write_tlog(folder / "far.tlog")
+    write_tlog(folder / "far.tlog", far_flight())
     (folder / "empty.csv").write_text("")
     (folder / "noise.tlog").write_bytes(bytes(np.random.default_rng(1).integers(0, 255, 5000)))
     (folder / "readme.txt").write_text("no recording")
@@ -142,15 +146,9 @@ def test_tlog_has_one_row_for_each_vehicle(folder: Path) -> None:
 
 
 def test_clock_jump_of_years_is_not_counted_as_duration(tmp_path: Path) -> None:
-    scanner = TlogScanner()
-    batch = scanner.feed(write_tlog(tmp_path / "a.tlog").read_bytes(), final=True)
-    leap_us = 30 * 31_556_952_000_000
-    (tmp_path / "a.tlog").write_bytes(
-        b"".join(
-            encode_record(record.time_us - leap_us * (number < 1000), record.frame)
-            for number, record in enumerate(batch.records())
-        )
-    )
+    records, leap_us = far_flight(), 30 * 31_556_952_000_000
+    records[:1000] = [TlogRecord(r.time_us - leap_us, r.frame) for r in records[:1000]]
+    write_tlog(tmp_path / "a.tlog", records)
     found = read_file(tmp_path, OPTIONS, ("a.tlog", ""))
     (facts, _), (other, _) = found.flights
     assert 590 < facts.duration < 600
@@ -161,7 +159,7 @@ def test_clock_jump_of_years_is_not_counted_as_duration(tmp_path: Path) -> None:
 def test_file_deleted_during_indexing_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    files = [write_tlog(tmp_path / name) for name in ("a.tlog", "b.tlog")]
+    files = [write_tlog(tmp_path / name, make_records(9)) for name in ("a.tlog", "b.tlog")]
     index_folder(tmp_path, OPTIONS, InThisProcess())
     files[0].unlink()
     monkeypatch.setattr(indexing, "recordings_below", lambda _: iter(files))
@@ -173,8 +171,7 @@ def test_file_deleted_during_indexing_is_reported(
 
 @pytest.mark.parametrize("name", ["a.tlog.gz", "packed.tlog"])
 def test_compressed_file_is_recognised_by_its_first_bytes(tmp_path: Path, name: str) -> None:
-    plain = write_tlog(tmp_path / "a.tlog").read_bytes()
-    (tmp_path / name).write_bytes(gzip.compress(plain))
+    (tmp_path / name).write_bytes(gzip.compress(make_tlog(far_flight())))
     found = read_file(tmp_path, OPTIONS, (name, ""))
     assert (found.kind, found.error, len(found.flights)) == ("tlog", None, 2)
     log = tmp_path / "log.bin.gz"
@@ -189,8 +186,7 @@ def test_broken_file_has_a_row_with_the_reason(folder: Path) -> None:
 
 
 def test_file_with_non_utf8_name_and_extreme_mtime_is_indexed(tmp_path: Path, folder: Path) -> None:
-    odd = tmp_path / os.fsdecode(b"fl\xfcg_01_v1.csv")
-    odd.write_bytes((folder / "one_01_v1.csv").read_bytes())
+    odd = copy(folder / "one_01_v1.csv", tmp_path / os.fsdecode(b"fl\xfcg_01_v1.csv"))
     os.utime(odd, (13_000_000_000, 13_000_000_000))
     for read in (1, 0):
         assert index_folder(tmp_path, OPTIONS, InThisProcess()).read == read
@@ -276,15 +272,34 @@ def test_file_that_is_no_catalogue_is_reported(tmp_path: Path) -> None:
         Catalogue(tmp_path)
 
 
+def catalogued(number: int) -> CataloguedFile:
+    return CataloguedFile(f"{number}.csv", f"{number}", None, 1, 2, "d" * 500)
+
+
 def test_catalogue_of_another_version_is_rebuilt(tmp_path: Path) -> None:
     catalogue = Catalogue(tmp_path)
-    catalogue.put([CataloguedFile("a", "a", None, 1, 1, "d", flights=((FlightFacts(), []),))])
-    catalogue._db.execute("PRAGMA user_version = 99")
+    catalogue.put([catalogued(1)])
     catalogue.close()
+    with closing(sqlite3.connect(tmp_path / CATALOGUE_NAME)) as database:
+        database.execute("PRAGMA user_version = 99")
     with pytest.raises(CatalogueError, match="another version"):
         find_flights(tmp_path)
     Catalogue(tmp_path).close()
     assert find_flights(tmp_path) == []
+
+
+Statement = Callable[[sqlite3.Connection, str], object]
+
+
+def watch(patched: pytest.MonkeyPatch, before: Statement) -> None:
+    """Call a function before each statement of connections that are opened from now on."""
+
+    class Watched(sqlite3.Connection):
+        def execute(self, sql: str, *values: Any) -> sqlite3.Cursor:
+            before(self, sql)
+            return super().execute(sql, *values)
+
+    patched.setattr(sqlite3, "connect", partial(sqlite3.connect, factory=Watched))
 
 
 @pytest.mark.parametrize(
@@ -296,37 +311,38 @@ def test_unwritable_catalogue_is_reported_with_advice(
 ) -> None:
     opened = []
 
-    def fail(catalogue: Catalogue) -> None:
-        opened.append(catalogue._db)
-        (tmp_path / CATALOGUE_NAME).touch()
-        error = sqlite3.OperationalError("no luck")
-        error.sqlite_errorcode = code
-        raise error
+    def fail(database: sqlite3.Connection, sql: str) -> None:
+        if sql.startswith("CREATE"):
+            opened.append(database)
+            error = sqlite3.OperationalError("no luck")
+            error.sqlite_errorcode = code
+            raise error
 
-    monkeypatch.setattr(Catalogue, "_make", fail)
+    watch(monkeypatch, fail)
     with pytest.raises(CatalogueError, match=f"no luck; .*{message}"):
         Catalogue(tmp_path)
     with pytest.raises(sqlite3.ProgrammingError, match="closed"):
-        opened[0].execute("SELECT 1")
+        opened[0].total_changes  # noqa: B018
+    assert (tmp_path / CATALOGUE_NAME).exists()
     with pytest.raises(CatalogueError, match="no catalogue yet"):
         find_flights(tmp_path)
 
 
-def catalogued(number: int) -> CataloguedFile:
-    return CataloguedFile(f"{number}.csv", f"{number}", None, 1, 2, "d" * 500)
+def test_catalogue_of_concurrent_indexing_is_kept(tmp_path: Path) -> None:
+    first: list[Catalogue] = []
 
+    def make_first(_: sqlite3.Connection, sql: str) -> None:
+        if sql.startswith("BEGIN") and not first:
+            patched.undo()
+            first.append(Catalogue(tmp_path))
+            first[0].put([catalogued(1)])
 
-def test_catalogue_of_concurrent_indexing_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first = Catalogue(tmp_path)
-    first.put([catalogued(1)])
-    looks, is_made = [False], Catalogue._is_made
-    monkeypatch.setattr(Catalogue, "_is_made", lambda self: looks.pop() if looks else is_made(self))
-    second = Catalogue(tmp_path)
+    with pytest.MonkeyPatch.context() as patched:
+        watch(patched, make_first)
+        second = Catalogue(tmp_path)
     second.put([catalogued(2)])
-    assert second.known().keys() == first.known().keys() == {"1.csv", "2.csv"}
-    for catalogue in (first, second):
+    assert second.known().keys() == first[0].known().keys() == {"1.csv", "2.csv"}
+    for catalogue in (*first, second):
         catalogue.close()
 
 
@@ -395,25 +411,21 @@ def test_figures_add_up_parts_and_keep_folders_apart() -> None:
 
 
 def test_commands_index_list_and_show(tmp_path: Path, folder: Path) -> None:
-    (tmp_path / "one_01_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
-    (tmp_path / "one_02_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
     (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "one_01_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
+    for name in ("one_01_v1.csv", "one_02_v1.csv", "other/one_01_v1.csv"):
+        copy(folder / "one_01_v1.csv", tmp_path / name)
     (tmp_path / "bad.csv").write_text("")
-    done = invoke("catalogue", tmp_path, "--jobs", "1")
-    assert done.exit_code == 0, done.output
+    done = invoke("catalogue", tmp_path, "--jobs", "1", code=0)
     assert "0 unchanged, 3 new, 0 removed, 1 unreadable" in done.output
     listed = invoke("catalogue", "list", "--folder", tmp_path)
     assert "one_01_v1.csv" in listed.output
     assert re.search(r"2 flights, \S+ h, in 4 files; 1 unreadable", listed.output)
-    wanted = ["catalogue", "list", "-d", str(tmp_path), "--json", "--where", "duration > 30"]
-    assert [row["name"] for row in json.loads(invoke(*wanted).output)] == ["one"] * 3
-    one = ["--where", "name = 'one'", "--geojson"]
-    geo = json.loads(invoke("catalogue", "list", "-d", tmp_path, *one).output)
+    wanted = ("catalogue", "list", "-d", tmp_path, "--where")
+    found = json.loads(invoke(*wanted, "duration > 30", "--json").output)
+    assert [row["name"] for row in found] == ["one"] * 3
+    geo = json.loads(invoke(*wanted, "name = 'one'", "--geojson").output)
     assert geo["type"] == "FeatureCollection"
-    refused = invoke("catalogue", "list", "-d", tmp_path, "--where", "nonsense")
-    assert refused.exit_code == 2
-    assert "no such column" in refused.output
+    assert "no such column" in invoke(*wanted, "nonsense", code=2).output
     assert "use `mavgate info`" in invoke("catalogue", "show", "one", code=2).output
 
 
@@ -424,7 +436,7 @@ def test_every_column_is_documented() -> None:
 
 def test_several_processes_give_results_of_one(folder: Path, tmp_path: Path) -> None:
     for name in ("one_01_v1.csv", "far.tlog"):
-        (tmp_path / name).write_bytes((folder / name).read_bytes())
+        copy(folder / name, tmp_path)
     index_folder(tmp_path, OPTIONS, LocalProcesses(2))
     facts = [{k: row[k] for k in FlightFacts.__struct_fields__} for row in find_flights(tmp_path)]
     expected = find_flights(folder, "path in ('one_01_v1.csv', 'far.tlog')")

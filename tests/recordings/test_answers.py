@@ -7,11 +7,9 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.answers import LogAnswers, VehicleAnswers
-from gateway.recordings.tlog import TlogScanner, encode_record
-from gateway.recordings.tlog_index import TlogIndex
-from tests.kit.recordings import START_US
+from tests.kit.mavlink import frame_with, packed, read_back
+from tests.kit.recordings import SECOND_US, START_US, batch_of, index_of, records_of
 
-SECOND_US = 1_000_000
 MISSION = mavlink.MAV_MISSION_TYPE_MISSION
 FENCE = mavlink.MAV_MISSION_TYPE_FENCE
 ACCEPTED = mavlink.MAV_MISSION_ACCEPTED
@@ -20,27 +18,21 @@ ACCEPTED = mavlink.MAV_MISSION_ACCEPTED
 class Day:
     """A link of vehicle 3 and station 255 that is being recorded, a message a second."""
 
-    def __init__(self) -> None:
-        self.vehicle = mavlink.MAVLink(None, 3, 1)
-        self.gimbal = mavlink.MAVLink(None, 3, 154)
-        self.station = mavlink.MAVLink(None, 255, 190)
-        self.data = b""
-        self.count = 0
+    vehicle, gimbal, station = (3, 1), (3, 154), (255, 190)
 
-    def send(self, sender: Any, *messages: Any) -> None:
-        for message in messages:
-            self.data += encode_record(self.now_us, bytes(message.pack(sender)))
-            self.count += 1
+    def __init__(self) -> None:
+        self.frames: list[bytes] = []
+
+    def send(self, origin: tuple[int, int], *messages: Any) -> None:
+        self.frames += [packed(message, *origin) for message in messages]
 
     @property
     def now_us(self) -> int:
-        return START_US + self.count * SECOND_US
+        return START_US + len(self.frames) * SECOND_US
 
     def answers(self, at_us: int | None = None, played_as: int = 3) -> VehicleAnswers:
-        batch = TlogScanner().feed(self.data, final=True)
-        index, found = TlogIndex(), LogAnswers()
-        index.add(batch)
-        found.add(batch, index.senders)
+        batch, found = batch_of(records_of(self.frames, SECOND_US)), LogAnswers()
+        found.add(batch, index_of([batch]).senders)
         time_us = self.now_us if at_us is None else at_us
         return VehicleAnswers(found, 3, played_as, lambda: time_us)
 
@@ -64,12 +56,8 @@ def count_of(items: int, kind: int = MISSION, target: int = 255) -> Any:
     return mavlink.MAVLink_mission_count_message(target, 1, items, kind)
 
 
-def decode(frame: bytes) -> Any:
-    return mavlink.MAVLink(None).decode(bytearray(frame))
-
-
 def test_answers_are_those_of_the_vehicle_whatever_its_component(day: Day) -> None:
-    autopilot = mavlink.MAVLink(None, 3, 7)
+    autopilot = (3, 7)
     day.send(autopilot, mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
     day.send(autopilot, value("ALPHA", 1.0))
     day.send(day.vehicle, mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
@@ -81,7 +69,7 @@ def test_parameters_are_complete_and_renumbered(day: Day) -> None:
     day.send(day.vehicle, value("BETA", 2.0, 7, 900), value("ALPHA", 1.0, 3, 900))
     day.send(day.vehicle, value("GAMMA", 5.0, 65535, 900))
     day.send(day.gimbal, value("GIMBAL", 9.0))
-    found = [decode(frame) for frame in day.answers(played_as=8).parameters().values()]
+    found = [read_back(frame) for frame in day.answers(played_as=8).parameters().values()]
     assert [(m.param_id, m.param_index, m.param_count) for m in found] == [
         ("ALPHA", 0, 3), ("BETA", 1, 3), ("GAMMA", 2, 3),
     ]  # fmt: skip
@@ -92,16 +80,14 @@ def test_parameter_has_its_newest_value_or_the_first_before_any(day: Day) -> Non
     day.send(day.vehicle, value("ALPHA", 1.0), value("ALPHA", 1.0), value("ALPHA", 2.0))
     moments = (START_US - 1, START_US + SECOND_US, START_US + 2 * SECOND_US)
     answers = [day.answers(at_us).parameters()["ALPHA"] for at_us in moments]
-    assert [decode(frame).param_value for frame in answers] == [1.0, 1.0, 2.0]
+    assert [read_back(frame).param_value for frame in answers] == [1.0, 1.0, 2.0]
 
 
 def test_bits_of_a_parameter_value_are_preserved(day: Day) -> None:
     # A signalling NaN as a float: autopilots put the bits of integers there.
     bits = struct.pack("<i", -5_000_000)
-    frame = bytearray(value("COUNT", 1.0).pack(day.vehicle))
-    frame[10:14] = bits
-    crc = mavlink.x25crc(frame[1:-2] + bytes([220])).crc
-    day.data = encode_record(START_US, bytes(frame[:-2]) + struct.pack("<H", crc))
+    payload = bits + packed(value("COUNT", 1.0))[14:-2]
+    day.frames.append(frame_with(mavlink.MAVLINK_MSG_ID_PARAM_VALUE, payload, day.vehicle))
     assert day.answers().parameters()["COUNT"][10:14] == bits
 
 
@@ -109,7 +95,7 @@ def test_complete_download_is_the_mission(day: Day) -> None:
     day.send(day.vehicle, count_of(2), item(0), item(1))
     mission = day.answers().mission(MISSION)
     assert mission is not None
-    assert [decode(frame).x for frame in mission] == [470_000_000, 470_000_001]
+    assert [read_back(frame).x for frame in mission] == [470_000_000, 470_000_001]
 
 
 def test_incomplete_download_is_no_mission(day: Day) -> None:
@@ -134,7 +120,7 @@ def test_mission_and_parameter_set_in_flight_did_not_exist_before(day: Day) -> N
     day.send(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, ACCEPTED, MISSION))
     later, before = day.answers(), day.answers(at_us=set_us)
     assert [sorted(each.parameters()) for each in (later, before)] == [["READ", "SET"], ["READ"]]
-    assert decode(before.parameters()["READ"]).param_value == 1.0
+    assert read_back(before.parameters()["READ"]).param_value == 1.0
     assert (len(later.mission(MISSION) or ()), before.mission(MISSION)) == (1, None)
 
 
@@ -145,7 +131,7 @@ def test_denied_upload_leaves_the_mission_unchanged(day: Day) -> None:
     day.send(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, denied, MISSION))
     mission = day.answers().mission(MISSION)
     assert mission is not None
-    assert decode(mission[0]).get_srcSystem() == 3
+    assert read_back(mission[0]).get_srcSystem() == 3
 
 
 def test_clearing_all_gives_empty_mission_fence_and_rally_points(day: Day) -> None:
@@ -167,7 +153,7 @@ def test_home_is_that_at_the_position_of_playback(day: Day) -> None:
     latitudes = []
     for second in (0, 1, 2):
         (frame,) = day.answers(START_US + second * SECOND_US).frames(242)
-        latitudes.append(decode(frame).latitude)
+        latitudes.append(read_back(frame).latitude)
     assert latitudes == [470_000_000, 470_000_000, 480_000_000]
 
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.recordings.columns import row_to_line
+from gateway.recordings.columns import COLUMNS, row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
 from gateway.recordings.table import encode_head
-from gateway.recordings.tlog import encode_record
-from tests.kit.recordings import START_US, make_records, make_tlog
+from gateway.recordings.tlog import TlogRecord
+from tests.kit.mavlink import packed
+from tests.kit.recordings import START_US, make_records, write_table, write_tlog
 from tests.recordings.flights import OPTIONS, flown_table, read
 
 pytestmark = pytest.mark.io
@@ -20,11 +21,9 @@ pytestmark = pytest.mark.io
 def test_recording_of_two_parts_is_opened_as_one_flight(tmp_path: Path) -> None:
     header, rows = read(flown_table(12))
     half = len(rows) // 2
-    parts = []
-    for number, some in ((1, rows[:half]), (2, rows[half:])):
-        parts.append(tmp_path / f"a_{number:02d}_v1.csv")
-        parts[-1].write_text(encode_head(header) + "".join(map(row_to_line, some)))
-    flight = open_flown(parts, OPTIONS)
+    first = write_table(tmp_path / "a_01_v1.csv", header, rows[:half])
+    second = write_table(tmp_path / "a_02_v1.csv", header, rows[half:])
+    flight = open_flown([first, second], OPTIONS)
     sampled = [row for row in rows if row.imu is not None]
     assert len(flight.time_s) == len(sampled)
     np.testing.assert_array_equal(
@@ -38,38 +37,32 @@ def test_recording_of_two_parts_is_opened_as_one_flight(tmp_path: Path) -> None:
 
 def test_raw_counts_are_calibrated(tmp_path: Path) -> None:
     header, rows = read(flown_table(2))
-    whole, bare = tmp_path / "whole.csv", tmp_path / "bare.csv"
-    names = encode_head(header).splitlines()[-1].split(",")
-    whole.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
-    kept = [
-        i for i, name in enumerate(names) if not name.endswith(("_b_mps2", "_b_radps", "_b_ut"))
-    ]
-    lines = [encode_head(header).splitlines()[-1], *map(row_to_line, rows)]
-    head = "\n".join(encode_head(header).splitlines()[:-1])
+    whole, bare = write_table(tmp_path / "whole.csv", header, rows), tmp_path / "bare.csv"
+    ends = ("_b_mps2", "_b_radps", "_b_ut")
+    kept = [i for i, name in enumerate(COLUMNS) if not name.endswith(ends)]
+    *head, names = encode_head(header).splitlines()
+    lines = [names, *map(row_to_line, rows)]
     cut = [",".join(line.rstrip("\n").split(",")[i] for i in kept) for line in lines]
-    bare.write_text("\n".join([head, *cut]) + "\n")
+    bare.write_text("\n".join([*head, *cut, ""]))
     a, b = open_flown([whole], OPTIONS), open_flown([bare], OPTIONS)
     np.testing.assert_allclose(a.accel_b_mps2, b.accel_b_mps2, atol=1e-9)
     np.testing.assert_allclose(a.gyro_b_radps, b.gyro_b_radps, atol=1e-9)
 
 
 def test_tlog_of_an_autopilot_is_opened(tmp_path: Path) -> None:
-    mav = mavlink.MAVLink(None, 1, 1)
-    data = b""
+    records = []
     for k in range(300):
         at_us = 20_000 * k
         imu = mavlink.MAVLink_highres_imu_message(
             at_us, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03, 0.2, 0.0, 0.4, 950.0, 0.0, 540.0, 20.0, 0x1FFF
         )
-        data += encode_record(START_US + at_us, bytes(imu.pack(mav)))
+        records.append(TlogRecord(START_US + at_us, packed(imu)))
         if k % 10 == 0:
             gps = mavlink.MAVLink_gps_raw_int_message(
                 at_us, 3, 470_000_000 + k, 85_000_000, 540_000, 100, 100, 500, 0, 9
             )
-            data += encode_record(START_US + at_us, bytes(gps.pack(mav)))
-    path = tmp_path / "other.tlog"
-    path.write_bytes(data)
-    flight = open_flown([path], OPTIONS)
+            records.append(TlogRecord(START_US + at_us, packed(gps)))
+    flight = open_flown([write_tlog(tmp_path / "other.tlog", records)], OPTIONS)
     assert len(flight.time_s) == 300
     assert flight.rate_hz == pytest.approx(50.0)
     np.testing.assert_allclose(flight.accel_b_mps2[0], [0.1, 0.2, -9.8], atol=1e-6)
@@ -95,7 +88,6 @@ def test_foreign_csv_is_opened(tmp_path: Path, caplog: pytest.LogCaptureFixture)
 
 
 def test_file_without_a_flight_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.tlog"
-    path.write_bytes(make_tlog(make_records(9)))
+    path = write_tlog(tmp_path / "a.tlog", make_records(9))
     with pytest.raises(FlightError, match=r"a\.tlog: contains no HIGHRES_IMU"):
         open_flown([path], OPTIONS)

@@ -16,18 +16,13 @@ from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord
-from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog
+from tests.kit.mavlink import STATION, Sender, read_back
+from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, write_table, write_tlog
 from tests.recordings.flights import OPTIONS, flown_table, fly, make_flight, read
 
 pytestmark = pytest.mark.io
 
 RECORDS = make_records(300)
-
-
-def write(folder: Path, name: str, records: list[TlogRecord]) -> Path:
-    path = folder / name
-    path.write_bytes(make_tlog(records))
-    return path
 
 
 def laid_out(files: list[Path], *wanted_ids: int) -> list[PlayedFlight]:
@@ -36,7 +31,7 @@ def laid_out(files: list[Path], *wanted_ids: int) -> list[PlayedFlight]:
 
 
 def test_parts_of_a_recording_are_one_flight(tmp_path: Path) -> None:
-    parts = [write(tmp_path, f"a_0{n}.tlog", RECORDS[100 * n :][:100]) for n in (0, 1, 2)]
+    parts = [write_tlog(tmp_path / f"a_0{n}.tlog", RECORDS[100 * n :][:100]) for n in (0, 1, 2)]
     (flight,) = laid_out(parts)
     assert flight.system_ids == {1: 1}
     firsts = [track.first_us for track in flight.tracks]
@@ -44,7 +39,7 @@ def test_parts_of_a_recording_are_one_flight(tmp_path: Path) -> None:
 
 
 def test_recording_that_grows_is_played_as_it_was_opened(tmp_path: Path) -> None:
-    path = write(tmp_path, "a.tlog", RECORDS[:100])
+    path = write_tlog(tmp_path / "a.tlog", RECORDS[:100])
     with ExitStack() as opened:
         (flight,) = open_flights([path], OPTIONS, opened)
         (source,) = flight.sources
@@ -56,8 +51,8 @@ def test_recording_that_grows_is_played_as_it_was_opened(tmp_path: Path) -> None
 
 
 def test_other_recordings_get_separate_vehicles(tmp_path: Path) -> None:
-    first = write(tmp_path, "first.tlog", RECORDS[:100])
-    later = write(tmp_path, "later.tlog", RECORDS[200:])
+    first = write_tlog(tmp_path / "first.tlog", RECORDS[:100])
+    later = write_tlog(tmp_path / "later.tlog", RECORDS[200:])
     flights = laid_out([first, later, first], 5)
     assert [flight.system_ids for flight in flights] == [{1: 5}, {1: 1}, {1: 2}]
     # Flights of other days begin together.
@@ -67,11 +62,9 @@ def test_other_recordings_get_separate_vehicles(tmp_path: Path) -> None:
 
 def test_parts_of_a_table_are_fused_as_one(tmp_path: Path) -> None:
     header, rows = read(flown_table(10))
-    parts = []
-    for number, some in ((1, rows[:200]), (2, rows[200:])):
-        parts.append(tmp_path / f"a_0{number}_v1.csv")
-        parts[-1].write_text(encode_head(header) + "".join(map(row_to_line, some)))
-    (flight,) = laid_out(parts)
+    first = write_table(tmp_path / "a_01_v1.csv", header, rows[:200])
+    second = write_table(tmp_path / "a_02_v1.csv", header, rows[200:])
+    (flight,) = laid_out([first, second])
     (track,) = flight.tracks
     assert track.last_us == rows[-1].time_us
 
@@ -82,12 +75,10 @@ def test_fused_flight_answers_with_the_settings_of_its_fusion(
     then = GatewaySettings().default_aircraft
     vehicle = msgspec.structs.replace(then.vehicle, node_silent_s=7.5)
     header, rows = read(fly(msgspec.structs.replace(then, vehicle=vehicle), make_flight(rng, 3))[0])
-    path = tmp_path / "a_01_v1.csv"
-    path.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
-    (flight,) = laid_out([path])
+    (flight,) = laid_out([write_table(tmp_path / "a_01_v1.csv", header, rows)])
     answers = VehicleAnswers(flight.answers, 1, 1, lambda: START_US)
     (silent,) = (f for n, f in answers.parameters().items() if "SILENT" in n)
-    assert mavlink.MAVLink(None).decode(bytearray(silent)).param_value == 7.5
+    assert read_back(silent).param_value == 7.5
     assert len(answers.frames(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)) == 1
 
 
@@ -112,25 +103,24 @@ def test_settings_changed_in_flight_are_answered_from_their_time(
     for at_us in (rows[0].time_us, rows[-1].time_us):
         answers = VehicleAnswers(flight.answers, 1, 1, lambda at_us=at_us: at_us).parameters()
         (cutoff,) = (frame for name, frame in answers.items() if "ACC_CUTOFF" in name)
-        answered[at_us] = mavlink.MAVLink(None).decode(bytearray(cutoff)).param_value
+        answered[at_us] = read_back(cutoff).param_value
     assert list(answered.values()) == [then.estimation.paper.accel_cutoff_hz, 3.5]
 
 
 def test_ground_station_is_no_vehicle(tmp_path: Path) -> None:
-    station = mavlink.MAVLink(None, 42, 190)
-    beat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
-    records = [*RECORDS[:9], TlogRecord(RECORDS[9].time_us, bytes(beat.pack(station)))]
-    (flight,) = laid_out([write(tmp_path, "a.tlog", records)])
+    records = [*RECORDS[:9], TlogRecord(RECORDS[9].time_us, Sender(42, STATION).heartbeat())]
+    (flight,) = laid_out([write_tlog(tmp_path / "a.tlog", records)])
     assert flight.system_ids == {1: 1}
 
 
 def test_file_without_frames_is_refused(tmp_path: Path) -> None:
+    files = [write_tlog(tmp_path / "a.tlog", RECORDS), write_tlog(tmp_path / "empty.tlog", [])]
     with pytest.raises(FlightError, match=r"empty.tlog: unknown file format"):
-        laid_out([write(tmp_path, "a.tlog", RECORDS), write(tmp_path, "empty.tlog", [])])
+        laid_out(files)
 
 
 def test_vehicles_of_a_recording_follow_the_id_of_its_first(tmp_path: Path) -> None:
-    both = write(tmp_path, "both.tlog", [*RECORDS[:50], *make_records(50, system_id=7)])
+    both = write_tlog(tmp_path / "both.tlog", [*RECORDS[:50], *make_records(50, system_id=7)])
     assert [flight.system_ids for flight in laid_out([both, both], 200)] == [
         {1: 200, 7: 201},
         {1: 1, 7: 7},

@@ -9,16 +9,14 @@ from gateway.recordings.summary import FileInfo, Rate, TableSummary, TlogSummary
 from gateway.recordings.table import TableHeader, TableNote, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from tests.kit.mavlink import packed
-from tests.kit.recordings import START_US, make_tlog, senders_of
+from tests.kit.recordings import SECOND_US, START_US, make_tlog, senders_of
 from tests.recordings.samples import make_baro, make_fused
 
-SECOND_US = 1_000_000
 M_PER_DEG_LAT = 111_132.0
 
 
 def make_flight(seconds: int, system_id: int, gap_at: int | None = None) -> list[TlogRecord]:
     """Fly north at 10 m/s, with a position once a second."""
-    mav = mavlink.MAVLink(None, system_id, 1)
     records = []
     for i in range(seconds):
         late_us = 30 * SECOND_US if gap_at is not None and i >= gap_at else 0
@@ -27,8 +25,8 @@ def make_flight(seconds: int, system_id: int, gap_at: int | None = None) -> list
             mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3),
             mavlink.MAVLink_global_position_int_message(i, lat, 80_000_000, 0, 0, 0, 0, 0, 0),
         ):
-            frame = bytes(message.pack(mav))
-            records.append(TlogRecord(START_US + i * SECOND_US + late_us, frame))
+            at_us = START_US + i * SECOND_US + late_us
+            records.append(TlogRecord(at_us, packed(message, system_id)))
     return records
 
 
@@ -37,6 +35,12 @@ def sum_up(data: bytes, chunk: int = 777) -> FileInfo:
     for begin in range(0, len(data), chunk):
         summary.add(scanner.feed(data[begin : begin + chunk]))
     summary.add(scanner.feed(b"", final=True))
+    return summary.result(len(data))
+
+
+def sum_up_table(data: bytes) -> FileInfo:
+    summary, reader = TableSummary(), TableReader()
+    summary.add(reader.feed_block(data, final=True), reader.header)
     return summary.result(len(data))
 
 
@@ -65,8 +69,9 @@ def test_gaps_and_damage_are_reported(chunk: int) -> None:
 
 def test_incomplete_last_record_is_no_damage() -> None:
     data = make_tlog(make_flight(20, 1))
-    info = sum_up(data[:300] + b"\xaa" * 40 + data[300:-4])
-    assert info.damaged_bytes == sum_up(data[:300] + b"\xaa" * 40 + data[300:]).damaged_bytes
+    spoilt = data[:300] + b"\xaa" * 40 + data[300:]
+    info = sum_up(spoilt[:-4])
+    assert info.damaged_bytes == sum_up(spoilt).damaged_bytes
     assert 0 < info.unfinished_bytes < 40
     wrong = sum_up(data + b"\xaa" * 4)
     assert (wrong.damaged_bytes, wrong.unfinished_bytes) == (4, 0)
@@ -75,8 +80,7 @@ def test_incomplete_last_record_is_no_damage() -> None:
 def test_truncated_record_before_others_is_damage() -> None:
     """Also where the file ends before its length would be over."""
     flight = make_flight(20, 1)
-    message = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251)
-    frame = packed(message)
+    frame = packed(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251))
     cut = make_tlog([TlogRecord(flight[-1].time_us, frame)])[:100]
     info = sum_up(make_tlog(flight[:-1]) + cut + make_tlog(flight[-1:]))
     assert (info.records, info.damaged_bytes, info.unfinished_bytes) == (40, len(cut), 0)
@@ -91,9 +95,7 @@ def test_incomplete_last_line_is_no_damage(
 ) -> None:
     rows = RowBuilder().add(make_fused(rng, 0))
     text = encode_head(TableHeader()) + "".join(map(row_to_line, rows))
-    summary, reader = TableSummary(), TableReader()
-    summary.add(reader.feed_block(text.encode() + tail, final=True), reader.header)
-    info = summary.result(0)
+    info = sum_up_table(text.encode() + tail)
     assert (info.damaged_bytes, info.unfinished_bytes) == (damaged, unfinished)
 
 
@@ -125,9 +127,7 @@ def test_table_is_summarised(rng: np.random.Generator) -> None:
         for record in [make_baro(rng, i * 10_000), *records] if i % 10 == 0 else records:
             text += "".join(map(row_to_line, builder.add(record)))
     text += encode_line(TableNote(5, "here")) + "broken,line\n"
-    summary, reader = TableSummary(), TableReader()
-    summary.add(reader.feed_block(text.encode(), final=True), reader.header)
-    info = summary.result(len(text))
+    info = sum_up_table(text.encode())
     assert (info.kind, info.records, info.duration_s) == ("table", 100, 0.99)
     rates = {rate.name: rate.count for rate in info.vehicles[0].rates}
     assert rates["imu"] == rates["state"] == 100

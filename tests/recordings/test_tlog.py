@@ -5,7 +5,6 @@ import time
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v10 import common as dialect_v1
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.clock import GatewayClock
@@ -20,16 +19,23 @@ from gateway.recordings.tlog import (
     Stamper,
     TlogRecord,
     TlogScanner,
-    encode_record,
     is_damaged,
 )
 from gateway.recordings.tlog import STEP_US as STAMP_STEP_US
-from gateway.recordings.tlog_index import TlogIndex
+from gateway.recordings.tlog_scan import IntArray
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_splitter import message_id_of
 from gateway.wire.timesync import ENOUGH
 from tests.kit.mavlink import KEY, packed
-from tests.kit.recordings import START_US, STEP_US, make_frames, make_records, make_tlog
+from tests.kit.recordings import (
+    START_US,
+    STEP_US,
+    batch_of,
+    index_of,
+    make_records,
+    make_tlog,
+    records_of,
+)
 
 
 def scan(data: bytes, *, strict: bool = False, chunk: int | None = None) -> list[Batch]:
@@ -39,15 +45,8 @@ def scan(data: bytes, *, strict: bool = False, chunk: int | None = None) -> list
     return [*batches, scanner.feed(b"", final=True)]
 
 
-def records_of(batches: list[Batch]) -> list[TlogRecord]:
+def read_of(batches: list[Batch]) -> list[TlogRecord]:
     return [record for batch in batches for record in batch.records()]
-
-
-def index_of(batches: list[Batch]) -> TlogIndex:
-    index = TlogIndex()
-    for batch in batches:
-        index.add(batch)
-    return index
 
 
 @pytest.mark.parametrize("chunk", [None, 1, 7, 100])
@@ -55,12 +54,12 @@ def index_of(batches: list[Batch]) -> TlogIndex:
 def test_written_file_is_read_in_any_chunks(chunk: int | None, strict: bool) -> None:
     records = make_records(40)
     batches = scan(make_tlog(records), strict=strict, chunk=chunk)
-    assert records_of(batches) == records
+    assert read_of(batches) == records
     assert index_of(batches).damage == []
 
 
 def test_columns_contain_sender_and_message() -> None:
-    batch = TlogScanner().feed(make_tlog(make_records(3, system_id=7)), final=True)
+    batch = batch_of(make_records(3, system_id=7))
     assert batch.origins.tolist() == [7 << 8 | 1] * 3
     assert batch.message_ids.tolist() == [0, 31, 253]
     assert batch.frame(1) == make_records(3, system_id=7)[1].frame
@@ -69,32 +68,35 @@ def test_columns_contain_sender_and_message() -> None:
 def test_mavlink_1_and_signed_frames_are_read() -> None:
     message = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
     old, signed = packed(message, version=1), packed(message, signing=(KEY, 0, 1))
-    records = [TlogRecord(START_US + i, frame) for i, frame in enumerate([old, signed, old])]
+    records = records_of([old, signed, old])
     assert len(signed) == 12 + 9 + 13
-    assert records_of(scan(make_tlog(records), strict=True)) == records
+    assert read_of(scan(make_tlog(records), strict=True)) == records
 
 
 def test_damaged_mavlink_1_frame_is_left_out() -> None:
-    sender = dialect_v1.MAVLink(None, 1, 1)
-    message = dialect_v1.MAVLink_attitude_message(20, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
-    frames = [bytes(message.pack(sender)) for _ in range(3)]
-    records = [TlogRecord(START_US + i * STEP_US, frame) for i, frame in enumerate(frames)]
+    message = mavlink.MAVLink_attitude_message(20, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    records = records_of([packed(message, version=1)] * 3)
     data = bytearray(make_tlog(records))
     size = len(data) // 3
     data[size + 20] ^= 1
     batches = scan(bytes(data), strict=True)
-    assert records_of(batches) == [records[0], records[2]]
+    assert read_of(batches) == [records[0], records[2]]
     assert [run for batch in batches for run in batch.damage] == [Damage(size, size)]
+
+
+def ends_of(records: list[TlogRecord]) -> IntArray:
+    """Return the end of each record in its file."""
+    return np.cumsum([8 + len(record.frame) for record in records])
 
 
 def test_truncated_tlog_loses_at_most_its_last_record() -> None:
     records = make_records(12)
     data = make_tlog(records)
-    ends = np.cumsum([8 + len(record.frame) for record in records])
+    ends = ends_of(records)
     for size in range(len(data) + 1):
         whole = int(np.searchsorted(ends, size, side="right"))
         batches = scan(data[:size])
-        assert records_of(batches) == records[:whole]
+        assert read_of(batches) == records[:whole]
         cut = size - (int(ends[whole - 1]) if whole else 0)
         assert (index_of(batches).damaged_bytes, index_of(batches).unfinished) == (0, cut)
 
@@ -106,9 +108,8 @@ def test_flipped_bit_loses_at_most_its_record_in_a_strict_scan(seed: int) -> Non
     data = bytearray(make_tlog(records))
     position = int(rng.integers(len(data)))
     data[position] ^= 1 << int(rng.integers(8))
-    ends = np.cumsum([8 + len(record.frame) for record in records])
-    hit = int(np.searchsorted(ends, position, side="right"))
-    found = records_of(scan(bytes(data), strict=True))
+    hit = int(np.searchsorted(ends_of(records), position, side="right"))
+    found = read_of(scan(bytes(data), strict=True))
     # A flip in the time leaves the frame good; one in the message id may make it unknown.
     others = records[:hit] + records[hit + 1 :]
     left = [record for record in found if record not in others]
@@ -126,7 +127,7 @@ def test_garbage_between_records_is_skipped(seed: int) -> None:
     garbage = rng.bytes(int(rng.integers(1, 2000)))
     head, tail = make_tlog(records[:15]), make_tlog(records[15:])
     batches = scan(head + garbage + tail, chunk=int(rng.integers(1, 500)))
-    assert records_of(batches) == records
+    assert read_of(batches) == records
     assert index_of(batches).damage == [Damage(len(head), len(garbage))]
 
 
@@ -153,7 +154,7 @@ def test_record_with_partial_time_gets_time_of_previous_record(torn: int, fill: 
     head, data = make_tlog(records[:50]), make_tlog(records)
     cut = data[: len(head) - 20] + fill * (20 + torn) + data[len(head) + torn :]
     batches = scan(cut, strict=True)
-    found = records_of(batches)
+    found = read_of(batches)
     assert found[:49] == records[:49]
     assert found[-49:] == records[51:]
     assert all(abs(record.time_us - START_US) < 3600e6 for record in found)
@@ -170,7 +171,7 @@ def test_flipped_time_gives_no_gap(chunk: int | None, hit: tuple[int, ...], flip
     for i in hit:
         spoilt[i] = TlogRecord(records[i].time_us ^ flip, records[i].frame)
     batches = scan(make_tlog(spoilt), chunk=chunk)
-    found, index = records_of(batches), index_of(batches)
+    found, index = read_of(batches), index_of(batches)
     assert [record.frame for record in found] == [record.frame for record in records]
     is_seen = flip > 1 << 30 or hit not in ((0,), (39,))
     assert index.mended == is_seen * len(hit)
@@ -190,7 +191,7 @@ def test_jump_of_the_clock_is_kept(chunk: int | None, leap_us: int) -> None:
         for i, r in enumerate(make_records(40))
     ]
     batches = scan(make_tlog(records), chunk=chunk)
-    assert records_of(batches) == records
+    assert read_of(batches) == records
     assert index_of(batches).mended == 0
 
 
@@ -211,13 +212,12 @@ def test_index_finds_the_offset_of_each_time() -> None:
 
 
 def test_index_stays_in_order_where_the_clock_jumped_back() -> None:
-    frames = make_frames(3 * STRIDE)
-    times = [START_US + (i if i < STRIDE else i - STRIDE) * STEP_US for i in range(len(frames))]
-    data = b"".join(encode_record(t, f) for t, f in zip(times, frames, strict=True))
+    records = [*make_records(STRIDE), *make_records(2 * STRIDE)]
+    data, last_us = make_tlog(records), records[-1].time_us
     index = index_of(scan(data))
-    assert index.last_us == max(times)
+    assert index.last_us == last_us
     assert index.offset_before(START_US) == 0
-    assert index.offset_before(max(times)) < len(data)
+    assert index.offset_before(last_us) < len(data)
 
 
 def test_index_of_an_empty_file_is_empty() -> None:
@@ -228,6 +228,14 @@ def test_index_of_an_empty_file_is_empty() -> None:
 
 UTC_US = 1_781_000_000_000_000
 MINUTE_US = 60_000_000
+
+
+@pytest.fixture
+def civil() -> CivilClock:
+    """Return a clock whose machine shows `UTC_US` at its begin."""
+    clock = CivilClock()
+    clock.update_machine(UTC_US, 0)
+    return clock
 
 
 def test_machine_clock_is_used_until_gps_time_is_confirmed() -> None:
@@ -242,55 +250,41 @@ def test_machine_clock_is_used_until_gps_time_is_confirmed() -> None:
     assert clock.offset_us == UTC_US - 3_000_000
 
 
-def test_correct_machine_clock_is_kept_over_gps_time() -> None:
-    clock = CivilClock()
-    clock.update_machine(UTC_US, 0)
+def test_correct_machine_clock_is_kept_over_gps_time(civil: CivilClock) -> None:
     for _ in range(ENOUGH):
-        clock.update_gps(1, UTC_US + 800_000, 1_000_000)
-    assert clock.offset_us == UTC_US
+        civil.update_gps(1, UTC_US + 800_000, 1_000_000)
+    assert civil.offset_us == UTC_US
 
 
 @pytest.mark.parametrize("jump_us", [-MINUTE_US, -JUMP_US - 1, JUMP_US + 1, 50 * MINUTE_US])
-def test_jump_of_civil_time_is_reported(jump_us: int) -> None:
-    clock = CivilClock()
-    clock.update_machine(UTC_US, 0)
+def test_jump_of_civil_time_is_reported(civil: CivilClock, jump_us: int) -> None:
     stamper = Stamper(UTC_US)
-    assert not stamper.has_jumped(clock)
+    assert not stamper.has_jumped(civil)
     for _ in range(ENOUGH):
-        clock.update_gps(1, UTC_US + jump_us, 0)
-    assert stamper.has_jumped(clock)
+        civil.update_gps(1, UTC_US + jump_us, 0)
+    assert stamper.has_jumped(civil)
 
 
-def test_wrong_time_of_one_aircraft_in_three_is_ignored() -> None:
-    clock = CivilClock()
-    clock.update_machine(UTC_US, 0)
+def test_wrong_time_of_one_aircraft_in_three_is_ignored(civil: CivilClock) -> None:
     for n in range(30):
         for vehicle_id, error_us in ((1, 3_600_000_000), (2, 0), (3, 100_000)):
-            clock.update_gps(vehicle_id, UTC_US + n * 200_000 + error_us, n * 200_000)
-        assert clock.offset_us == UTC_US
+            civil.update_gps(vehicle_id, UTC_US + n * 200_000 + error_us, n * 200_000)
+        assert civil.offset_us == UTC_US
 
 
-def test_single_wrong_fixes_are_ignored() -> None:
-    clock = CivilClock()
-    clock.update_machine(UTC_US, 0)
+def test_single_wrong_fixes_are_ignored(civil: CivilClock) -> None:
     for n in range(60):
-        clock.update_gps(1, UTC_US + n * 200_000 + 7_000_000 * (n % 3 == 2), n * 200_000)
-        assert clock.offset_us == UTC_US
-
-
-def sleepless(monkeypatch: pytest.MonkeyPatch) -> dict[int, int]:
-    """Put the kernel's clocks under the test's control."""
-    clocks = {time.CLOCK_BOOTTIME: 10**12, time.CLOCK_MONOTONIC: 10**12}
-    monkeypatch.setattr(time, "clock_gettime_ns", clocks.__getitem__)
-    monkeypatch.setattr(time, "monotonic_ns", lambda: clocks[time.CLOCK_MONOTONIC])
-    return clocks
+        civil.update_gps(1, UTC_US + n * 200_000 + 7_000_000 * (n % 3 == 2), n * 200_000)
+        assert civil.offset_us == UTC_US
 
 
 @pytest.mark.parametrize("set_by_us", [0, 3_600_000_000])
 def test_suspend_is_distinguished_from_a_set_clock(
     monkeypatch: pytest.MonkeyPatch, set_by_us: int
 ) -> None:
-    clocks = sleepless(monkeypatch)
+    clocks = {time.CLOCK_BOOTTIME: 10**12, time.CLOCK_MONOTONIC: 10**12}
+    monkeypatch.setattr(time, "clock_gettime_ns", clocks.__getitem__)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: clocks[time.CLOCK_MONOTONIC])
     now_us, clock = GatewayClock(), CivilClock()
     clock.update_machine(UTC_US, now_us())
     stamper = Stamper(UTC_US)
@@ -317,11 +311,6 @@ def test_timestamp_is_never_later_than_its_time() -> None:
 def test_timestamps_of_a_clock_before_1970_start_at_zero() -> None:
     stamper = Stamper(-1_000_000)
     assert [stamper.stamp(0), stamper.stamp(1)] == [STAMP_STEP_US, 2 * STAMP_STEP_US]
-
-
-def decode(frame: bytes) -> mavlink.MAVLink_message:
-    (message,) = mavlink.MAVLink(None).parse_buffer(frame)
-    return message
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from gateway.recordings.formats import parquet as parquet_file
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import TableNote, encode_line
 from tests.kit.cli import run
-from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog
+from tests.kit.recordings import START_US, STEP_US, make_records, write_tlog
 from tests.recordings.flights import OPTIONS, fly, make_flight
 
 pytestmark = pytest.mark.io
@@ -73,8 +73,7 @@ def test_info_and_convert_accept_parquet(table: Path, tmp_path: Path) -> None:
 
 
 def test_one_kind_of_message_is_a_typed_table(tmp_path: Path) -> None:
-    path, out = tmp_path / "a.tlog", tmp_path / "a.parquet"
-    path.write_bytes(make_tlog(make_records(300)))
+    path, out = write_tlog(tmp_path / "a.tlog", make_records(300)), tmp_path / "a.parquet"
     run("convert", path, "-o", out, "--message", "ATTITUDE_QUATERNION")
     found = pq.read_table(out)
     assert len(found) == 100
@@ -90,29 +89,22 @@ def test_one_kind_of_message_is_a_typed_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("message", "said"),
     [
-        (
-            ("--message", "VFR_HUD", "-o", "a.parquet"),
-            "contains no VFR_HUD, but ATTITUDE",
-        ),
-        (("--message", "NONSENSE", "-o", "a.parquet"), "no MAVLink message is named NONSENSE"),
+        ("VFR_HUD", "contains no VFR_HUD, but ATTITUDE"),
+        ("NONSENSE", "no MAVLink message is named NONSENSE"),
     ],
 )
-def test_invalid_options_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], said: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "x.tlog").write_bytes(make_tlog(make_records(30)))
-    assert said in run("convert", "x.tlog", *words, code=2)
-    assert not (tmp_path / "a.parquet").exists()
+def test_message_that_the_file_lacks_is_refused(tmp_path: Path, message: str, said: str) -> None:
+    path, out = write_tlog(tmp_path / "x.tlog", make_records(30)), tmp_path / "a.parquet"
+    assert said in run("convert", path, "-o", out, "--message", message, code=2)
+    assert not out.exists()
 
 
 def test_parquet_is_written_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So memory is bounded by a few rows."""
     monkeypatch.setattr(parquet_file, "ROWS", 50)
-    path = tmp_path / "a.tlog"
-    path.write_bytes(make_tlog(make_records(3000)))
+    path = write_tlog(tmp_path / "a.tlog", make_records(3000))
     flight = FlightToWrite([path], OPTIONS, message="HEARTBEAT")
     sizes = [len(piece) for piece in WRITERS[".parquet"](flight)]
     assert len(sizes) == 3000 // 3 // 50 + 1
