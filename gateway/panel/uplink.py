@@ -147,7 +147,6 @@ class Uplink:
         self._player_hub = self._make_hub((PLAYBACK_URL,), played=True)
         self._senders: dict[tuple[int, int], Any] = {}
         self._listeners: list[Callable[[Any], None]] = []
-        self._heard: bytes | None = None
         self._heard_us = -SILENT_US
         self._local = self._reported = ""
         self._acks: dict[tuple[int, int], asyncio.Queue[int]] = {}
@@ -226,14 +225,13 @@ class Uplink:
 
     def _make_hub(self, endpoints: tuple[str, ...], *, played: bool) -> Hub:
         def on_frame(incoming: Incoming) -> None:
-            self._heard = incoming.frame
-            self._handle(incoming.frame, played=played)
+            # A broadcast arrives as foreign, too.
+            if not incoming.forwarded:
+                self._handle(incoming.frame, played=played)
 
         def on_foreign(frames: Sequence[bytes]) -> None:
             for frame in frames:
-                # A broadcast arrives both as ours and as foreign.
-                if frame is not self._heard:
-                    self._handle(frame, played=played)
+                self._handle(frame, played=played)
 
         return Hub(HubSettings(endpoints=endpoints), on_frame, self._clock, on_foreign=on_foreign)
 

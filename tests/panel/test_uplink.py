@@ -2,7 +2,8 @@
 
 import asyncio
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
-from gateway.panel import uplink as panel_uplink
 from gateway.panel.state.commands import command_long
 from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import (
@@ -22,8 +22,8 @@ from gateway.panel.uplink import (
     GatewayWatch,
     Uplink,
 )
-from tests.kit.mavlink import packed
-from tests.panel.messages import decoded
+from gateway.wire.mavlink_splitter import message_id_of
+from tests.kit.mavlink import Sender
 
 pytestmark = pytest.mark.io
 LIMIT_S = 60.0
@@ -31,12 +31,12 @@ PLAYED = 249
 
 
 def beat(system_id: int) -> bytes:
-    message = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_FIXED_WING, 0, 0, 0, 4, 3)
-    return packed(message, system_id)
+    return Sender(system_id).heartbeat()
 
 
 @pytest.fixture
 def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """Return the sockets of a gateway and of a player."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gateway,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as player,
@@ -45,6 +45,22 @@ def sockets() -> Iterator[tuple[socket.socket, socket.socket]]:
             sock.bind(("127.0.0.1", 0))
             sock.setblocking(False)
         yield gateway, player
+
+
+@pytest.fixture
+def fleet() -> FleetState:
+    return FleetState()
+
+
+@pytest.fixture
+async def uplink(
+    tmp_path: Path, fleet: FleetState, sockets: tuple[socket.socket, socket.socket]
+) -> AsyncIterator[Uplink]:
+    url = f"udp:127.0.0.1:{sockets[0].getsockname()[1]}"
+    made = Uplink(url, fleet, ControlClient(tmp_path / "none.sock"), GatewayClock())
+    made.start()
+    yield made
+    made.close()
 
 
 async def until(holds: Callable[[], bool], send: Callable[[], object]) -> None:
@@ -65,85 +81,90 @@ def heard(sock: socket.socket) -> list[mavlink.MAVLink_message]:
 
 
 async def test_played_messages_are_not_sent_to_the_gateway(
-    tmp_path: Path, sockets: tuple[socket.socket, socket.socket]
+    uplink: Uplink, fleet: FleetState, sockets: tuple[socket.socket, socket.socket]
 ) -> None:
     gateway, player = sockets
-    fleet = FleetState()
-    url = f"udp:127.0.0.1:{gateway.getsockname()[1]}"
-    uplink = Uplink(url, fleet, ControlClient(tmp_path / "none.sock"), GatewayClock())
-    uplink.start()
-    await asyncio.sleep(0)
-    try:
-        fleet.origins[PLAYED] = Origin("recorded", 1)
-        await until(lambda: bool(uplink.playback_port), lambda: None)
-        here = ("127.0.0.1", uplink.playback_port)
-        await until(lambda: PLAYED in fleet.vehicles, lambda: player.sendto(beat(PLAYED), here))
-        assert fleet.vehicles[PLAYED].title == "Plane 1, recorded"
-        assert not uplink.is_alive
-        there: list[tuple[str, int]] = []
+    fleet.origins[PLAYED] = Origin("recorded", 1)
+    await until(lambda: bool(uplink.playback_port), lambda: None)
+    here = ("127.0.0.1", uplink.playback_port)
+    await until(lambda: PLAYED in fleet.vehicles, lambda: player.sendto(beat(PLAYED), here))
+    assert fleet.vehicles[PLAYED].title == "Plane 1, recorded"
+    assert not uplink.is_alive
+    there: list[tuple[str, int]] = []
 
-        def answer() -> None:
-            try:
-                there.append(gateway.recvfrom(2048)[1])
-            except BlockingIOError:
-                return
-            # A live one of the same number is another aircraft, and is not taken for the played.
-            gateway.sendto(beat(PLAYED), there[0])
-            gateway.sendto(beat(3), there[0])
-            player.sendto(beat(4), here)
+    def answer() -> None:
+        try:
+            there.append(gateway.recvfrom(2048)[1])
+        except BlockingIOError:
+            return
+        # A live one of the same number is another aircraft, and is not taken for the played.
+        gateway.sendto(beat(PLAYED), there[0])
+        gateway.sendto(beat(3), there[0])
+        player.sendto(beat(4), here)
 
-        await until(lambda: 3 in fleet.vehicles, answer)
-        assert sorted(fleet.vehicles) == [3, PLAYED]
-        heard(gateway)
-        heard(player)
-        for system_id in (PLAYED, 3):
-            uplink.send(mavlink.MAVLink_param_request_list_message(system_id, 1))
-        for sock, system_id in ((gateway, 3), (player, PLAYED)):
-            seen: list[mavlink.MAVLink_message] = []
-            await until(
-                lambda seen=seen: any(m.get_type() == "PARAM_REQUEST_LIST" for m in seen),
-                lambda sock=sock, seen=seen: seen.extend(heard(sock)),
-            )
-            assert {m.get_srcSystem() for m in seen} == {SYSTEM_ID}
-            asked = [m.target_system for m in seen if m.get_type() == "PARAM_REQUEST_LIST"]
-            assert asked == [system_id]
-    finally:
-        uplink.close()
+    await until(lambda: 3 in fleet.vehicles, answer)
+    assert sorted(fleet.vehicles) == [3, PLAYED]
+    heard(gateway)
+    heard(player)
+    for system_id in (PLAYED, 3):
+        uplink.send(mavlink.MAVLink_param_request_list_message(system_id, 1))
+    for sock, system_id in ((gateway, 3), (player, PLAYED)):
+        seen: list[mavlink.MAVLink_message] = []
+        await until(
+            lambda seen=seen: any(m.get_type() == "PARAM_REQUEST_LIST" for m in seen),
+            lambda sock=sock, seen=seen: seen.extend(heard(sock)),
+        )
+        assert {m.get_srcSystem() for m in seen} == {SYSTEM_ID}
+        asked = [m.target_system for m in seen if m.get_type() == "PARAM_REQUEST_LIST"]
+        assert asked == [system_id]
 
 
-@pytest.mark.parametrize("result", [mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED])
-async def test_command_in_progress_has_a_longer_timeout(
-    monkeypatch: pytest.MonkeyPatch, result: int
+PROGRESS = mavlink.MAV_RESULT_IN_PROGRESS
+
+
+@pytest.mark.parametrize(
+    ("results", "trouble"),
+    [
+        ([PROGRESS, PROGRESS, mavlink.MAV_RESULT_ACCEPTED], ""),
+        ([PROGRESS, PROGRESS, mavlink.MAV_RESULT_FAILED], "LOGGING_START: failed"),
+        ([mavlink.MAV_RESULT_TEMPORARILY_REJECTED], "temporarily"),
+        ([200], "200"),
+    ],
+)
+async def test_command_fails_unless_accepted_and_has_a_longer_timeout_while_in_progress(
+    uplink: Uplink,
+    sockets: tuple[socket.socket, socket.socket],
+    monkeypatch: pytest.MonkeyPatch,
+    results: list[int],
+    trouble: str,
 ) -> None:
-    results: asyncio.Queue[int] = asyncio.Queue()
-    progress = mavlink.MAV_RESULT_IN_PROGRESS
-    for answer in (progress, progress, result):
-        results.put_nowait(answer)
     limits_s: list[float] = []
 
     def timeout(limit_s: float) -> asyncio.Timeout:
         limits_s.append(limit_s)
         return asyncio.Timeout(None)
 
+    heard_acks: list[int] = []
+    uplink.listen(lambda m: m.get_type() == "COMMAND_ACK" and heard_acks.append(m.result))
+    number, vehicle = mavlink.MAV_CMD_LOGGING_START, Sender()
+    # The first command is lost unless the socket is open.
+    await asyncio.get_running_loop().sock_recv(sockets[0], 2048)
     monkeypatch.setattr(asyncio, "timeout", timeout)
-    assert await panel_uplink._outcome(results) == result
-    assert limits_s == [ACK_TIMEOUT_S, PROGRESS_TIMEOUT_S, PROGRESS_TIMEOUT_S]
-
-
-@pytest.mark.parametrize(
-    ("result", "word"), [(mavlink.MAV_RESULT_TEMPORARILY_REJECTED, "temporarily"), (200, "200")]
-)
-async def test_every_result_other_than_accepted_is_a_failure(
-    tmp_path: Path, result: int, word: str
-) -> None:
-    uplink = Uplink(None, FleetState(), ControlClient(tmp_path / "none.sock"), GatewayClock())
-    waits = asyncio.ensure_future(uplink.command(command_long(1, mavlink.MAV_CMD_LOGGING_START)))
-    await asyncio.sleep(0)
-    uplink._note_ack(
-        decoded(mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_LOGGING_START, result))
-    )
-    with pytest.raises(CommandFailedError, match=word):
+    waits = asyncio.create_task(uplink.command(command_long(1, number)))
+    while True:
+        receiving = asyncio.get_running_loop().sock_recvfrom(sockets[0], 2048)
+        data, here = await asyncio.wait_for(receiving, LIMIT_S)
+        if message_id_of(data) == mavlink.MAVLINK_MSG_ID_COMMAND_LONG:
+            break
+    for result in results:
+        acknowledgement = mavlink.MAVLink_command_ack_message(number, result)
+        sockets[0].sendto(vehicle.pack(acknowledgement), here)
+    with pytest.raises(CommandFailedError, match=trouble) if trouble else nullcontext():
         await waits
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert heard_acks == results, "each once"
+    assert limits_s == [ACK_TIMEOUT_S, *[PROGRESS_TIMEOUT_S] * (len(results) - 1)]
 
 
 class Gateway:
