@@ -1,3 +1,5 @@
+from collections.abc import Iterable
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,14 @@ def imu(time_us: int) -> Any:
     return decoded(mavlink.MAVLink_highres_imu_message(time_us, *values))
 
 
+def collected(received_us: Iterable[int], *, quantum_us: int = 1) -> SampleMemory:
+    """Return samples of aircraft 1, whose own times are multiples of a quantum."""
+    memory = SampleMemory()
+    for time_us in received_us:
+        memory.add(1, imu(time_us // quantum_us * quantum_us), time_us)
+    return memory
+
+
 def test_parameters_are_converted_to_settings() -> None:
     found = settings_of({"PAPER_ALPHA_GYRO": 0.75, "EST_ESTIMATOR": 1.0, "CAL_ACC_BIAS_X": 3.0})
     assert found.estimation.paper.alpha_gyro == 0.75
@@ -30,39 +40,28 @@ def test_value_out_of_range_leaves_the_default(value: float) -> None:
 def test_too_few_samples_are_refused_with_the_reason() -> None:
     with pytest.raises(ComparisonError, match="no sensor samples"):
         compare([], {})
-    memory = SampleMemory()
-    for n in range(100):
-        memory.add(1, imu(n * 20_000), n * 20_000)
     with pytest.raises(ComparisonError, match="2 s of samples at 50 Hz"):
-        compare(memory.frames(1), {})
+        compare(collected(range(0, 2 * US_PER_S, 20_000)).frames(1), {})
 
 
 @pytest.mark.parametrize(
     ("rate_hz", "seconds", "share"), [(50, 10, 0.5), (10, 40, 0.5), (25, 21, 1.0), (50, 60, 1.0)]
 )
 def test_share_of_the_needed_samples_is_reported(rate_hz: int, seconds: int, share: float) -> None:
-    memory = SampleMemory()
-    assert memory.collected(1, LEAST_S, LEAST_HZ) == 0.0
-    for n in range(rate_hz * seconds + 1):
-        memory.add(1, imu(n), n * US_PER_S // rate_hz)
+    assert SampleMemory().collected(1, LEAST_S, LEAST_HZ) == 0.0
+    memory = collected(n * US_PER_S // rate_hz for n in range(rate_hz * seconds + 1))
     assert memory.collected(1, LEAST_S, LEAST_HZ) == pytest.approx(share, abs=0.03)
 
 
 def test_newest_samples_suffice_if_the_earlier_ones_came_too_slowly() -> None:
-    memory = SampleMemory()
-    for n in range(150):
-        memory.add(1, imu(n * US_PER_S), n * US_PER_S)
-    for n in range(1100):
-        time_us = 150 * US_PER_S + n * 20_000
-        memory.add(1, imu(time_us), time_us)
+    slow = range(0, 150 * US_PER_S, US_PER_S)
+    memory = collected(chain(slow, range(150 * US_PER_S, 172 * US_PER_S, 20_000)))
     found = compare(memory.frames(1), {})
     assert np.ptp(found[0].time_us) / US_PER_S == pytest.approx(LEAST_S + 1.0, abs=1.0)
 
 
 def test_samples_with_repeated_times_are_fused() -> None:
-    memory = SampleMemory()
-    for n in range(1200):
-        memory.add(1, imu(n // 5 * 100_000), n * 20_000)
+    memory = collected(range(0, 24 * US_PER_S, 20_000), quantum_us=100_000)
     found = compare(memory.frames(1), {})
     assert [each.name for each in found] == list(ESTIMATORS)
     assert {len(each.time_us) for each in found} == {120}
@@ -74,7 +73,6 @@ def test_only_the_newest_minutes_of_sensor_frames_are_stored() -> None:
     memory = SampleMemory()
     memory.add(1, mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3), 0)
     assert memory.frames(1) == []
-    for second in range(400):
-        memory.add(1, imu(second), second * US_PER_S)
+    memory = collected(range(0, 400 * US_PER_S, US_PER_S))
     times = [time_us for time_us, _ in memory.frames(1)]
     assert times[-1] - times[0] == SPAN_US

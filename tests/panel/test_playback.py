@@ -1,34 +1,32 @@
 """The page's player, with processes and answers that the test controls."""
 
 import asyncio
+from collections.abc import AsyncIterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from gateway.live.control_socket import ControlError
 from gateway.panel import playback as playback_module
-from gateway.panel.playback import (
-    MAX_PLAYERS,
-    RECORDED,
-    Playback,
-    PlaybackError,
-    Profile,
-    RecordedAircraft,
-)
+from gateway.panel.playback import MAX_PLAYERS, RECORDED, Playback, PlaybackError
 from gateway.panel.state.fleet import FleetState, Origin
-from tests.panel.messages import heartbeat
+from tests.panel.messages import heartbeat, short_tlog
 
 
 class Player:
     """Takes every request at once; its answers wait for `answers`."""
 
-    def __init__(self, *, is_playing: bool = True) -> None:
+    returncode: int | None = None
+    """Of its process, which runs until it is ended."""
+
+    def __init__(self) -> None:
         self.asked: list[str] = []
         self.answers = asyncio.Event()
         self.answers.set()
         self.refusals = 0
-        self._state = "playing" if is_playing else "paused"
+        self._state = "playing"
 
     async def ask(self, verb: str, **_: Any) -> dict[str, Any]:
         self.asked.append(verb)
@@ -42,101 +40,99 @@ class Player:
             await self.answers.wait()
         return answer
 
-
-@pytest.fixture
-def player() -> Player:
-    return Player()
+    def terminate(self) -> None:
+        self.returncode = -15
 
 
 @pytest.fixture
-def playback(player: Player) -> Playback:
-    made = Playback(None, FleetState(), "page")
-    made._control = player
-    made.status = {"state": "playing", "position_s": 0.0}
+def player(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Player:
+    """Return the player of each recording; one of an aircraft 1 is in the temporary folder."""
+    made = Player()
+
+    async def start(*_: object, **__: object) -> Player:
+        return made
+
+    monkeypatch.setattr(playback_module, "STEP_S", 0.0)
+    monkeypatch.setattr(playback_module, "ControlClient", lambda _: made)
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
+    (tmp_path / "day_01.tlog").write_bytes(short_tlog())
     return made
 
 
-async def started(task: asyncio.Task[None], player: Player) -> asyncio.Task[None]:
+async def opened(folder: Path, fleet: FleetState, page: str) -> Playback:
+    uplink: Any = SimpleNamespace(playback_port=1)
+    made = Playback(uplink, fleet, page)
+    await made.open(folder, "day", fused_again=False)
+    assert made.status == {"state": "playing", "position_s": 0.0}
+    return made
+
+
+@pytest.fixture
+async def playback(player: Player, tmp_path: Path) -> AsyncIterator[Playback]:
+    made = await opened(tmp_path, FleetState(), "page")
+    player.asked.clear()
+    yield made
+    made.close()
+
+
+async def asking(playback: Playback, player: Player) -> asyncio.Task[None]:
+    """Ask for the status, whose answer is late."""
+    player.answers.clear()
+    task = asyncio.create_task(playback.refresh())
     while not player.asked:
         await asyncio.sleep(0)
     return task
 
 
 async def test_late_status_does_not_undo_a_later_pause(playback: Playback, player: Player) -> None:
-    player.answers.clear()
-    asking = await started(asyncio.create_task(playback.refresh()), player)
+    early = await asking(playback, player)
     pausing = asyncio.create_task(playback.toggle())
     for _ in range(10):
         await asyncio.sleep(0)
     player.answers.set()
-    await asyncio.gather(asking, pausing)
+    await asyncio.gather(early, pausing)
     assert playback.status is not None
     assert playback.status["state"] == "paused"
 
 
 async def test_two_quick_toggles_pause_and_resume(playback: Playback, player: Player) -> None:
     await asyncio.gather(playback.toggle(), playback.toggle())
-    assert player.asked == ["play.pause", "play.resume"]
+    assert [verb for verb in player.asked if verb != "play.status"] == ["play.pause", "play.resume"]
 
 
 async def test_answer_after_closing_is_ignored(playback: Playback, player: Player) -> None:
-    player.answers.clear()
-    asking = await started(asyncio.create_task(playback.refresh()), player)
+    early = await asking(playback, player)
     playback.close()
     player.answers.set()
-    await asking
+    await early
     assert playback.status is None
-
-
-class Child:
-    """A process that runs until it is ended."""
-
-    returncode: int | None = None
-
-    def terminate(self) -> None:
-        self.returncode = -15
 
 
 async def test_opening_waits_for_a_player_that_refuses_at_first(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, player: Player
+    player: Player, tmp_path: Path
 ) -> None:
     """A socket is in its folder before its process listens to it."""
     player.refusals = 3
-
-    async def start(*_: object, env: dict[str, str], **__: object) -> Child:
-        socket = Path(env["XDG_RUNTIME_DIR"]) / "mavgate" / "play.sock"
-        socket.parent.mkdir()
-        socket.touch()
-        return Child()
-
-    monkeypatch.setattr(playback_module, "STEP_S", 0.0)
-    monkeypatch.setattr(playback_module, "ControlClient", lambda _: player)
-    monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
-    monkeypatch.setattr(playback_module, "look_into", lambda _: [[]])
-    (tmp_path / "day_01.tlog").write_bytes(b"")
-
-    class Uplink:
-        playback_port = 1
-
-    playback = Playback(Uplink(), FleetState(), "page")
-    await playback.open(tmp_path, "day", fused_again=False)
-    assert playback.status == {"state": "playing", "position_s": 0.0}
+    playback = await opened(tmp_path, FleetState(), "page")
+    assert player.asked == ["play.status"] * 4
     playback.close()
-    assert playback.status is None
+    assert (playback.status, player.returncode) == (None, -15)
 
 
-async def test_recording_is_visible_only_on_the_page_that_opened_it() -> None:
+async def test_recording_is_visible_only_on_the_page_that_opened_it(
+    player: Player, tmp_path: Path
+) -> None:
     fleet = FleetState()
-    playback = Playback(None, fleet, "mine")
-    recorded = RecordedAircraft(1, RECORDED, Profile())
-    (first,) = playback._number([[recorded]])
+    playback = await opened(tmp_path, fleet, "mine")
+    [first] = playback.aircraft
     fleet.update(heartbeat(), 0)
     fleet.update(heartbeat(system_id=first), 0)
     assert set(fleet.visible("mine")) == {1, first}
     assert set(fleet.visible("another")) == set(fleet.visible("")) == {1}
-    other = Playback(None, fleet, "another")
-    assert other._number([[recorded]]) != [first]
-    playback.close()
+    other = await opened(tmp_path, fleet, "another")
+    assert first not in other.aircraft
+    for each in (playback, other):
+        each.close()
     assert set(fleet.visible("mine")) == {1}
 
 

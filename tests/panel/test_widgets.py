@@ -4,23 +4,25 @@ import asyncio
 import errno
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from nicegui import Client
+from nicegui import Client, ElementFilter, background_tasks, core, ui
 from nicegui.page import page
+from nicegui.testing.user_interaction import UserInteraction
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.batch.catalogue import FlightFigures
 from gateway.panel.dialogues import Dialogue
 from gateway.panel.estimator_trial import ComparisonError
-from gateway.panel.state.parameters import ParameterEntry, ParameterMeta
-from gateway.panel.views import tuning_view
+from gateway.panel.state.parameters import ParameterMeta
 from gateway.panel.views.recordings_view import _facts_cells
 from gateway.panel.views.tuning_view import ComparisonCard, ParameterRow, range_of
 from gateway.panel.widgets import DataTable, RowButton, StripChart, why_not
+from tests.panel.messages import decoded
 
 NAME = "CAL_GYRO_BIAS_Z"
 
@@ -29,6 +31,19 @@ NAME = "CAL_GYRO_BIAS_Z"
 def _page() -> Iterator[None]:
     with Client(page("/"), request=None):
         yield
+
+
+def emit(element: ui.element, kind: str, arguments: Any = None) -> None:
+    """Emit an event as the browser does, and wait until its handlers have ended."""
+
+    async def handle() -> None:
+        core.loop = asyncio.get_running_loop()
+        user: Any = SimpleNamespace(client=element.client)
+        UserInteraction(user, {element}, None).trigger(kind, arguments)
+        await asyncio.gather(*background_tasks.running_tasks, return_exceptions=True)
+        core.loop = None
+
+    asyncio.run(handle())
 
 
 def test_button_of_a_row_acts_only_while_the_row_is_shown() -> None:
@@ -40,7 +55,7 @@ def test_button_of_a_row_acts_only_while_the_row_is_shown() -> None:
         {"key": "d", "cells": [["2", "bad", "error"]]},
     ]
     for key in ("d", "gone"):
-        asyncio.run(table._on_act(SimpleNamespace(args=[0, key])))
+        emit(table, "act", [0, key])
     assert pressed == ["d"]
 
 
@@ -50,45 +65,54 @@ def test_control_characters_in_a_table_are_escaped_except_in_keys() -> None:
     assert table.props["rows"] == [{"key": "a\x1b[2J", "cells": [["a\\x1b[2J", ""]]}]
 
 
-def row_of(sent: list[float]) -> tuple[ParameterRow, Dialogue]:
-    """Build a row of a parameter that is 0, of an aircraft that never answers."""
-    dialogue = Dialogue(1)
-    dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.0, 9, 0)
+class Row:
+    """The row of a parameter that is 0, and what it sends to the aircraft."""
 
-    def change(_: int, name: str, value: float) -> None:
-        sent.append(value)
-        dialogue.parameters.change(name, value, 0)
+    def __init__(self) -> None:
+        self.sent: list[float] = []
+        self.dialogue = Dialogue(1)
+        self.answer(0.0)
+        dialogues = SimpleNamespace(of=lambda _: self.dialogue, change=self._change)
+        context: Any = SimpleNamespace(
+            may_change=True,
+            check_may_change=lambda: None,
+            parts=SimpleNamespace(dialogues=dialogues),
+        )
+        self.row = ParameterRow(context, self.dialogue, ParameterMeta(name=NAME))
+        [self.field] = ElementFilter(kind=ui.number)
 
-    dialogues = SimpleNamespace(of=lambda _: dialogue, change=change)
-    context: Any = SimpleNamespace(
-        may_change=True, check_may_change=lambda: None, parts=SimpleNamespace(dialogues=dialogues)
-    )
-    return ParameterRow(context, dialogue, ParameterMeta(name=NAME)), dialogue
+    def answer(self, value: float) -> None:
+        """Let the aircraft report its value, which has 32 bits."""
+        message = mavlink.MAVLink_param_value_message(NAME.encode(), value, 9, 1, 0)
+        self.dialogue.parameters.handle(decoded(message), 0)
+
+    def enter(self, value: float) -> None:
+        self.field.set_value(value)
+        emit(self.field, "keydown.enter")
+
+    def _change(self, _: int, name: str, value: float) -> None:
+        self.sent.append(value)
+        self.dialogue.parameters.change(name, value, 0)
 
 
 def test_previous_value_is_sent_again_while_a_change_is_unanswered() -> None:
-    sent: list[float] = []
-    row, _ = row_of(sent)
+    row = Row()
     for value in (0.0, 0.8, 0.0):
-        row._set(value)
-    assert sent == [0.8, 0.0]
+        row.enter(value)
+    assert row.sent == [0.8, 0.0]
 
 
 def test_typed_value_is_not_overwritten_by_its_own_answer() -> None:
-    sent: list[float] = []
-    row, dialogue = row_of(sent)
-    row._field.set_value(0.8)
-    row._set(0.8)
-    # As 32 bits have it.
-    dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.800000011920929, 9, 0)
-    dialogue.parameters._changes.clear()
-    row.refresh(dialogue)
-    assert row._field.value == 0.8
-    row._set(0.8)
-    assert sent == [0.8]
-    dialogue.parameters.entries[NAME] = ParameterEntry(NAME, 0.5, 9, 0)
-    row.refresh(dialogue)
-    assert row._field.value == 0.5
+    row = Row()
+    row.enter(0.8)
+    row.answer(0.8)
+    row.row.refresh(row.dialogue)
+    assert row.field.value == 0.8
+    row.enter(0.8)
+    assert row.sent == [0.8]
+    row.answer(0.5)
+    row.row.refresh(row.dialogue)
+    assert row.field.value == 0.5
 
 
 def test_picture_has_a_longer_timeout_than_other_answers(
@@ -108,67 +132,64 @@ def test_picture_has_a_longer_timeout_than_other_answers(
     assert min(limits_s) >= 60.0
 
 
+class Page:
+    """A page with the card of the comparison, on which a share of the samples is collected."""
+
+    def __init__(self, share: float, *, may_change: bool = False) -> None:
+        self.share = share
+        self.asked: list[int] = []
+        self.failures: list[Exception] = []
+        """In which the comparisons end, one after the other."""
+        self.refreshes: list[Callable[[], None]] = []
+        dialogues = SimpleNamespace(of=lambda _: Dialogue(1), ask_for_samples=self.asked.append)
+        samples = SimpleNamespace(frames=self._fail, collected=lambda *_: self.share)
+        context: Any = SimpleNamespace(
+            system_id=1,
+            may_change=may_change,
+            parts=SimpleNamespace(dialogues=dialogues, samples=samples),
+            on_select=lambda _: None,
+            every=lambda _, refresh: self.refreshes.append(refresh),
+        )
+        ComparisonCard(context)
+        [self.button] = ElementFilter(kind=ui.button)
+
+    def _fail(self, _: int) -> None:
+        assert not self.button.enabled
+        raise self.failures.pop(0)
+
+
 @pytest.mark.parametrize(
-    ("error", "text"),
+    ("error", "reason"),
     [
-        (BrokenProcessPool("the process ended"), "Cannot be compared: the process ended."),
-        (
-            OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)),
-            "Cannot be compared: Cannot allocate memory.",
-        ),
-        (MemoryError(), "Cannot be compared: MemoryError."),
+        (BrokenProcessPool("the process ended"), "the process ended"),
+        (OSError(errno.ENOMEM, os.strerror(errno.ENOMEM)), "Cannot allocate memory"),
+        (MemoryError(), "MemoryError"),
     ],
 )
 def test_failed_comparison_reports_the_reason_and_can_be_repeated(
-    monkeypatch: pytest.MonkeyPatch, error: Exception, text: str
+    caplog: pytest.LogCaptureFixture, error: Exception, reason: str
 ) -> None:
-    card, failures = comparison_of(monkeypatch, [error, ComparisonError("no samples")])
-    with pytest.raises(type(error)):
-        asyncio.run(card._compare())
-    assert (card._summary.text, card._button.enabled) == (text, True)
-    asyncio.run(card._compare())
-    again = "Cannot be compared: no samples."
-    assert (card._summary.text, card._button.enabled) == (again, True)
-    assert failures == []
+    card = Page(1.0)
+    card.failures = [error, ComparisonError("no samples")]
+    for text in (reason, "no samples"):
+        emit(card.button, "click")
+        shown = [label.text for label in ElementFilter(kind=ui.label)]
+        assert f"Cannot be compared: {text}." in shown
+        assert card.button.enabled
+    assert card.failures == []
+    assert [record.exc_info[1] for record in caplog.records if record.exc_info] == [error]
 
 
 @pytest.mark.parametrize("may_change", [True, False])
 def test_opened_view_collects_samples_if_the_user_may_change_things(*, may_change: bool) -> None:
-    asked: list[int] = []
-    card = ComparisonCard(context_of(asked, share=0.4, may_change=may_change))
-    assert asked == [1] * may_change
-    assert not card._button.enabled
-    assert card._button.props["title"] == "Collecting samples: 40%"
-    card._context.parts.samples.collected = lambda *_: 1.0
-    card._refresh()
-    assert card._button.enabled
-
-
-def context_of(asked: list[int], *, share: float, may_change: bool) -> Any:
-    """A page on which that share of the needed samples is collected."""
-    dialogues = SimpleNamespace(of=lambda _: Dialogue(1), ask_for_samples=asked.append)
-    samples = SimpleNamespace(frames=lambda _: [], collected=lambda *_: share)
-    return SimpleNamespace(
-        system_id=1,
-        may_change=may_change,
-        parts=SimpleNamespace(dialogues=dialogues, samples=samples),
-        on_select=lambda _: None,
-        every=lambda *_: None,
-    )
-
-
-def comparison_of(
-    monkeypatch: pytest.MonkeyPatch, failures: list[Exception]
-) -> tuple[ComparisonCard, list[Exception]]:
-    """Build a card whose comparisons fail in these ways, one after the other."""
-    card = ComparisonCard(context_of([], share=1.0, may_change=False))
-
-    async def fail(*_: object) -> None:
-        assert not card._button.enabled
-        raise failures.pop(0)
-
-    monkeypatch.setattr(tuning_view, "compare_apart", fail)
-    return card, failures
+    card = Page(0.4, may_change=may_change)
+    assert card.asked == [1] * may_change
+    assert not card.button.enabled
+    assert card.button.props["title"] == "Collecting samples: 40%"
+    card.share = 1.0
+    for refresh in card.refreshes:
+        refresh()
+    assert card.button.enabled
 
 
 @pytest.mark.parametrize(
