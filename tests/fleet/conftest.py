@@ -1,7 +1,8 @@
 """A fleet that is a router, sites behind it with real sessions, and one ground station."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+import json
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.fleet.server import FleetServer
 from gateway.fleet.settings import FleetSettings, SiteSettings
 from gateway.hub.settings import HubSettings
+from gateway.hub.transports.zenoh.session import open_session, presence_key, session_config
+from gateway.live.control_socket import request
 from tests.kit.cli import invoke
 from tests.kit.hub import Rig, Station, proven, rig
 from tests.kit.mavlink import Sender
@@ -35,11 +38,8 @@ class World:
         self.vehicles: dict[str, Sender] = {}
         self.got: list[Any] = []
 
-    def open_site(
-        self, name: str, options: str = "", recordings: Path | None = None, extra: str = ""
-    ) -> Any:
-        url = f"zenoh:{self.locator}?site={name}{options}"
-        return self.add_site(name, url, extra=extra, recordings=recordings)
+    def open_site(self, name: str, options: str = "", **settings: Any) -> Any:
+        return self.add_site(name, f"zenoh:{self.locator}?site={name}{options}", **settings)
 
     def add_site(
         self,
@@ -50,33 +50,25 @@ class World:
         extra: str = "",
         recordings: Path | None = None,
     ) -> Any:
-        incoming: list[Any] = []
         rig = Rig()
-        rig.clock = self.rig.clock
-        rig.incoming = incoming
-        rig.vehicle = rig.sender(system)
+        rig.clock, rig.vehicle = self.rig.clock, rig.sender(system)
         hub = rig.hub(url, *filter(None, [extra]), recordings=recordings)
         self.rig.closing += rig.closing
-        self.sites[name], self.received[name], self.vehicles[name] = hub, incoming, rig.vehicle
+        self.sites[name], self.received[name], self.vehicles[name] = hub, rig.incoming, rig.vehicle
         return hub
 
     def exchange(self) -> None:
         """Send frames of every vehicle and the station, and read those that the station gets."""
         for name, hub in self.sites.items():
-            if hub._timer is not None:
-                self.rig.tick(hub)
-                hub.send(self.rig.out(self.vehicles[name].heartbeat()))
-                hub.send(self.rig.out(self.vehicles[name].attitude()))
+            self.rig.tick(hub)
+            hub.send(self.rig.out(self.vehicles[name].heartbeat()))
+            hub.send(self.rig.out(self.vehicles[name].attitude()))
         self.station.send(self.station.sender.heartbeat())
         reader = mavlink.MAVLink(None)
-        while True:
-            try:
-                data = self.station.socket.recv(65536)
-            except BlockingIOError:
-                return
+        for data in self.station.received():
             self.got += reader.parse_buffer(data) or []
 
-    async def until(self, condition: Callable[[], bool]) -> None:
+    async def until(self, condition: Callable[[], object]) -> None:
         async with asyncio.timeout(START_LIMIT_S):
             while not condition():
                 self.rig.clock.now_us += 100_000
@@ -91,6 +83,24 @@ class World:
         found = [link.decode(bytearray(each.frame)) for each in self.received[name]]
         return [message for message in found if message.get_type() == "COMMAND_LONG"]
 
+    def shown(self) -> dict[str, dict[str, Any]]:
+        """Return the sites in the fleet's status, by name."""
+        return {site["name"]: site for site in self.fleet.status()["sites"]}
+
+    def ids(self) -> dict[tuple[str, int], int]:
+        """Return the ids of vehicles that have one, by site and system."""
+        return {
+            (name, vehicle["system_id"]): vehicle["id"]
+            for name, site in self.shown().items()
+            for vehicle in site["vehicles"]
+            if vehicle["id"] is not None
+        }
+
+    async def ask(self, verb: str, **params: object) -> Any:
+        """Ask the fleet by its control socket, in a thread, since it answers here."""
+        path = self.fleet.control_socket
+        return await asyncio.to_thread(request, path, verb, params, timeout_s=START_LIMIT_S)
+
 
 async def run(*words: str) -> str:
     """Run a command as a person does, in a thread, since the fleet answers it here."""
@@ -100,28 +110,39 @@ async def run(*words: str) -> str:
 
 
 @pytest.fixture
-def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FleetSettings:
+def ids() -> dict[str, int]:
+    """Return the ids in the fleet's file when it starts."""
+    return {}
+
+
+@pytest.fixture
+def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ids: dict[str, int]) -> FleetSettings:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    file = tmp_path / "fleet.json"
+    if ids:
+        file.write_text(json.dumps(ids))
     return FleetSettings(
         listen=f"tcp/127.0.0.1:{free_port()}",
         sites=("field-*",),
-        ids_file=str(tmp_path / "fleet.json"),
+        ids_file=str(file),
         site=(SiteSettings(name="field-s", passphrase="secret"),),
     )
 
 
 @asynccontextmanager
 async def opened_world(
-    rig: Rig, settings: FleetSettings, hub: HubSettings | None = None, locator: str = ""
+    rig: Rig, settings: FleetSettings, hub: HubSettings, locator: str = ""
 ) -> AsyncIterator[World]:
     """Run a fleet with one ground station; sites reach it at its router, or at another address."""
-    hub = msgspec.structs.replace(hub or HubSettings(), endpoints=("udp-listen:127.0.0.1:0",))
-    fleet = FleetServer(settings, hub)
+    station = rig.station(free_port())
+    listener = "udp-listen:{}:{}".format(*station.target or ())
+    fleet = FleetServer(
+        settings, msgspec.structs.replace(hub, endpoints=(*hub.endpoints, listener))
+    )
     await fleet.start()
-    station = rig.station(fleet._hub.listening_ports()[0])
     async with asyncio.timeout(START_LIMIT_S):
-        while not fleet._session.is_open:
+        while not fleet.status()["is_linked"]:
             await asyncio.sleep(0.01)
     yield World(rig, fleet, locator or settings.listen, station)
     fleet.close()
@@ -129,6 +150,27 @@ async def opened_world(
 
 
 @pytest.fixture
-async def world(rig: Rig, settings: FleetSettings) -> AsyncIterator[World]:
-    async with opened_world(rig, settings) as world:
+def hub_settings() -> HubSettings:
+    """Return those of the fleet's hub, without the endpoint of the ground station."""
+    return HubSettings(endpoints=())
+
+
+@pytest.fixture
+async def world(
+    rig: Rig, settings: FleetSettings, hub_settings: HubSettings
+) -> AsyncIterator[World]:
+    async with opened_world(rig, settings, hub_settings) as world:
         yield world
+
+
+@pytest.fixture
+def forger(world: World) -> Iterator[Any]:
+    """Open a session at the fleet's router that is no gateway's."""
+    session = open_session(session_config(world.locator, ""))
+    yield session
+    session.close()
+
+
+def announce(session: Any, site: str, token: object = None) -> Any:
+    """Announce a session of a site, by default the announcing one."""
+    return session.liveliness().declare_token(presence_key(site, str(token or session.zid())))

@@ -1,9 +1,7 @@
 """Sites and a fleet with real sessions: frames, presence, loops, ids, status, metrics."""
 
 import asyncio
-import errno
 import json
-import os
 import socket
 import time
 from contextlib import suppress
@@ -13,34 +11,36 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.fleet import id_map
 from gateway.fleet import server as fleet_server
 from gateway.fleet.id_map import LAST_ID
 from gateway.fleet.server import FleetServer
 from gateway.fleet.settings import FleetSettings
 from gateway.hub.settings import HubSettings
-from gateway.hub.transports.zenoh.session import open_session, out_key, presence_key, session_config
-from gateway.live.control_socket import ControlError, request
+from gateway.hub.transports.zenoh.session import out_key
+from gateway.live.control_socket import ControlError
 from gateway.wire.mavlink_signing import EPOCH_2015_US, TICK_US, key_from_passphrase
-from tests.fleet.conftest import World, run
+from tests.fleet.conftest import World, announce, opened_world, run
+from tests.kit.hub import Rig
 from tests.kit.process import START_LIMIT_S, Process, wait_for
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io
 
 
-STATUSTEXT = 253
+@pytest.fixture
+def _polls_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fleet_server, "POLL_S", 0.01)
 
 
 async def test_two_aircraft_1_get_two_ids_and_a_command_reaches_the_right_one(world: World) -> None:
     for name in ("field-a", "field-b", "office"):
         world.open_site(name)
     await world.until(lambda: len(world.systems()) == 2)
-    ids = {site["name"]: site["vehicles"][0]["id"] for site in world.fleet.status()["sites"]}
-    assert set(ids) == {"field-a", "field-b"}
+    ids = world.ids()
+    assert set(ids) == {("field-a", 1), ("field-b", 1)}
     assert set(ids.values()) == world.systems() == {1, 2}
-    world.station.send(world.station.sender.command(ids["field-b"], 1))
-    await world.until(lambda: bool(world.commands("field-b")))
+    world.station.send(world.station.sender.command(ids["field-b", 1], 1))
+    await world.until(lambda: world.commands("field-b"))
     (command,) = world.commands("field-b")
     assert (command.target_system, command.get_srcSystem()) == (1, 255)
     assert not world.commands("field-a")
@@ -49,42 +49,48 @@ async def test_two_aircraft_1_get_two_ids_and_a_command_reaches_the_right_one(wo
     hub.send(world.rig.out(vehicle.pack(ack)))
     await world.until(lambda: any(m.get_type() == "COMMAND_ACK" for m in world.got))
     answer = next(m for m in world.got if m.get_type() == "COMMAND_ACK")
-    assert (answer.get_srcSystem(), answer.target_system) == (ids["field-b"], 255)
+    assert (answer.get_srcSystem(), answer.target_system) == (ids["field-b", 1], 255)
 
 
+@pytest.mark.usefixtures("_polls_often")
+@pytest.mark.parametrize("ids", [{f"field-many/{n}": n for n in range(1, LAST_ID + 1)}])
 async def test_id_of_an_abandoned_vehicle_is_passed_on(
     world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(fleet_server, "POLL_S", 0.01)
     monkeypatch.setattr(fleet_server, "ABANDONED_US", 0)
-    for system_id in range(1, LAST_ID + 1):
-        world.fleet._ids.set_by_hand("field-many", system_id, system_id)
     world.open_site("field-a")
-    await world.until(lambda: bool(world.systems()))
+    await world.until(world.systems)
     (own_id,) = world.systems()
-    assert world.fleet._ids.vehicle_of(own_id) == ("field-a", 1)
+    assert world.ids() == {("field-a", 1): own_id}
     assert (
         f"id {own_id} of field-many/{own_id}, not received for an hour, is now of field-a/1"
         in caplog.text
     )
 
 
+@pytest.mark.usefixtures("_polls_often")
 async def test_abandoned_site_is_removed_when_sites_are_full(
-    world: World, monkeypatch: pytest.MonkeyPatch
+    world: World, forger: Any, settings: FleetSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fleet_server, "MAX_SITES", 3)
-    fleet, now_us = world.fleet, fleet_server.ABANDONED_US
-    for name in ("field-1", "field-2", "field-3", "field-4"):
-        fleet._handle_presence(name, "token", True)
-    fleet._handle_presence("field-2", "token", False)
-    assert (sorted(fleet._sites), fleet._bad_names) == (["field-1", "field-2", "field-3"], 1)
-    fleet._make_room(now_us // 2)
-    assert "field-2" in fleet._sites
-    fleet._make_room(now_us + fleet._now_us())
-    fleet._handle_presence("field-4", "token", True)
-    assert sorted(fleet._sites) == ["field-1", "field-3", "field-4"]
-    assert {client.name for client in fleet._hub.clients()} >= set(fleet._sites)
-    assert "field-2" not in {client.name for client in fleet._hub.clients()}
+    tokens = {name: announce(forger, name) for name in ("field-1", "field-2", "field-3", "field-4")}
+    await world.until(lambda: world.fleet.status()["bad_names"])
+    assert list(world.shown()) == ["field-1", "field-2", "field-3"]
+    tokens["field-2"].undeclare()
+    await world.until(lambda: not world.shown()["field-2"]["is_here"])
+    # Ids are saved at the intervals at which room is made: once for each of the vehicles.
+    saved = Path(settings.ids_file)
+    for system in (1, 2):
+        forger.put(out_key("field-1", system), world.rig.sender(system).heartbeat())
+        await world.until(lambda n=system: saved.exists() and f"1/{n}" in saved.read_text())
+    assert "field-2" in world.shown()
+    monkeypatch.setattr(fleet_server, "ABANDONED_US", 0)
+    await world.until(lambda: "field-2" not in world.shown())
+    tokens["field-4"].undeclare()
+    tokens["field-4"] = announce(forger, "field-4")
+    await world.until(lambda: "field-4" in world.shown())
+    assert list(world.shown()) == ["field-1", "field-3", "field-4"]
+    assert "field-2" not in {client.name for client in world.fleet.status()["clients"]}
 
 
 async def test_frames_of_one_site_never_reach_another(world: World) -> None:
@@ -94,7 +100,7 @@ async def test_frames_of_one_site_never_reach_another(world: World) -> None:
     before = {name: hub.clients()[0].received for name, hub in world.sites.items()}
     await world.until(lambda: len(world.got) > 200)
     assert world.vehicles["field-a"].heartbeat() == world.vehicles["field-b"].heartbeat()
-    looped = [site["looped"] for site in world.fleet.status()["sites"]]
+    looped = [site["looped"] for site in world.shown().values()]
     assert looped == [0, 0], "equal frames of two vehicles are no loop"
     for name, hub in world.sites.items():
         senders = {each.frame[5] for each in world.received[name]}
@@ -107,29 +113,32 @@ async def test_disconnected_site_is_reported_once(world: World) -> None:
     world.open_site("field-a")
     world.open_site("field-b")
     await world.until(lambda: len(world.systems()) == 2)
-    world.sites["field-b"].close()
+    world.sites.pop("field-b").close()
     await world.until(lambda: any(m.get_type() == "STATUSTEXT" for m in world.got))
     for _ in range(20):
         world.exchange()
         await asyncio.sleep(0.01)
     texts = [m.text for m in world.got if m.get_type() == "STATUSTEXT"]
     assert texts == ["Site field-b disconnected"]
-    gone = {site["name"]: site["is_here"] for site in world.fleet.status()["sites"]}
-    assert gone == {"field-a": True, "field-b": False}
+    is_here = {name: site["is_here"] for name, site in world.shown().items()}
+    assert is_here == {"field-a": True, "field-b": False}
 
 
-async def test_frames_fed_back_through_a_site_end_after_one_round(world: World) -> None:
-    hub = world.open_site("field-a", extra="udp-listen:127.0.0.1:0")
-    world.fleet._ids.set_by_hand("field-a", 1, 7)
-    world.fleet._hub.add(f"udp:127.0.0.1:{hub.listening_ports()[0]}")
-    await world.until(lambda: world.fleet.status()["sites"][0:1] != [] and 7 in world.systems())
-    world.station.send(world.station.sender.command(7, 1))
-    await world.until(lambda: world.fleet.status()["sites"][0]["looped"] > 50)
-    (site,) = world.fleet.status()["sites"]
-    assert [(each["system_id"], each["id"]) for each in site["vehicles"]] == [(1, 7)]
-    assert [own_id for _, own_id in world.fleet._ids.items()] == [7]
-    assert len(world.commands("field-a")) == 1
-    assert "looped frames dropped" in await run("fleet", "status")
+@pytest.mark.parametrize("ids", [{"field-a/1": 7}])
+async def test_frames_fed_back_through_a_site_end_after_one_round(
+    rig: Rig, settings: FleetSettings
+) -> None:
+    port = free_port()
+    hub = HubSettings(endpoints=(f"udp:127.0.0.1:{port}",))
+    async with opened_world(rig, settings, hub) as world:
+        world.open_site("field-a", extra=f"udp-listen:127.0.0.1:{port}")
+        await world.until(lambda: 7 in world.systems())
+        world.station.send(world.station.sender.command(7, 1))
+        await world.until(lambda: world.shown()["field-a"]["looped"] > 50)
+        assert world.ids() == {("field-a", 1): 7}
+        assert json.loads(Path(settings.ids_file).read_text()) == {"field-a/1": 7}
+        assert len(world.commands("field-a")) == 1
+        assert "looped frames dropped" in await run("fleet", "status")
 
 
 async def test_rejected_frames_of_a_site_with_passphrase_are_counted(
@@ -139,8 +148,7 @@ async def test_rejected_frames_of_a_site_with_passphrase_are_counted(
     world.open_site("field-a")
     vehicle = world.rig.sender(1, signed=True)
     vehicle.link.signing.secret_key = key_from_passphrase("secret")
-    now_ticks = (time.time_ns() // 1000 - EPOCH_2015_US) // TICK_US
-    vehicle.link.signing.timestamp = now_ticks
+    vehicle.link.signing.timestamp = (time.time_ns() // 1000 - EPOCH_2015_US) // TICK_US
     world.vehicles["field-s"] = vehicle
     await world.until(lambda: len(world.systems()) == 2)
     forged = world.rig.sender(1, signed=True)
@@ -149,62 +157,45 @@ async def test_rejected_frames_of_a_site_with_passphrase_are_counted(
         hub.send(world.rig.out(frame))
 
     def counts() -> list[int]:
-        sites = {site["name"]: site for site in world.fleet.status()["sites"]}
-        return [sites["field-s"][kind] for kind in ("forged", "unsigned", "replayed")]
+        return [world.shown()["field-s"][kind] for kind in ("forged", "unsigned", "replayed")]
 
     await world.until(lambda: counts() == [1, 1, 1])
     shown = await run("fleet", "status")
     assert "frames of field-s dropped: 1 unsigned, 1 forged, 1 replayed" in shown
 
 
-async def test_garbage_and_invalid_site_names_are_counted(world: World) -> None:
-    import zenoh
+async def test_garbage_and_invalid_site_names_are_counted(world: World, forger: Any) -> None:
+    forger.put("mavlink/field-x/1/out", b"no MAVLink at all")
+    forger.put("mavlink/field- x/1/out", b"\xfd")
+    await world.until(lambda: world.fleet.status()["bad_names"])
+    assert {name: site["bytes_garbage"] for name, site in world.shown().items()} == {"field-x": 17}
 
-    config = zenoh.Config()
-    config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([world.locator]))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    with zenoh.open(config) as client:
-        client.put("mavlink/field-x/1/out", b"no MAVLink at all")
-        client.put("mavlink/field- x/1/out", b"\xfd")
-        await world.until(lambda: bool(world.fleet.status()["bad_names"]))
-        sites = {site["name"]: site for site in world.fleet.status()["sites"]}
-        assert sites["field-x"]["bytes_garbage"] == 17
-        assert set(sites) == {"field-x"}
+
+ASSIGNED = {"site": "field-a", "system_id": 1, "own_id": 77}
 
 
 async def test_assigned_id_is_used_shown_and_saved(world: World, settings: FleetSettings) -> None:
     world.open_site("field-a")
-    await world.until(lambda: bool(world.systems()))
-    socket_path = world.fleet.control_socket
-    params = {"site": "field-a", "system_id": 1, "own_id": 77}
-    answer = await asyncio.to_thread(
-        request, socket_path, "fleet.id", params, timeout_s=START_LIMIT_S
-    )
-    assert answer == ["field-a/1 = 77"]
+    await world.until(world.systems)
+    assert await world.ask("fleet.id", **ASSIGNED) == ["field-a/1 = 77"]
     await world.until(lambda: 77 in world.systems())
-    status = await asyncio.to_thread(request, socket_path, "fleet.status", {})
-    assert status["sites"][0]["vehicles"][0]["id"] == 77
+    [site] = (await world.ask("fleet.status"))["sites"]
+    assert site["vehicles"][0]["id"] == 77
     assert json.loads(Path(settings.ids_file).read_text()) == {"field-a/1": 77}
 
 
-async def test_id_that_cannot_be_saved_is_an_error(
-    world: World, settings: FleetSettings, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: object, **__: object) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    world.fleet._ids.set_by_hand("field-a", 1, 5)
-    unknown = {"site": "field-z", "system_id": 1, "own_id": 77}
+@pytest.mark.parametrize("ids", [{"field-a/1": 5}])
+async def test_id_that_cannot_be_saved_is_an_error(world: World, settings: FleetSettings) -> None:
     with pytest.raises(ControlError, match=r"unknown site 'field-z'; known: .*field-a"):
-        await asyncio.to_thread(request, world.fleet.control_socket, "fleet.id", unknown)
-    params = {"site": "field-a", "system_id": 1, "own_id": 77}
-    with monkeypatch.context() as patch:
-        patch.setattr(id_map, "write_new", refuse)
-        with pytest.raises(ControlError, match=r"not saved: .*fleet\.json: No space left"):
-            await asyncio.to_thread(request, world.fleet.control_socket, "fleet.id", params)
-    await world.until(Path(settings.ids_file).exists)
-    assert json.loads(Path(settings.ids_file).read_text()) == {"field-a/1": 77}
+        await world.ask("fleet.id", **ASSIGNED | {"site": "field-z"})
+    file = Path(settings.ids_file)
+    file.unlink()
+    file.mkdir()
+    with pytest.raises(ControlError, match=r"not saved: .*fleet\.json: Invalid argument"):
+        await world.ask("fleet.id", **ASSIGNED)
+    file.rmdir()
+    await world.until(file.exists)
+    assert json.loads(file.read_text()) == {"field-a/1": 77}
 
 
 @pytest.mark.parametrize(
@@ -252,39 +243,35 @@ def test_fleet_ends_on_sigterm_while_its_router_does_not_answer(tmp_path: Path) 
             assert fleet.end() == 0
 
 
-def site_of(world: World, name: str) -> dict[str, Any]:
-    return {site["name"]: site for site in world.fleet.status()["sites"]}.get(name, {})
-
-
+@pytest.mark.usefixtures("_polls_often")
+@pytest.mark.parametrize("hub_settings", [HubSettings(endpoints=(), ping_interval_s=0.05)])
 async def test_status_shows_round_trip_and_rate(world: World) -> None:
-    world.open_site("field-a")
-    world.open_site("field-b")
+    names = ("field-a", "field-b")
+    for name in names:
+        world.open_site(name)
     await world.until(lambda: len(world.systems()) == 2)
-
-    def asked() -> bool:
-        world.fleet._session.ask_round_trips()
-        return all(site_of(world, name)["round_trip_s"] for name in ("field-a", "field-b"))
-
-    await world.until(asked)
-    assert 0 < site_of(world, "field-a")["round_trip_s"] < 5
-    assert site_of(world, "field-a")["vehicles"][0]["rate_hz"] > 0
+    await world.until(lambda: all(world.shown()[name]["round_trip_s"] for name in names))
+    site = world.shown()["field-a"]
+    assert 0 < site["round_trip_s"] < 5
+    assert site["vehicles"][0]["rate_hz"] > 0
     shown = await run("fleet", "status")
     head, *rows = [line.split() for line in shown.splitlines() if line.strip()][1:]
     assert head == ["site", "RTT", "ms", "system", "id", "here", "Hz", "age", "s", "lost"]
-    assert {row[0] for row in rows} >= {"field-a", "field-b"}
+    assert {row[0] for row in rows} >= {*names}
     listed = json.loads(await run("fleet", "status", "--json"))
-    assert {site["name"] for site in listed["sites"]} == {"field-a", "field-b"}
+    assert {site["name"] for site in listed["sites"]} == {*names}
 
 
-async def test_metrics_contain_sites_and_vehicles(world: World) -> None:
-    world.open_site("field-a")
-    await world.until(lambda: bool(world.systems()))
+async def test_metrics_contain_sites_and_vehicles(rig: Rig, settings: FleetSettings) -> None:
     port = free_port()
-    world.fleet._metrics.listen(port)
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
-    text = (await reader.read()).decode()
-    writer.close()
+    hub = HubSettings(endpoints=(), metrics_port=port)
+    async with opened_world(rig, settings, hub) as world:
+        world.open_site("field-a")
+        await world.until(world.systems)
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
+        text = (await reader.read()).decode()
+        writer.close()
     assert "mavgate_fleet_linked 1.0" in text
     assert 'mavgate_fleet_site_here{site="field-a"} 1.0' in text
     assert 'mavgate_fleet_vehicle_lost_total{id="1",site="field-a",system="1"} 0.0' in text
@@ -294,46 +281,45 @@ async def test_metrics_contain_sites_and_vehicles(world: World) -> None:
 async def test_two_sites_of_one_name_are_reported(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
+    def sessions() -> int:
+        return world.shown().get("field-a", {}).get("sessions", 0)
+
     first = world.open_site("field-a")
-    await world.until(lambda: site_of(world, "field-a").get("sessions") == 1)
+    await world.until(lambda: sessions() == 1)
     world.open_site("field-a")
-    await world.until(lambda: site_of(world, "field-a")["sessions"] == 2)
+    await world.until(lambda: sessions() == 2)
     assert "2 sites are called 'field-a'" in caplog.text
     assert "2 of this name" in await run("fleet", "status")
     first.close()
-    await world.until(lambda: site_of(world, "field-a")["sessions"] == 1)
-    assert site_of(world, "field-a")["is_here"], "the other one is there still"
+    await world.until(lambda: sessions() == 1)
+    assert world.shown()["field-a"]["is_here"], "the other one is there still"
 
 
-async def test_one_session_under_many_names_takes_no_more_ids_than_one_site(world: World) -> None:
-    forger = open_session(session_config(world.locator, ""))
-    tokens = [
-        forger.liveliness().declare_token(presence_key(f"field-{n}", forger.zid()))
-        for n in range(6)
-    ]
-    ids = world.fleet._ids
+async def test_one_session_under_many_names_takes_no_more_ids_than_one_site(
+    world: World, forger: Any
+) -> None:
+    tokens = [announce(forger, f"field-{n}") for n in range(6)]
 
     def forge(least: int) -> bool:
         for number in range(6):
             for system in range(1, 60):
                 key = out_key(f"field-{number}", system)
                 forger.put(key, world.rig.sender(system).heartbeat())
-        return len(ids.items()) >= least
+        return len(world.ids()) >= least
 
     # Those of the one site that the session may announce, and of all without a session.
     await world.until(lambda: forge(100))
     world.open_site("field-late")
     await world.until(lambda: forge(101))
-    await world.until(lambda: ids.known_id("field-late", 1) is not None)
-    assert len(ids.items()) == 101
+    await world.until(lambda: ("field-late", 1) in world.ids())
+    assert len(world.ids()) == 101
     assert len(world.fleet.status()["without_session"]) == 5
     assert "sharing the ids of one site: field-" in await run("fleet", "status")
     for token in tokens:
         token.undeclare()
-    forger.close()
 
 
-async def test_excluded_vehicle_is_not_shown(world: World, tmp_path: Path) -> None:
+async def test_excluded_vehicle_is_not_shown(world: World, settings: FleetSettings) -> None:
     world.open_site("field-a")
     world.open_site("field-b")
     await world.until(lambda: len(world.systems()) == 2)
@@ -345,8 +331,6 @@ async def test_excluded_vehicle_is_not_shown(world: World, tmp_path: Path) -> No
 
     await world.until(one_is_left)
     assert "excluded: field-a/1" in await run("fleet", "status")
-    assert json.loads((tmp_path / "fleet.json").read_text())["field-a/1"] == 0
-    params = {"site": "field-a", "system_id": 1, "own_id": 9}
-    path = world.fleet.control_socket
-    await asyncio.to_thread(request, path, "fleet.id", params, timeout_s=START_LIMIT_S)
+    assert json.loads(Path(settings.ids_file).read_text())["field-a/1"] == 0
+    await world.ask("fleet.id", **ASSIGNED | {"own_id": 9})
     await world.until(lambda: 9 in world.systems())

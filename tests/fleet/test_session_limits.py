@@ -18,7 +18,7 @@ from gateway.fleet.session import (
 )
 from gateway.fleet.settings import FleetSettings
 from gateway.hub.settings import HubSettings
-from tests.fleet.conftest import World
+from tests.fleet.conftest import World, announce
 from tests.ports import free_port
 
 MUTUAL = {"enable_mtls": "true", "root_ca_certificate": '"/ca.pem"'}
@@ -71,17 +71,16 @@ async def test_insecure_fleet_warns_at_every_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    # No other machine can reach it: the address is only taken for one that is not loopback.
-    monkeypatch.setattr(fleet_session, "is_local", lambda _: False)
+    # No other machine can reach it, but it is not written as an address of loopback.
     settings = FleetSettings(
-        listen=f"tcp/127.0.0.1:{free_port()}", insecure=True, ids_file=str(tmp_path / "ids.json")
+        listen=f"tcp/127.1:{free_port()}", insecure=True, ids_file=str(tmp_path / "ids.json")
     )
     for _ in range(2):
         fleet = FleetServer(settings, HubSettings(endpoints=()))
         caplog.clear()
         await fleet.start()
         fleet.close()
-        assert "insecure: tcp/127.0.0.1" in caplog.text
+        assert "insecure: tcp/127.1" in caplog.text
         assert caplog.records[0].levelno == logging.WARNING
 
 
@@ -134,14 +133,12 @@ def test_endless_answers_are_cut_off(monkeypatch: pytest.MonkeyPatch, payload: b
         assert not payload
 
 
-async def test_forged_sessions_and_keys_of_a_site_are_bounded(world: World) -> None:
-    fleet = world.fleet
-    for number in range(100):
-        fleet._handle_presence("field-a", f"session-{number}", True)
-    assert len(fleet._sites["field-a"].tokens) == MAX_SESSIONS
-    sample = MagicMock(
-        payload=zenoh.ZBytes(b"x"), attachment=None, key_expr=f"mavlink/{'a' * 60_000}/1/out"
-    )
-    fleet._session._handle(sample)
-    assert fleet.status()["bad_names"] == 1
-    assert not fleet._session._keys
+async def test_forged_sessions_and_keys_of_a_site_are_bounded(world: World, forger: Any) -> None:
+    tokens = [announce(forger, "field-a", f"session-{number}") for number in range(100)]
+    tokens.append(announce(forger, "field-last"))
+    await world.until(lambda: "field-last" in world.shown())
+    assert world.shown()["field-a"]["sessions"] == MAX_SESSIONS
+    forger.put(f"mavlink/field-{'a' * 60_000}/1/out", b"x")
+    await world.until(lambda: world.fleet.status()["bad_names"])
+    for token in tokens:
+        token.undeclare()

@@ -45,7 +45,7 @@ class Memory:
             "texts": len(vehicle.texts.all),
             "newest": len(vehicle.state.fields),
             "frames": len(self.samples.frames(1)),
-            "rows": sum(columns.capacity for columns in self.history._vehicles[1].values()),
+            "rows": len(self.history.series(1, "ATTITUDE.roll")[0]),
         }
 
 
