@@ -283,7 +283,7 @@ def test_endpoint_is_added_to_file_with_comments_kept(tmp_path: Path) -> None:
         ("[panel]\nhosts = [1]", "must be a list, each entry a text in quotes"),
         ("[simulator]\ngps_outages_s = [[1]]", "each entry a list in brackets of 2 entries"),
         ('[recording]\nmode = "never"', "allowed: manual, in_flight, armed, always"),
-        ('[serial]\nport = "x"', "must be as described (where the receiver is"),
+        ('[serial]\nport = "x"', "must be as described (port of the receiver"),
         ('[hub]\nendpoints = ["192.168.1.20"]', "write udp:192.168.1.20:14550"),
         ('[hub]\nendpoints = ["udp:1.2.3.4:5?trust=no"]', "did you mean 'trusted'?"),
     ],

@@ -8,28 +8,28 @@ from gateway.settings import Settings, setting
 class SiteSettings(Settings, frozen=True):
     """Settings of one site."""
 
-    name: Annotated[str, setting("The site.", pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
+    name: Annotated[str, setting("Name of the site.", pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
     passphrase: Annotated[
         str,
         setting(
-            "Its signing passphrase. All its frames must be signed with it then: unsigned, forged "
-            "and replayed ones are dropped and counted. Signatures are renewed where a system id "
-            "changes."
+            "Signing passphrase of the site. With one, all its frames must be signed: unsigned, "
+            "forged and replayed ones are dropped and counted. Signatures are renewed where a "
+            "system id changes."
         ),
     ] = ""
 
 
 class FleetSettings(Settings, frozen=True):
-    """The vehicles of many sites at one place: `mavgate fleet`."""
+    """The fleet, which joins the vehicles of many sites: `mavgate fleet`."""
 
     router: Annotated[
-        str, setting("Zenoh router to connect to: tls/HOST:7447. Empty: it is the router itself.")
+        str, setting("Zenoh router to connect to: tls/HOST:7447. Empty: the fleet is the router.")
     ] = ""
     listen: Annotated[
         str,
         setting(
-            "Where it listens for sites as the router. Beyond loopback it needs TLS with client "
-            "certificates, or user and password, in zenoh_config."
+            "Address at which the router listens for sites. Beyond loopback it needs TLS with "
+            "client certificates, or user and password, in zenoh_config."
         ),
     ] = "tcp/127.0.0.1:7447"
     insecure: Annotated[
@@ -40,13 +40,13 @@ class FleetSettings(Settings, frozen=True):
         ),
     ] = False
     sites: Annotated[
-        tuple[str, ...], setting("Names of the sites to show; * stands for any letters.")
+        tuple[str, ...], setting("Names of the sites to show; * matches any characters.")
     ] = ("*",)
     zenoh_config: Annotated[
         str, setting("Zenoh's own configuration file: TLS, certificates, access control.")
     ] = ""
     vehicles_per_site: Annotated[
-        int, setting("Most system ids of one site, and of all sites of one client.", ge=1, le=249)
+        int, setting("Maximum system ids of a site, and of all sites of a client.", ge=1, le=249)
     ] = 50
     ids_file: Annotated[str, setting("File that keeps the system ids of all vehicles.")] = (
         "~/.config/mavgate/fleet.json"

@@ -29,7 +29,7 @@ class HubSettings(Settings, frozen=True):
     ] = ENDPOINTS
     max_clients: Annotated[
         int,
-        setting("Most clients that a listening endpoint serves at once.", ge=1, le=2000),
+        setting("Maximum clients of a listening endpoint.", ge=1, le=2000),
     ] = 32
     idle_timeout_s: Annotated[
         float,
@@ -55,8 +55,8 @@ class HubSettings(Settings, frozen=True):
     late_after_s: Annotated[
         float,
         setting(
-            "Of a system that is received on several links: a frame that is older than the "
-            "newest by more than this is dropped, as one from a congested mobile network.",
+            "A frame that is older than the newest of its system by more than this is dropped, if "
+            "the system is received on several links, one of which may be congested.",
             "s",
             ge=0.05,
             le=30,
@@ -64,7 +64,7 @@ class HubSettings(Settings, frozen=True):
     ] = 1.0
     ping_interval_s: Annotated[
         float,
-        setting("How often each client's round trip is measured; 0 never.", "s", ge=0, le=3600),
+        setting("Interval of measuring round trips; 0 measures none.", "s", ge=0, le=3600),
     ] = 5.0
     metrics_port: Annotated[
         int,

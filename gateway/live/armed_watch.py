@@ -12,7 +12,7 @@ from gateway.wire.mavlink_splitter import frame_of, message_id_of
 LOST_US: Final = 300 * US_PER_S
 """A vehicle without a heartbeat for longer counts as disarmed."""
 SHOWN: Final = 4
-"""Vehicles in the name of a recording."""
+"""Maximum vehicles in the name of a recording."""
 WATCHED: Final = frozenset({HEARTBEAT_ID, *RANKS})
 VehicleLocations = dict[int, tuple[float, float] | None]
 """Latitude and longitude in degrees by system id; None if they are not known."""
@@ -25,12 +25,12 @@ class ArmedWatch:
         self._newest = NewestVehicles()
 
     def feed(self, frame: bytes, now_us: int) -> None:
-        """Take in a frame that is recorded."""
+        """Process a frame that is recorded."""
         if message_id_of(frame) in WATCHED:
             self._newest.feed(frame_of(frame), now_us)
 
     def is_armed(self, now_us: int, own: Set[int]) -> bool:
-        """Return whether a vehicle is armed; the bit of own ones may follow the recording."""
+        """Return whether a vehicle is armed, except `own`, whose bit may follow the recording."""
         return bool(self._armed(now_us).keys() - own)
 
     def vehicles(self, now_us: int) -> VehicleLocations:

@@ -1,9 +1,8 @@
 """The live view in the terminal: link, aircraft and clients at a glance.
 
-Tables that are wider than the terminal are split into several below each other, so that all is
-legible at 40 columns; from `SIDE_BY_SIDE` columns on clients and rates are next to the aircraft. If
-there are too few rows, the end is cut off; so the most important comes first, and the message
-rates last.
+Tables that are wider than the terminal are split into several below each other, so that everything
+is legible at 40 columns; from `SIDE_BY_SIDE` columns on, clients and rates are next to the
+aircraft. With too few rows the end is cut off; so the message rates come last.
 """
 
 import logging
@@ -42,10 +41,10 @@ LOG_LINES: Final = 5
 RATE_SNAPSHOTS: Final = 11
 """Rates are averaged over this many views: a message of 1 Hz must not flicker between 0 and 2."""
 RATE_NAME: Final = 22
-"""Letters of the longest usual name, so that names and figures are aligned."""
+"""Characters of the longest usual name, so that names and figures are aligned."""
 
 SIDE_BY_SIDE: Final = 150
-"""Columns of a terminal from which on two halves are wide enough."""
+"""Columns of a terminal that is wide enough for two halves."""
 GAP: Final = 2
 KEYS: Final = "q quit   r record or stop   space pause the view"
 FIX_NAMES: Final = ("none", "dead reckoning", "2D", "3D", "3D", "time only")

@@ -27,24 +27,24 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MAX_LINE: Final = 64 << 10
-"""A request is short; a status of many clients has some thousand bytes."""
+"""Maximum bytes of a line: a request is short; a status of many clients has some thousand."""
 MAX_PATH: Final = 107
-"""Bytes of `sun_path`, less the zero at its end."""
+"""Bytes of `sun_path`, without the zero at its end."""
 MAX_CONNECTIONS: Final = 16
-"""Of more, the one that has waited longest for a request is closed."""
+"""Maximum connections; for a further one, that with the longest wait for a request is closed."""
 BACKLOG: Final = 128
-"""Connections that wait in the kernel, since each wake-up accepts one."""
+"""Connections that may wait in the kernel, since each wake-up accepts only one."""
 IDLE_S: Final = 60.0
 """A connection without a request is closed after this time."""
 FOLDER_RIGHTS: Final = 0o700
 SOCKET_RIGHTS: Final = 0o600
 SERVICE_SOCKET_RIGHTS: Final = 0o660
 SERVICE_FOLDER: Final = Path("/run/mavgate")
-"""Created by systemd for the unit."""
+"""Folder that systemd creates for the unit."""
 GROUP: Final = "mavgate"
 """Group whose members may control the service."""
 MAX_GATEWAYS: Final = 9
-"""Gateways of one user: `run.sock`, `run-2.sock`, …"""
+"""Maximum gateways of one user: `run.sock`, `run-2.sock`, …"""
 REQUEST_TIMEOUT_S: Final = 10.0
 STARTERS: Final = {
     "run": "`mavgate run` or `mavgate demo`",
@@ -64,11 +64,11 @@ JSON, a msgspec structure or a dataclass; it refuses by ControlError, ValueError
 """
 SOCKETS: Final = Path("/proc/self/net/unix")
 ACCEPTS: Final = "00010000"
-"""The flag of a socket that takes connections, see proc_net(5)."""
+"""The flag of a socket that accepts connections, see proc_net(5)."""
 
 
 class ControlError(UserError):
-    """A request that was refused, or no gateway to send it to; the text says why."""
+    """A request was refused, or there is no gateway to send it to; the text gives the reason."""
 
 
 class _Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -118,7 +118,7 @@ class ControlServer:
             self._socket = self._bound()
         except OSError as error:
             raise ControlError(f"control socket {self.path}: {error.strerror}") from error
-        # Imported here and below: clients do not need it, and it is half of a command's start-up.
+        # Imported here and below: clients do not need it, and it takes half of a command's start.
         from gateway.hub.transports.stream import accept_each
 
         accept_each(self._socket, self._on_connection, self._report)
@@ -189,7 +189,7 @@ class ControlServer:
         import asyncio
 
         reader, writer = await asyncio.open_unix_connection(sock=connection, limit=MAX_LINE)
-        # One that was accepted just before the end is served only after it.
+        # A connection that is accepted just before `close` arrives here after it.
         if self._socket is None or not self._is_allowed(writer) or not self._has_room():
             writer.close()
             return
@@ -198,7 +198,7 @@ class ControlServer:
                 writer.write(await self.answer(line))
                 await writer.drain()
         except (ConnectionError, ValueError, TimeoutError):
-            # Gone, idle, or a line beyond the limit.
+            # The client has gone, is idle, or sent a line beyond the limit.
             log.debug("Control connection ended early")
         finally:
             self._writers.pop(writer, None)
@@ -357,7 +357,7 @@ def live_sockets(name: str) -> list[Path]:
 
 
 def all_sockets() -> list[Path]:
-    """List the sockets of all that runs here: of this user, and of the system service."""
+    """List the live sockets of this user and of the system service."""
     services = (SERVICE_FOLDER / f"{name}.sock" for name in STARTERS)
     own = [path for name in STARTERS for path in live_sockets(name)]
     return [*dict.fromkeys([*own, *_listening().intersection(services)])]

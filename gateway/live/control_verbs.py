@@ -27,11 +27,11 @@ from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
 
 MAX_FRAMES: Final = 200
-"""Of an answer: each has some 60 bytes, and a line of the control socket holds 64 kB."""
+"""Maximum frames of an answer: some 60 bytes each, and a line of the control socket has 64 kB."""
 MAX_SAMPLES: Final = 400
-"""Between two requests: some seconds, and less than a line of the control socket may hold."""
+"""Maximum samples between two requests: some seconds, and less than a line of the socket."""
 IDLE_US: Final = 5 * US_PER_S
-"""Without a request for so long nothing is collected any more."""
+"""Samples are no longer collected after this time without a request."""
 Values = tuple[int, ...]
 """Time, accelerometer, gyroscope and magnetometer counts, temperature, three ranges, flags."""
 VehicleId = Annotated[int, msgspec.Meta(ge=1, le=255)]
@@ -151,14 +151,14 @@ class SerialVerbs:
         }
 
     async def _status(self) -> SerialStatus:
-        # In a thread: a USB hub that does not answer holds up the list.
+        # In a thread: a USB hub that does not answer delays the list.
         ports = await asyncio.to_thread(list_serial_ports)
         return replace(self._port.status(ports), is_fixed=self._is_simulated)
 
     async def _connect(self, port: str) -> SerialStatus:
         self._check_changeable()
         ports = await asyncio.to_thread(list_serial_ports)
-        # The one of the settings may be chosen even if this machine does not list it.
+        # The port of the settings may be chosen even if this machine does not list it.
         check_listed(port, {"auto", self._own, *(each.device for each in ports)})
         try:
             load_entry_points()
@@ -180,7 +180,7 @@ class SerialVerbs:
 def check_listed(port: str, known: set[str]) -> None:
     """Refuse a device that is not a known serial port.
 
-    Opening some devices has effects, as that of a watchdog, which restarts the machine.
+    Opening a device may have effects: that of a watchdog restarts the machine.
     """
     if {port, os.path.realpath(port)}.isdisjoint(known):
         listed = ", ".join(sorted(known)) or "none"
@@ -219,9 +219,9 @@ def introduction_verb(introduction: Callable[[int], list[bytes]]) -> Verbs:
 
 
 class ImuTap:
-    """Collects the raw samples of one aircraft while a client asks for them.
+    """Collect the raw samples of one aircraft while a client requests them.
 
-    `calibration` returns that of an aircraft, and raises LookupError for an unknown one;
+    `calibration` returns the calibration of an aircraft, and raises LookupError for an unknown one;
     `calibrate` sets it, and raises ControlError if it is refused.
     """
 
@@ -240,7 +240,7 @@ class ImuTap:
         return {"imu.samples": self._take, "imu.calibration": self._get, "imu.calibrate": self._set}
 
     def add(self, fused: FusedSample) -> None:
-        """Collect a sample, if a client asks for those of its aircraft."""
+        """Collect a sample, if a client requests those of its aircraft."""
         raw = fused.imu
         if raw is None or fused.vehicle_id != self._vehicle_id:
             return

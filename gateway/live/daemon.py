@@ -79,17 +79,17 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LONGEST_WAIT_S: Final = 0.1
-"""A sample may make something due sooner than was known when the timer was set."""
+"""Maximum interval of polls: a sample may make something due sooner than the timer is set to."""
 SHORTEST_WAIT_S: Final = 0.001
 SECRET_MESSAGES: Final = ids_of("CHANGE_OPERATOR_CONTROL", "SETUP_SIGNING")
-"""A recording is shared more easily than a password."""
+"""Messages that are not recorded: recordings are shared more easily than passwords."""
 
 
 class Daemon:
     """The running gateway: receiver in, MAVLink out.
 
     `aircraft` has the settings of single aircraft by vehicle id; `read` reads all settings again,
-    or raises ConfigError. `line` brings the frames of a simulated receiver instead of the serial
+    or raises ConfigError. `line` yields the frames of a simulated receiver instead of the serial
     port, or the bytes of a source of `simulated_kind`.
     """
 
@@ -109,7 +109,7 @@ class Daemon:
             settings = _with_simulated(settings, simulated_kind, self._receiver.path)
         serial = settings.serial
         self._own_ids = set[int]() if line is None else {*aircraft}
-        """Vehicle ids of our aircraft: those that a simulation has, or that were received."""
+        """Vehicle ids of our aircraft: the simulated ones, or those received so far."""
         self._settings = settings
         self._read = read
         self._plans = PlanFiles(aircraft_folder(settings), self._announce_plans)
@@ -128,7 +128,7 @@ class Daemon:
             recordings=Path(settings.recording.folder).expanduser(),
         )
         self._announcer = Announcer()
-        """Texts of a gateway without an aircraft of its own."""
+        """Sends the texts of a gateway without an aircraft of its own."""
         self._recorder = self._make_recorder()
         self._budget = RecordingBudget()
         callbacks = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
@@ -139,7 +139,7 @@ class Daemon:
         self._files = begin_worker("settings")
         self._metrics = MetricsServer(self._metrics_text)
         self._systems: SystemMetrics | None = None
-        """Only of a gateway that serves metrics."""
+        """None in a gateway that serves no metrics."""
         self._notifier = ServiceNotifier()
         self._sent: Counter[int] = Counter()
         self._lag = LoopLag()
@@ -189,10 +189,10 @@ class Daemon:
         )
 
     def start(self) -> None:
-        """Open everything; needs a running event loop. What is missing is retried."""
+        """Open everything; needs a running event loop. A missing port is retried."""
         if self._settings.hub.realtime_priority:
             set_realtime_priority(self._settings.hub.realtime_priority)
-        # Several, since a network that is down holds each look-up of a name for seconds.
+        # Several threads, since each look-up of a name takes seconds while the network is down.
         asyncio.get_running_loop().set_default_executor(begin_worker("lookups", 8))
         self._hub.start()
         self._recorder.start()
@@ -214,7 +214,7 @@ class Daemon:
     async def reload(self) -> str:
         """Apply changed settings of the hub and of signing; other clients stay connected.
 
-        Other changes apply at the next start: ground stations may have changed them meanwhile.
+        Other settings apply at the next start: ground stations may have changed them since.
 
         Raises ConfigError if the settings are wrong; then nothing is changed.
         """
@@ -286,8 +286,8 @@ class Daemon:
     def _serve_metrics(self) -> None:
         port = self._settings.hub.metrics_port
         if port:
-            # Here, since most gateways serve no metrics. Not at the first request either: loading
-            # the library then would stop the telemetry for 0.3 s.
+            # Imported here, since most gateways serve no metrics; not at the first request, because
+            # loading the library then would stop the telemetry for 0.3 s.
             systems = import_module("gateway.live.system_metrics")
             self._systems = self._systems or systems.SystemMetrics()
         else:
@@ -352,7 +352,7 @@ class Daemon:
 
     def _on_bytes(self, data: bytes, now_us: int) -> None:
         if now_us > self._lag.stalled_after_us:
-            # Before the samples that waited in the kernel: they are late for the same reason.
+            # Reported before the samples that waited in the kernel, which are late for this reason.
             self._watch_loop(now_us)
         self._perform(self._pipeline.feed(data, now_us))
 
@@ -391,7 +391,7 @@ class Daemon:
         self._budget.remove_client(client_id)
 
     def _send(self, frames: Sequence[Outgoing]) -> None:
-        # Also those that are only recorded: their numbers leave no gap at the clients.
+        # Frames that are only recorded too, so that their numbers leave no gap at the clients.
         self._hub.send_all(frames)
         for sent in frames:
             message_id, to = sent.message_id, sent.client_id
@@ -407,7 +407,7 @@ class Daemon:
                 self._recorder.frame(sent.frame)
 
     def _poll(self) -> None:
-        # First, so that the next turn comes whatever happens below.
+        # Scheduled first, so that the next turn follows even if an error is raised below.
         loop = asyncio.get_running_loop()
         self._timer = loop.call_later(LONGEST_WAIT_S, self._poll)
         now_us = self.now_us()
@@ -417,7 +417,7 @@ class Daemon:
             self._own_ids |= appeared
             loop.run_in_executor(None, self._warn_of_conflicts, appeared)
         for vehicle_id in self._broken_plans.keys() & self._pipeline.aircraft.keys():
-            # After its first heartbeat, before which ground stations ignore its messages.
+            # Only after its first heartbeat: ground stations ignore earlier messages.
             self._announce_plans(vehicle_id, self._broken_plans.pop(vehicle_id))
         self._note_recorder(now_us)
         wait_s = (self._pipeline.next_due_us() - now_us) / US_PER_S
@@ -427,7 +427,7 @@ class Daemon:
         self._lag.expect(self.now_us() + round(wait_s * US_PER_S))
 
     def _note_recorder(self, now_us: int) -> None:
-        """Exchange with the recorder whether to record, and whether it does."""
+        """Report the state of the vehicles to the recorder, and its state to the pipeline."""
         vehicles = [each.vehicle for each in self._pipeline.aircraft.values()]
         recorder = self._recorder
         recorder.set_in_flight(
@@ -449,7 +449,7 @@ class Daemon:
         }
 
     def _watch_loop(self, now_us: int) -> None:
-        """Report once that the event loop is starved, and excuse the nodes for a stall."""
+        """Report once that the event loop is late; a stall is not counted as loss of the nodes."""
         report = self._lag.update(now_us)
         if report.stalled_us:
             self._pipeline.on_stall(report.stalled_us, now_us)
@@ -519,9 +519,9 @@ class Daemon:
         self._perform_for(aircraft, aircraft.vehicle.on_saved(request, text, now_us, stored=stored))
 
     def _announce_plans(self, vehicle_id: int, trouble: str | None) -> None:
-        status = StatusText(INFO, "Mission, mark and home are kept again")
+        status = StatusText(INFO, "Mission, mark and home are stored again")
         if trouble is not None:
-            status = StatusText(WARNING, f"Mission, mark and home not kept: {trouble}")
+            status = StatusText(WARNING, f"Mission, mark and home not stored: {trouble}")
         aircraft = self._pipeline.find(vehicle_id)
         self._perform_for(aircraft, aircraft.vehicle.say(status, self.now_us()))
 
@@ -532,8 +532,8 @@ class Daemon:
 
 
 def _with_simulated(settings: GatewaySettings, kind: str, path: str) -> GatewaySettings:
-    """Let a simulated receiver, or a simulated source, take the place of those of the settings."""
-    # It is an aeroplane, which the names of most modes do not show.
+    """Replace the receiver or the sources of the settings by a simulated one."""
+    # The type is given because the names of most modes do not show that it is an aeroplane.
     url = f"{kind}:{path}" + ("?type=fixed_wing" if kind == "crsf" else "")
     found = (SourceSettings(url=url, vehicle=settings.simulator.vehicle_id),) if kind else ()
     serial = msgspec.structs.replace(settings.serial, port=NO_RECEIVER if kind else path)

@@ -1,8 +1,8 @@
 """Files kept for the next start: each aircraft's stored locations, and the signing timestamps.
 
-A file is replaced whole or not at all, by a separate thread, since writing to a disk may block. A
-failed write of locations is retried until it succeeds. A file that cannot be read is reported and
-left as it is: it may hold a mission that a person can repair.
+A separate thread replaces a file atomically, since writing to a disk may block. A failed write of
+locations is retried until it succeeds. A file that cannot be read is reported and left unchanged:
+it may contain a mission that a person can repair.
 """
 
 import asyncio
@@ -27,16 +27,16 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 NAME: Final = re.compile(r"(\d{1,3})\.places\.json")
 RETRY_S: Final = 10.0
-"""Soon for a person who has repaired a file or made room, and no load for a failing disk."""
+"""Interval of retries: short for a person who has freed disk space, no load for a failing disk."""
 TIMESTAMPS_NAME: Final = "signing-stamps.json"
 _Stream = Annotated[str, msgspec.Meta(pattern=r"^\d{1,3}\.\d{1,3}\.\d{1,3}$")]
 _Timestamp = Annotated[int, msgspec.Meta(ge=0, lt=1 << 49)]
 Kept = Mapping[int, dict[str, dict[str, int]]]
-"""By vehicle id; see `SigningTimestamps`."""
+"""Signing timestamps by vehicle id; see `SigningTimestamps`."""
 
 
 def begin_worker(name: str, most: int = 1) -> ThreadPoolExecutor:
-    """Start a thread at once: when its first job comes, the loop would wait for it."""
+    """Start a thread now, because the event loop would wait for its start at the first job."""
     worker = ThreadPoolExecutor(most, name)
     worker.submit(int)
     return worker
@@ -54,13 +54,13 @@ async def done_by(
 
 
 class PlanFiles:
-    """The files of all aircraft."""
+    """The plan files of all aircraft: missions, marks and homes."""
 
     def __init__(self, folder: Path, report: Callable[[int, str | None], None]) -> None:
         self.failures = 0
         """Changes that could not be written at once since the start."""
         self.broken: dict[int, str] = {}
-        """Why the plan of an aircraft could not be loaded, by vehicle id."""
+        """Reasons why plans could not be loaded, by vehicle id."""
         self._folder = folder
         self._report = report
         self._pending: dict[int, StoredPlan] = {}
@@ -92,7 +92,7 @@ class PlanFiles:
         return found
 
     def save(self, vehicle_id: int, plan: StoredPlan) -> None:
-        """Store the plan of an aircraft; returns at once, only the newest is written."""
+        """Store the plan of an aircraft; returns at once. Only the newest plan is written."""
         self._pending[vehicle_id] = plan
         self._start()
 
@@ -140,15 +140,15 @@ class PlanFiles:
             return
         self._failed[vehicle_id] = plan
         self.failures += 1
-        log.warning("plan of aircraft %d cannot be kept: %s; trying again", vehicle_id, reason)
+        log.warning("plan of aircraft %d cannot be stored: %s; trying again", vehicle_id, reason)
         self._report(vehicle_id, reason)
 
     def _note_success(self, vehicle_id: int, plan: StoredPlan) -> None:
-        # It stays until it is written, so that a shutdown in between loses nothing.
+        # The plan stays pending until it is written, so that a shutdown loses nothing.
         if self._pending[vehicle_id] is plan:
             del self._pending[vehicle_id]
         if self._failed.pop(vehicle_id, None):
-            log.info("plan of aircraft %d is kept again", vehicle_id)
+            log.info("plan of aircraft %d is stored again", vehicle_id)
             self._report(vehicle_id, None)
 
     def _write(self, vehicle_id: int, plan: StoredPlan) -> None:
@@ -164,7 +164,7 @@ def _broken(file: Path) -> str:
 
 
 class TimestampFile:
-    """The file of all aircraft."""
+    """The file with the signing timestamps of all aircraft."""
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / TIMESTAMPS_NAME
@@ -173,7 +173,7 @@ class TimestampFile:
         self._is_reported = False
 
     def load(self) -> Kept:
-        """Read the file; nothing if there is none, or it cannot be read."""
+        """Read the file; empty if it does not exist or cannot be read."""
         kind = dict[int, dict[str, dict[_Stream, _Timestamp]]]
         try:
             return msgspec.json.decode(self._file.read_bytes(), type=kind, strict=False)
@@ -189,13 +189,13 @@ class TimestampFile:
             return {}
 
     def save(self, timestamps: Kept) -> None:
-        """Store these; returns at once, only the newest is written."""
+        """Store timestamps; returns at once. Only the newest ones are written."""
         is_busy, self._waiting = self._waiting is not None, timestamps
         if not is_busy:
             self._worker.submit(self._write)
 
     def close(self, timestamps: Kept) -> None:
-        """Write these last if there are any, and end."""
+        """Write the last timestamps, if any, and end."""
         if timestamps:
             self.save(timestamps)
         self._worker.shutdown(wait=True)

@@ -1,8 +1,9 @@
 """A rate limit for the log, so that no repeated error fills the disk.
 
 A kind of line is the code position that writes it and, for an unexpected error, the one that
-raised it. Of each kind a few lines at once are written and then one a second; the next one written
-says how many were not. Time is monotonic: a wall clock that is set back suppresses no line.
+raised it. Each kind may write a few lines at once and then one a second; the next written line
+gives the number of suppressed ones. Time is monotonic, so setting the wall clock back suppresses
+no line.
 """
 
 import logging
@@ -13,10 +14,10 @@ from dataclasses import dataclass
 from typing import Final
 
 BURST: Final = 20
-"""Lines of a kind at once: a start with many endpoints writes one for each."""
+"""Maximum lines of a kind at once: a start with many endpoints writes one for each."""
 REFILL_S: Final = 1.0
 MAX_KINDS: Final = 1024
-"""Code positions; there are fewer, so none is discarded in practice."""
+"""Maximum code positions; there are fewer, so none is discarded in practice."""
 
 Kind = tuple[str, int, str]
 
@@ -29,7 +30,7 @@ class _Kind:
 
 
 class LogLimit(logging.Filter):
-    """Let a bounded number of lines of each kind through a handler."""
+    """Pass a bounded number of lines of each kind to a handler."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
@@ -37,7 +38,7 @@ class LogLimit(logging.Filter):
         self._kinds: dict[Kind, _Kind] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a line is written; the first after a gap says how many were not."""
+        """Return whether a line is written; the first after a gap gets the number of suppressed."""
         if len(self._kinds) >= MAX_KINDS:
             self._kinds.clear()
         now_s = self._clock()

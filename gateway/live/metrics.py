@@ -35,8 +35,8 @@ GATEWAY_COUNTERS: Final = {
 }
 NODE_COUNTERS: Final = {
     "received": "Radio payloads of a node that arrived.",
-    "lost": "Radio payloads of a node that never came: above some percent look at the antennas.",
-    "duplicates": "Payloads that came twice: the node received no acknowledgement of the first.",
+    "lost": "Radio payloads of a node that never arrived: above some percent check the antennas.",
+    "duplicates": "Payloads that arrived twice: the node received no acknowledgement of the first.",
     "restarts": "Restarts of a node: in flight a failing supply or its watchdog.",
 }
 NODE_GAUGES: Final = {
@@ -87,12 +87,12 @@ CLIENT_COUNTERS: Final = {
     "sent": "Frames sent to a client.",
     "dropped": "Frames dropped: the client is too slow for them, or out of reach.",
     "unheard": "Frames sent to a port without a listener, as before a station is started.",
-    "bytes_sent": "Bytes sent to a client; their rate over the width of its link is its load.",
+    "bytes_sent": "Bytes sent to a client; their rate over the link's bandwidth is its load.",
     "received": "Frames received from a client.",
     "bytes_garbage": "Bytes of a client that were not MAVLink: a wrong baud rate or program.",
 }
 CLIENT_GAUGES: Final = {
-    "queued": "Frames that wait for a client: it is slower than what it is sent.",
+    "queued": "Frames that wait for a client: its link is slower than its telemetry.",
     "open": "1 while frames reach the client as far as is known.",
     "round_trip_seconds": "Time of the newest answer to PING or TIMESYNC.",
 }
@@ -124,7 +124,7 @@ VALUES: Final[dict[str, Callable[[Any], float | None]]] = {
     "open": lambda port_or_client: port_or_client.state == "open",
     "round_trip_seconds": lambda client: client.round_trip_us and client.round_trip_us / US_PER_S,
 }
-"""By the name of the family; the others are attributes of the same name."""
+"""Functions by the name of the family; other families are attributes of the same name."""
 VALID: Final = {
     "attitude": NavFlags.ATTITUDE_VALID,
     "heading": NavFlags.HEADING_VALID,
@@ -143,7 +143,7 @@ CLIENT: Final = ("client", "name", "remote")
 
 
 class _Moment(Collector):
-    """The metrics of one moment, in place of a registry that counts by itself."""
+    """The metrics of one moment, instead of a registry with its own counters."""
 
     def __init__(self, found: Iterable[Metric]) -> None:
         self._found = found

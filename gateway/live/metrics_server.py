@@ -21,14 +21,14 @@ MAX_CONNECTIONS: Final = 8
 HOST: Final = re.compile(rb"^host:(.*?)\r$", re.IGNORECASE | re.MULTILINE)
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 RETRY_S: Final = 5.0
-"""Between attempts to bind a port in use: about the interval of a scraper."""
+"""Interval of attempts to bind a port in use: about the interval of a scraper."""
 
 
 class MetricsServer:
-    """Answer HTTP with the present metrics, unless a page asks under a name of its own."""
+    """Answer HTTP with the present metrics, except to pages that use another host name."""
 
     def __init__(self, text: Callable[[], Iterator[str]]) -> None:
-        """Serve the pieces of text that a function returns."""
+        """Serve the pieces of text that `text` returns."""
         self._text = text
         self._wanted = 0
         self._reason = ""
@@ -121,7 +121,7 @@ class MetricsServer:
             return b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n"
         pieces = []
         for piece in self._text():
-            # All of them take some milliseconds, so telemetry goes on between two.
+            # All pieces take some milliseconds, so telemetry is processed between two.
             await asyncio.sleep(0)
             pieces.append(piece.encode())
         await asyncio.sleep(0)

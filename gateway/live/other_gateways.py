@@ -1,4 +1,4 @@
-"""The gateways, players and fleets of this machine: which vehicles each sends, and to whom.
+"""The gateways, players and fleets of this machine, with the vehicles and clients of each.
 
 Two programs that send the same system id to one ground station show one vehicle that jumps.
 """
@@ -21,11 +21,11 @@ from gateway.printable import UNKNOWN
 log = logging.getLogger(__name__)
 
 ANSWER_S: Final = 1.0
-"""A gateway that was stopped answers nothing, and must not delay the start of another."""
+"""Timeout of an answer: a suspended gateway must not delay the start of another."""
 
 
 class Gateway(msgspec.Struct, frozen=True):
-    """A running gateway, player or fleet; without a process id where it does not answer us."""
+    """A running gateway, player or fleet; without a process id if it does not answer us."""
 
     socket: str
     pid: int | None = None
@@ -80,7 +80,7 @@ def other_gateways() -> list[Gateway]:
 
 
 def log_other_gateways() -> None:
-    """Log which others run."""
+    """Log the other gateways that run."""
     for other in other_gateways():
         log.warning("another gateway runs here: %s", other)
 

@@ -11,7 +11,7 @@ from gateway.recordings.tlog import Stamper, encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 
 PENDING_LIMIT: Final = 16 << 20
-"""Bytes that wait for a slow disk: minutes of telemetry. More is dropped."""
+"""Maximum bytes that wait for a slow disk: minutes of telemetry. More is dropped."""
 TLOG: Final = ".tlog"
 
 
@@ -24,20 +24,20 @@ class _Table:
     rows: RowBuilder = field(default_factory=RowBuilder)
     begun: bool = False
     has_head: bool = False
-    """Whether its head was taken to be written."""
+    """Whether its head was passed on to be written."""
 
 
 class Part:
-    """Bytes by the ending of their file's name, buffered until they are written to the disk."""
+    """Data buffered until it is written to the disk, by the ending of the file name."""
 
     def __init__(self, session: str, number: int, offset_us: int) -> None:
         self.session = session
-        """May be set until the first bytes are taken."""
+        """Name of the session; may be set until the first bytes are taken."""
         self.number = number
         self.stamper = Stamper(offset_us)
         self.pending: dict[str, bytearray] = {}
         self.size = 0
-        """Bytes added, those beyond the limit included."""
+        """Bytes added, including those dropped beyond the limit."""
         self._tables: dict[int, _Table] = {}
         self._introduced: set[int] = set()
 
@@ -63,7 +63,7 @@ class Part:
         self.add(TLOG, encode_record(self.stamper.stamp(now_us), frame))
 
     def introduces(self, vehicle_id: int) -> bool:
-        """Return whether this part has nothing of an aircraft yet; from then on it has."""
+        """Return whether an aircraft is new in this part, and note that it no longer is."""
         is_new = vehicle_id not in self._introduced
         self._introduced.add(vehicle_id)
         return is_new
@@ -81,7 +81,7 @@ class Part:
     ) -> None:
         """Buffer a record of an aircraft, for a table that was prepared."""
         if isinstance(record, NodeStatus):
-            # It begins no table: the first row must come first.
+            # A status does not begin a table: that begins with a row.
             if self._tables[vehicle_id].begun:
                 self.add(table_ending(vehicle_id), encode_line(record).encode())
             return
@@ -95,13 +95,13 @@ class Part:
         self.add(table_ending(header.vehicle_id), encode_line(header).encode())
 
     def add_note(self, note: TableNote) -> None:
-        """Add a remark to every table that has begun."""
+        """Add a note to every table that has begun."""
         for vehicle_id, table in self._tables.items():
             if table.begun:
                 self.add(table_ending(vehicle_id), encode_line(note).encode())
 
     def flush_rows(self) -> None:
-        """Buffer also the records that still wait for an IMU sample to share its row."""
+        """Buffer the records that still wait for the row of an IMU sample."""
         for table in self._tables.values():
             self._write(table, table.rows.flush())
 

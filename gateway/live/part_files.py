@@ -77,9 +77,9 @@ class PartFiles:
         return DiskState(max(self._sizes.values(), default=0), free_bytes_near(self._folder))
 
     def sync_job(self) -> Callable[[], None]:
-        """Return a function that waits until all written data is on the physical disk.
+        """Return a function that waits until all data written so far is on the physical disk.
 
-        It raises OSError if the disk fails. Other threads may write meanwhile, but not close.
+        It raises OSError if the disk fails. Other threads may write during the wait, but not close.
         """
         folder, self._has_new_names = self._folder if self._has_new_names else None, False
         return partial(_sync, tuple(self._files.values()), folder)
@@ -130,7 +130,7 @@ class PartFiles:
             while view:
                 view = view[os.write(file, view) :]
         except OSError:
-            # A full disk writes only the start of the data: no partial record may stay.
+            # A full disk writes only the start of the data: remove a partial record.
             with contextlib.suppress(OSError):
                 os.ftruncate(file, size)
             raise

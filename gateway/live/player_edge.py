@@ -1,7 +1,7 @@
 """The player's edge: emits the frames of recordings when they are due.
 
-While nothing plays, the state of the vehicles is repeated once a second: ground stations give up a
-vehicle without heartbeats.
+While nothing plays, the state of the vehicles is repeated once a second, because ground stations
+report a vehicle without heartbeats as lost.
 """
 
 import asyncio
@@ -15,10 +15,10 @@ from gateway.recordings.play import AS_FAST_AS_POSSIBLE, Player, PlayState, chec
 from gateway.units import US_PER_S
 
 BATCH: Final = 25
-"""Frames at once: to four clients a millisecond, after which others get their turn."""
+"""Maximum frames at once: a millisecond for four clients, after which others get their turn."""
 LONGEST_WAIT_S: Final = 0.5
 HOLD_US: Final = US_PER_S
-"""Between two repetitions of the state."""
+"""Interval of the repetitions of the state."""
 SEEKING: Final = "seeking"
 
 
@@ -28,17 +28,17 @@ class PlayerStatus:
 
     state: str
     position_s: float
-    """Since the start of the range."""
+    """Time since the start of the range."""
     duration_s: float
     time_us: int
     """Recorded civil time, µs since 1970."""
     speed: float | None
-    """None for as fast as possible."""
+    """Factor to real time; None for as fast as possible."""
     loop: bool
     sent: int
     files: tuple[str, ...]
     remark: str = ""
-    """How a request was not carried out as it was made."""
+    """Difference between the last request and its result; empty for none."""
 
 
 class PlayerEdge:
@@ -128,7 +128,7 @@ class PlayerEdge:
     def seek(self, to: str) -> PlayerStatus:
         """Move to a moment, as soon as it is ready; see `parse_moment`, also for its error.
 
-        A moment beyond the range is its begin or end, and the status says so.
+        A moment beyond the range becomes its begin or end, with a remark in the status.
         """
         player, moment = self._player, parse_moment(to)
         here_us = player.position_us if self._wanted_us is None else self._wanted_us

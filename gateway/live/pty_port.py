@@ -1,7 +1,7 @@
 """A pseudo-terminal that behaves like the receiver's serial port, at the true rate.
 
 A program that opens `path` reads the same as from a USB adapter: bytes at their times, and none
-buffered without a reader (except the kernel's few kilobytes, which opening flushes).
+from before (except the few kilobytes in the kernel, which opening flushes).
 """
 
 import asyncio
@@ -13,17 +13,17 @@ from typing import Final
 from gateway.simulator.timed_frame import TimedFrame
 
 MAX_LATE_S: Final = 1.0
-"""A frame that is later is dropped, as a receiver drops what nobody reads: sending it would delay
-the loop even more, and pausing the clocks of the nodes would look like a restart of them."""
+"""A later frame is dropped, as a receiver drops unread data: sending it would delay the loop even
+more, and pausing the clocks of the nodes would look like a restart of them."""
 SUSPENDED_S: Final = 60.0
-"""A loop delayed for longer, as by a suspended machine, continues where it was."""
+"""After a longer delay, as of a suspended machine, the frames continue without drops."""
 CATCH_UP_S: Final = 2.0
-"""Frames that are late for longer are made too slowly: dropping more of them would leave none."""
+"""Frames that stay late for longer are generated too slowly: all of them would be dropped."""
 DROPS_AT_ONCE: Final = 64
-"""Dropped frames cost little more than the generator that makes them."""
+"""Frames dropped in the time of writing one: they cost little more than their generation."""
 
 MAX_BATCH: Final = 4
-"""Frames written at once before the loop's other work gets its turn: some have to be made first."""
+"""Maximum frames written before the loop's other work gets its turn; some are generated first."""
 
 
 class PtyPort:
@@ -38,7 +38,7 @@ class PtyPort:
         self.ended = asyncio.Event()
         """Set after the last frame, and by closing."""
         self._frames = frames
-        # Here and not by `start`: the first frame takes as long as many of the others.
+        # Generated before `start`, since the first frame takes as long as many of the others.
         self._next = next(frames, None)
         self._rest = b""
         self._start_s = 0.0
@@ -98,7 +98,7 @@ class PtyPort:
         self._timer = loop.call_soon(self._advance)
 
     def _is_dropped(self, late_s: float) -> bool:
-        """Return whether to drop a late frame to catch up, or else to continue where it was."""
+        """Return whether to drop a late frame to catch up, instead of shifting the time."""
         now_s = asyncio.get_running_loop().time()
         if self._late_since_s is None:
             self._late_since_s = now_s
@@ -108,7 +108,7 @@ class PtyPort:
         return False
 
     def _write(self, data: bytes) -> None:
-        """Write one frame whole, or keep its end for the next time, or drop it."""
+        """Write one frame, keep its unwritten end for the next call, or drop it."""
         if self._rest:
             self._rest = self._rest[self._put(self._rest) :]
         if self._rest:

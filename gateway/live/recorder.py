@@ -1,16 +1,16 @@
-"""The recorder: records what passes through the gateway, and never delays it.
+"""The recorder: records the traffic of the gateway without delaying it.
 
 Linux has no way to write to a disk without waiting for it: a card that cleans up, or a network
 folder, blocks for seconds. So two other threads do all disk work. They get immutable values and
-return results; nothing is shared, so there is nothing to lock. Meanwhile the event loop buffers
-the next bytes, up to a limit.
+return results; nothing is shared, so there is nothing to lock. The event loop buffers the next
+bytes while they work, up to a limit.
 
-Every `flush_s` one thread gives the buffered bytes to the kernel, which survives a crash of the
-gateway; every `sync_s` the other has the kernel write them to the disk, which survives a power
-loss, and it closes, renames and copies what is finished. So no write waits for a slow sync, and
-the next sync begins once the last has ended. By default both times are half a second, so that
-either costs less than a second on a disk that syncs as fast; a card that is worn by this may be
-synced less often.
+Every `flush_s` one thread gives the buffered bytes to the kernel, where they survive a crash of the
+gateway; every `sync_s` the other has the kernel write them to the disk, where they survive a power
+loss, and it closes, renames and copies finished files. So no write waits for a slow sync, and the
+next sync begins once the last has ended. By default both times are half a second, so that a crash
+or a power loss costs less than a second of data if the disk syncs as fast; a longer `sync_s` wears
+a card less.
 """
 
 import asyncio
@@ -50,9 +50,9 @@ from gateway.units import US_PER_S
 
 log = logging.getLogger(__name__)
 HELD_US: Final = 30 * US_PER_S
-"""In the mode `armed` at least so much before arming is recorded, at most twice as much."""
+"""In the mode `armed`, the least time before arming that is recorded, and half the most."""
 HELD_BYTES: Final = PENDING_LIMIT // 4
-"""Most of a stretch that is held, but for one turn: faster telemetry is held for less time."""
+"""Maximum bytes held of a stretch, plus one turn's: faster telemetry is held for less time."""
 
 
 class Recorder:
@@ -94,13 +94,13 @@ class Recorder:
         self._disk = DiskState(0, 0)
         self._sync_due_us = 0
         self._syncing: Future[None] | None = None
-        """The sync that runs, or ended since the last flush."""
+        """The sync that is running, or has ended since the last flush."""
         self._writer, self._syncer = begin_worker("recorder"), begin_worker("syncer")
         self._wake = asyncio.Event()
         self._turned = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
         self._offsets: dict[int, int] = {}
-        """Civil time of gateway time zero with which each part of the session was written."""
+        """Civil time of gateway time zero used in each part of the session."""
         self._restamper = Restamper(round(settings.free_floor_mb * 1e6))
         self._restamping: asyncio.Task[None] | None = None
         self.folder = Path(settings.folder).expanduser()
@@ -112,13 +112,13 @@ class Recorder:
         self._civil.update_machine(self._machine_us(), self._clock())
         self._hold()
         if self._session.wanted:
-            # Nothing runs yet that could be delayed, and a table should begin with the estimator's
-            # first sample.
+            # Called directly: nothing can be delayed yet, and a table should begin with the first
+            # sample of the estimator.
             self._open_at_once()
         self._task = asyncio.get_running_loop().create_task(self._run())
 
     def close(self) -> None:
-        """Write what is pending and end; waits for the disk."""
+        """Write the pending data and end; waits for the disk."""
         for task in (self._task, self._restamping):
             if task is not None:
                 task.cancel()
@@ -136,7 +136,7 @@ class Recorder:
 
     async def settle(self) -> None:
         """Wait until all requests so far have been carried out."""
-        # The present turn may have begun before the request came.
+        # The present turn may have begun before the request.
         for _ in range(2):
             self._turned.clear()
             self._wake.set()
@@ -183,7 +183,7 @@ class Recorder:
         self._session.name = name
         if self._part is not None:
             self._part.session = name
-        # Not by the thread that writes.
+        # Not in the thread that writes.
         await done_by(self._syncer, sync_folder, self.folder)
 
     def status(self) -> RecorderStatus:
@@ -250,7 +250,7 @@ class Recorder:
                 part.change_settings(self._header(vehicle_id, part))
 
     def _parts(self) -> list[Part]:
-        """Return the part that is written; while none is, those in memory."""
+        """Return the part being written, or else those in memory."""
         return [part for _, part in self._memory] if self._part is None else [self._part]
 
     def _hold(self) -> None:
@@ -269,7 +269,7 @@ class Recorder:
             self._memory.popleft()
 
     def _new_part(self, session: str, number: int) -> Part:
-        """Start buffering for a part, the first of a session with what is held in memory."""
+        """Start buffering for a part; the first of a session begins with the data in memory."""
         if number == 1:
             self._offsets.clear()
         if number == 1 and self._memory:
@@ -282,7 +282,7 @@ class Recorder:
         return part
 
     def _begin_part(self, session: str, number: int) -> Part:
-        """Start buffering for a part; later, the fusion would be ahead of its first row."""
+        """Start buffering for a part, with the present state of the fusion for its head."""
         part = Part(session, number, self._civil.offset_us or 0)
         if self._settings.table:
             for vehicle_id in self._seen:
@@ -290,7 +290,7 @@ class Recorder:
         return part
 
     def _label_of(self) -> str:
-        """Return what follows the time in the name of a recording that begins now."""
+        """Return the text after the time in the name of a recording that begins now."""
         if self._settings.name == "time":
             return ""
         known = {} if self._watch is None else self._watch.vehicles(self._clock())
@@ -311,7 +311,7 @@ class Recorder:
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
-            # The time that a slow disk needs is subtracted from the pause.
+            # The pause is shorter by the time that a slow disk needs.
             due_s = loop.time() + self._settings.flush_s
             self._wake.clear()
             await self._turn()
@@ -368,7 +368,7 @@ class Recorder:
         """Carry out the session's actions; return its actions upon their outcome."""
         closing = self._part
         opening = next((action for action in actions if isinstance(action, OpenPart)), None)
-        # The next part buffers from here on, so that nothing is lost while the last one closes.
+        # The next part buffers from here on, so that no data is lost while the last one closes.
         if closing is not None and any(isinstance(a, ClosePart) for a in actions):
             closing.flush_rows()
             self._part = None
@@ -408,7 +408,7 @@ class Recorder:
                 self._say(action)
 
     def _trouble_of(self, error: OSError) -> str:
-        """Return why no part could be opened, with the path that the system refused."""
+        """Return the reason why no part could be opened, with the path that was refused."""
         return f"{error.filename or self.folder}: {reason_of(error)}"
 
     async def _open_part(self, action: OpenPart) -> list[SessionAction]:
@@ -427,7 +427,7 @@ class Recorder:
         return self._session.opened(self._clock())
 
     async def _close_part(self, part: Part | None, *, is_last: bool) -> None:
-        """Write the end of a part and close it behind its syncs; only for the last one wait."""
+        """Write the end of a part and close it after its syncs; wait only for the last one."""
         files, self._files = self._files, None
         syncing, self._syncing = self._syncing, None
         if part is None or files is None:
@@ -441,7 +441,7 @@ class Recorder:
         """Queue the finished parts of the session to be shifted to the true time."""
         await self._restamped()
         try:
-            # Not by the thread that syncs the part before.
+            # Not in the thread that syncs the previous part.
             found = await done_by(self._writer, find_recording, self.folder, self._session.name)
         except (OSError, RecordingError) as error:
             log.warning("Recording %s keeps its times: %s", self._session.name, error)

@@ -1,26 +1,26 @@
-"""Quotas of the bytes of each client that are recorded."""
+"""Quotas of recorded bytes for each client."""
 
 from typing import Final
 
 from gateway.hub.limits import TokenBucket
 
 TRUSTED_RATE: Final = 64_000
-"""Bytes a second for each client that may change things: more than any ground station sends."""
+"""Bytes a second for each trusted client: more than any ground station sends."""
 UNTRUSTED_RATE: Final = 4_000
-"""Bytes a second for all others together."""
+"""Bytes a second for all untrusted clients together."""
 BURST_S: Final = 16
-"""Length of a burst: a ground station requests much when it connects, then little."""
+"""Size of a burst as time: a ground station requests much when it connects, then little."""
 
 
 class RecordingBudget:
-    """Quotas of bytes that are recorded of each client; an unknown client is untrusted."""
+    """Quotas of recorded bytes for each client; an unknown client is untrusted."""
 
     def __init__(self) -> None:
         self._untrusted = _bucket(UNTRUSTED_RATE, 0)
         self._trusted: dict[int, TokenBucket] = {}
 
     def note(self, client_id: int, now_us: int, *, trusted: bool) -> None:
-        """Note whether a client may change things."""
+        """Note whether a client is trusted."""
         if not trusted:
             self._trusted.pop(client_id, None)
         elif client_id not in self._trusted:

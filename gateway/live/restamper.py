@@ -1,8 +1,8 @@
 """Finished files get their true times once GPS has provided them.
 
 A part may be larger than the memory and the disk slow, so a file is copied in small steps, between
-which the present recording is synced. The copy replaces the file in one step: a power cut leaves
-either.
+which the present recording is synced. The copy replaces the file atomically: a power cut leaves one
+of the two.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from gateway.recordings.tlog import Batch, TlogScanner
 log = logging.getLogger(__name__)
 
 STEP: Final = 1 << 16
-"""Bytes in one step: a millisecond's work."""
+"""Bytes copied in one step: a millisecond's work."""
 NEW: Final = ".new"
 
 
@@ -78,7 +78,7 @@ class Restamper:
                     yield
                 copy.flush()
                 os.fsync(copy.fileno())
-            # If it was deleted meanwhile, it must not come back.
+            # If the file was deleted during the copy, it must not reappear.
             if path.exists():
                 temporary.replace(path)
                 sync_folder(path.parent)

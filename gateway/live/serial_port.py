@@ -1,4 +1,4 @@
-"""The receiver's serial port: found by name, USB id or its frames, lost and found again.
+"""The receiver's serial port: found by name, USB id or its frames, and opened again after a loss.
 
 | state     | event                          | next                                      |
 | --------- | ------------------------------ | ----------------------------------------- |
@@ -32,17 +32,17 @@ log = logging.getLogger(__name__)
 
 FIRST_RETRY_S: Final = 0.25
 LONGEST_RETRY_S: Final = 1.0
-"""A port that returns and is lost again within the delay would be missed."""
+"""Longest delay of retries: a port that returns and is lost again within it would be missed."""
 READ_SIZE: Final = 48
-"""A sample of the IMU has 42. A backlog, of which the kernel keeps 4096 bytes, takes several turns
-of the loop, so that clients are not kept waiting, and the hub sends faster than samples come: with
-256 bytes its queue does not drain, and telemetry that has waited too long is dropped."""
+"""Bytes of one read; a sample of the IMU has 42. So a backlog, of which the kernel keeps 4096
+bytes, takes several turns of the loop: clients need not wait, and the hub's queue drains. With 256
+bytes it does not, and telemetry that has waited too long is dropped."""
 BITS_PER_BYTE: Final = 10
-"""On the line, start and stop bit included."""
+"""Bits per byte on the line, with start and stop bit."""
 
 ASK_S: Final = 6.0
-"""How long adapters are asked: opening a port resets a board, whose bootloader waits up to 2 s;
-then the receiver reports at least once a second."""
+"""Time for which adapters are tried: opening a port resets a board, whose bootloader waits up to
+2 s; then the receiver reports at least once a second."""
 ASK_AGAIN_S: Final = 30.0
 """Pause before adapters that sent no frame are opened again."""
 READ_ASKED: Final = 4096
@@ -63,16 +63,16 @@ NO_RECEIVER: Final = "none"
 
 
 class SerialSettings(Settings, frozen=True):
-    """Which port the receiver is on."""
+    """Serial port of the receiver."""
 
     port: Annotated[
         str,
         setting(
-            'Where the receiver is: a device ("/dev/ttyUSB0"), a USB id with or without its serial '
+            'Port of the receiver: a device ("/dev/ttyUSB0"), a USB id with or without its serial '
             'number ("usb:1a86:7523", "usb:0403:6001:A50285BI"), "auto" for a known USB adapter, '
-            'or "none" for a router without one. "auto" with other sources among the endpoints '
-            "does not report that none is there. If several fit, each is opened and asked for the "
-            "receiver's frames, which resets the boards behind them. `mavgate ports` lists them.",
+            'or "none" for a router without one. With other sources among the endpoints, "auto" '
+            "does not report a missing receiver. If several adapters fit, each is opened and "
+            "checked for frames, which resets its board. `mavgate ports` lists them.",
             pattern=r"^(auto|none|/.+|usb:[0-9a-fA-F]{4}:[0-9a-fA-F]{4}(:.+)?)$",
         ),
     ] = "auto"
@@ -103,11 +103,11 @@ class SerialStatus:
 
     state: Literal["open", "waiting", "closed"]
     wanted: str
-    """As the setting `port`."""
+    """The requested port, as in the setting `port`."""
     device: str
     """The open port; empty if none is."""
     reason: str
-    """Why it is not open yet."""
+    """The reason why it is not open yet."""
     ports: tuple[Port, ...]
     """All ports of this machine."""
     is_fixed: bool = False
@@ -240,9 +240,9 @@ def _open_each(devices: list[str], baud: int) -> tuple[dict[str, serial.Serial],
 
 
 async def find_receiver(settings: SerialSettings) -> str:
-    """Return the device of the receiver, asking every port if several fit the settings.
+    """Return the device of the receiver; if several ports fit the settings, all are tried.
 
-    Raises PortNotFoundError if nothing fits, none is the receiver, or the only one does not open.
+    Raises PortNotFoundError if no port fits, none is the receiver, or the only one does not open.
     """
     ports = list_serial_ports()
     fitting = fitting_ports(settings.port, ports)
@@ -257,7 +257,7 @@ async def find_receiver(settings: SerialSettings) -> str:
 class SerialPort:
     """Keep one serial port open and pass on its bytes.
 
-    One that is not needed is not missed: that it is not there is no warning.
+    A port that is not needed may be missing without a warning.
 
     `on_bytes` is called with every chunk and the gateway time of its reading; `on_open` and
     `on_lost` with the device, after each opening, before the first bytes, and after each loss.
@@ -285,7 +285,7 @@ class SerialPort:
         self._last_complaint = ""
         self._search: asyncio.Task[None] | None = None
         self._rejected: set[str] = set()
-        """Ports that were asked and are not the receiver."""
+        """Ports that were tried and are not the receiver."""
         self._asked_s = 0.0
         self._read_us = 0
         self._left_more = False
@@ -310,7 +310,7 @@ class SerialPort:
         self._release()
 
     async def connect(self, wanted: str) -> None:
-        """Close the port, and open the one that a setting `port` names, now or once it exists."""
+        """Close the port, and open the one named as in the setting `port`, once it exists."""
         await self.disconnect()
         self._settings = replace(self._settings, port=wanted)
         self._delay_s = FIRST_RETRY_S
@@ -349,7 +349,7 @@ class SerialPort:
         try:
             fitting = self._candidates(ports)
             if len(fitting) > 1:
-                log.info("several USB adapters fit, asking each: %s", ", ".join(fitting))
+                log.info("several USB adapters fit, trying each: %s", ", ".join(fitting))
                 self._search = asyncio.get_running_loop().create_task(self._ask(fitting))
                 return
             port = open_port(fitting[0], self._settings.baud, ports)
@@ -360,7 +360,7 @@ class SerialPort:
         self._use(port)
 
     def _candidates(self, ports: list[Port]) -> list[str]:
-        """List the ports that may be the receiver, without those that were asked lately."""
+        """List the ports that may be the receiver, without those that were tried lately."""
         fitting = fitting_ports(self._settings.port, ports)
         if asyncio.get_running_loop().time() - self._asked_s > ASK_AGAIN_S:
             self._rejected.clear()
@@ -368,7 +368,7 @@ class SerialPort:
         if left := [device for device in fitting if device not in self._rejected]:
             return left
         raise PortNotFoundError(
-            f"no receiver among {', '.join(fitting)}, which are asked again every "
+            f"no receiver among {', '.join(fitting)}, which are tried again every "
             f"{ASK_AGAIN_S:.0f} s; plug it in, or name its port in [serial] port or with --port"
         )
 
@@ -389,7 +389,7 @@ class SerialPort:
     def _use(self, port: serial.Serial) -> None:
         self._port, device = port, str(port.port)
         with contextlib.suppress(OSError, ValueError):
-            # An adapter may hold bytes back to send more at once, FTDI's for 16 ms.
+            # An adapter may delay bytes to send more at once, FTDI's by 16 ms.
             port.set_low_latency_mode(True)
         log.info("receiver on %s at %d baud", device, self._settings.baud)
         self._needed = True
@@ -402,12 +402,12 @@ class SerialPort:
     def _read(self, file: int) -> None:
         now_us, size = self._now_us(), READ_SIZE
         if self._left_more:
-            # As much as the line brought since: where clients make turns long, the samples come
-            # late, but none is lost in the kernel.
+            # As many bytes as the line has carried since: while clients make turns long, samples
+            # are late, but none is lost in the kernel.
             line_bytes = (now_us - self._read_us) * self._settings.baud // BITS_PER_BYTE
             size = max(READ_SIZE, line_bytes // US_PER_S)
         try:
-            # pyserial's own read makes two more system calls, for every sample.
+            # pyserial's own read would make two more system calls for every sample.
             data = os.read(file, size)
         except BlockingIOError:
             return
@@ -440,7 +440,7 @@ class SerialPort:
         self._delay_s = min(2.0 * self._delay_s, LONGEST_RETRY_S)
 
     def _complain(self, text: str) -> None:
-        """Log a problem once, however often it is repeated."""
+        """Log a problem once, even if it is repeated."""
         if text != self._last_complaint:
             if self._needed:
                 log.warning("%s; trying again until it works", text)

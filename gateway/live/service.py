@@ -1,12 +1,12 @@
-"""The process of a gateway: its event loop, the scheduler's priority, notifications to systemd.
+"""The process of a gateway: event loop, real-time priority, notifications to systemd.
 
 The notification protocol is one datagram of text to a socket that the environment names; see
 sd_notify(3). Without that variable nothing happens.
 
 `LoopLag` detects that the event loop does not get the processor time it needs: the daemon's timer
 measures how late it is called. A single long delay, or many short ones, mean that the computer is
-too slow or was stopped: samples are then lost on this side, which must not be taken for a fault of
-the nodes or the radio.
+too slow or was suspended: samples are then lost here, which must not count as a fault of the nodes
+or the radio.
 """
 
 import asyncio
@@ -24,21 +24,22 @@ from gateway.units import NS_PER_US, US_PER_S
 
 log = logging.getLogger(__name__)
 STALL_US: Final = 500_000
-"""A delay that loses samples: the kernel buffers about 0.4 s of them."""
+"""Shortest delay that loses samples: the kernel buffers about 0.4 s of them."""
 SPAN_US: Final = 10 * US_PER_S
 MAX_SHARE: Final = 0.3
-"""Delays that add up to more of the span mean that the loop cannot keep up."""
+"""Share of the span above which the sum of delays means that the loop is too slow."""
 WARM_UP_US: Final = 5 * US_PER_S
-"""At the start, loading machine code takes 0.25 s of a PC, several times that of a small board."""
+"""Delays at the start do not count: loading machine code takes 0.25 s on a PC, and several times
+that on a small board."""
 RECOVERED_US: Final = 60 * US_PER_S
 MAX_DELAYS: Final = 1000
-"""In a span; the timer fires at most every millisecond, but only delays are kept."""
+"""Maximum delays in a span; the timer fires at most every millisecond, but only delays are kept."""
 LEAST_DELAY_US: Final = 20_000
 NEVER_US: Final = 1 << 62
 
 
 class ServiceNotifier:
-    """Notify systemd that we are ready, alive, reloading or stopping."""
+    """Notify systemd that the service is ready, alive, reloading or stopping."""
 
     def __init__(self) -> None:
         self._address = os.environ.get("NOTIFY_SOCKET", "")
@@ -71,7 +72,7 @@ class ServiceNotifier:
     def _send(self, text: str) -> None:
         if not self._address:
             return
-        # A leading @ stands for the zero byte of an abstract socket.
+        # A leading @ means the zero byte of an abstract socket.
         address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
@@ -96,11 +97,11 @@ def run_event_loop(main: Coroutine[Any, Any, None], kind: str) -> None:
 
 
 def set_realtime_priority(priority: int) -> None:
-    """Request the round-robin real-time scheduler, for this thread and none that it starts.
+    """Request the round-robin real-time scheduler for this thread only.
 
     On a busy machine this keeps the worst latency below a millisecond, which niceness does not.
-    The threads that write to the disk do not get it. Priority 1 to 99, of which 1 is already above
-    everything ordinary; 0 goes back to the usual scheduler.
+    Threads that it starts, such as those that write to the disk, keep the usual scheduler. Of the
+    priorities 1 to 99, 1 is already above all ordinary threads; 0 restores the usual scheduler.
     """
     policy = os.SCHED_RR if priority else os.SCHED_OTHER
     try:
@@ -137,7 +138,7 @@ class LoopLag:
         self._delays: deque[tuple[int, int]] = deque(maxlen=MAX_DELAYS)
         self._slow_us = 0
         self.stalled_after_us = NEVER_US
-        """After this time the timer, if it has not been called, is late by a stall."""
+        """After this time, a timer that has not been called yet is late by a stall."""
         self._due_us: int | None = None
         self._begin_us: int | None = None
 

@@ -1,25 +1,25 @@
-"""When to record, into which part, and what to do when the disk fails.
+"""Decisions of the recorder: when to record, into which part, and how to handle disk errors.
 
 Theory of operation. The session never touches a file: it returns actions to its owner, which
 reports their outcome.
 
 | state     | event                              | becomes   | actions                           |
 | --------- | ---------------------------------- | --------- | --------------------------------- |
-| idle      | wanted (start, in flight, always)  | opening   | open part 1 of a new session      |
+| idle      | requested (start, flight, always)  | opening   | open part 1 of a new session      |
 | opening   | opened                             | recording | announce (first part only)        |
-| opening   | failed                             | blocked   | announce why                      |
-| recording | not wanted any more                | idle      | close, announce                   |
+| opening   | failed                             | blocked   | announce the reason               |
+| recording | no longer requested                | idle      | close, announce                   |
 | recording | part too large or too old          | opening   | close, open the next part         |
 | recording | the clock turns out to be wrong *  | opening   | close, correct, open the next     |
-| recording | too little free space, or failed   | blocked   | close, announce why               |
+| recording | too little free space, or failed   | blocked   | close, announce the reason        |
 | blocked   | retry is due and there is space    | opening   | open the next part                |
-| blocked   | not wanted any more                | idle      | announce                          |
+| blocked   | no longer requested                | idle      | announce                          |
 
 * Only once per part: the part that this opens is not corrected again. Otherwise clocks that
 disagree permanently would rewrite the session again and again.
 
-Whether a recording is wanted: a user's start or stop counts until the next one; without one the
-mode in the settings decides.
+A user's start or stop is valid until the next one; without one, the mode in the settings decides
+whether a recording is requested.
 """
 
 from dataclasses import dataclass
@@ -32,34 +32,34 @@ from gateway.units import US_PER_S
 
 RETRY_US: Final = 5 * US_PER_S
 RESUME_FACTOR: Final = 1.25
-"""Free space must exceed the floor by this before recording resumes, or it would flap."""
+"""Recording resumes when the free space exceeds the floor by this factor, which avoids flapping."""
 RESUME_LEAST_MB: Final = 1.0
-"""And this in any case: some ten seconds of recording."""
+"""Least free space to resume in any case: some ten seconds of recording."""
 PART_DIGITS: Final = 2
 
 
 Mode = Literal["manual", "in_flight", "armed", "always"]
 NameStyle = Literal["time", "vehicle", "place"]
 AFTER_US: Final = 10 * US_PER_S
-"""In the mode `armed` a recording goes on for so long after disarming."""
+"""Time for which a recording continues after disarming, in the mode `armed`."""
 
 
 class RecordingSettings(Settings, frozen=True):
-    """What is recorded, where, and when."""
+    """Content, location and times of recordings."""
 
     mode: Annotated[
         Mode,
         setting(
             "manual: on command only; in_flight: from arming or take-off to landing; armed: from "
-            "at least 30 s before arming, out of memory, to 10 s after disarming; always: as "
+            "at least 30 s before arming (held in memory) to 10 s after disarming; always: as "
             "long as the gateway runs."
         ),
     ] = "in_flight"
     name: Annotated[
         NameStyle,
         setting(
-            "Name of a recording: time of its begin; vehicle: and the ids of its vehicles; place: "
-            "and where the first of them is then."
+            "Name of a recording. time: its start time; vehicle: also the ids of its vehicles; "
+            "place: also the location of the first of them at the start."
         ),
     ] = "time"
     folder: Annotated[
@@ -86,13 +86,13 @@ class RecordingSettings(Settings, frozen=True):
         float, setting("Recording stops when the disk has less space left.", "MB", ge=0, le=1e6)
     ] = 200.0
     flush_s: Annotated[
-        float, setting("Most that is lost when the gateway is killed.", "s", ge=0.05, le=1)
+        float, setting("Longest loss when the gateway is killed.", "s", ge=0.05, le=1)
     ] = 0.5
     sync_s: Annotated[
         float,
         setting(
-            "How often data is synced to the disk; longer spares a card, but a loss of power "
-            "costs more.",
+            "Interval of syncs to the disk. Long: less wear of a card. Short: less lost by a "
+            "power failure.",
             "s",
             ge=0.05,
             le=60,
@@ -111,7 +111,7 @@ class RecordingSettings(Settings, frozen=True):
 
     @property
     def unpacked_limit(self) -> int:
-        """The same in bytes."""
+        """`unpacked_limit_mb` in bytes."""
         return round(self.unpacked_limit_mb * 1e6)
 
 
@@ -126,7 +126,7 @@ class SessionState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OpenPart:
-    """Open the files of a part; answer by `opened` or `failed`."""
+    """Open the files of a part; report the outcome by `opened` or `failed`."""
 
     session: str
     part: int
@@ -139,7 +139,7 @@ class ClosePart:
 
 @dataclass(frozen=True, slots=True)
 class Announce:
-    """Announce to the user."""
+    """Announce a text to the user."""
 
     is_trouble: bool
     text: str
@@ -147,7 +147,7 @@ class Announce:
 
 @dataclass(frozen=True, slots=True)
 class CorrectTimes:
-    """Correct the times of the files of the session, all closed; it keeps its announced name."""
+    """Correct the times in the files of the session, which are closed; its name stays."""
 
 
 SessionAction = OpenPart | ClosePart | Announce | CorrectTimes
@@ -178,7 +178,7 @@ class Session:
         """Name of the session that runs, or ran last."""
         self.part = 0
         self.reason = ""
-        """Why it is blocked."""
+        """The reason why it is blocked."""
         self._begin_us = self._end_us = 0
         self._until_us = 0
         """End of the time after disarming."""
@@ -186,12 +186,12 @@ class Session:
 
     @property
     def duration_s(self) -> float:
-        """How long the session has recorded, or did."""
+        """Duration of the present session, or of the last one."""
         return (self._end_us - self._begin_us) / US_PER_S
 
     @property
     def wanted(self) -> bool:
-        """Whether there should be a recording now."""
+        """Whether a recording is requested now."""
         if self._requested is not None:
             return self._requested
         mode = self._settings.mode

@@ -1,4 +1,4 @@
-"""The transports of sources: they bring bytes, and reconnect.
+"""The transports of sources: they receive bytes and reconnect.
 
 | transport  | opened                                        | lost                              |
 | ---------- | --------------------------------------------- | --------------------------------- |
@@ -6,11 +6,11 @@
 | udp        | at once; an address in use is tried again     | never                             |
 | tcp        | when the server accepts                       | closed by the server: tried again |
 | tcp-listen | when a client connects, one at a time         | when it leaves                    |
-| poll       | when the server answers                       | when it does not: tried again     |
+| poll       | when the server answers                       | without an answer: tried again    |
 | push       | with the first content                        | never                             |
 | stdin      | at once                                       | at its end, for good              |
 | file       | as soon as it exists, from its beginning      | shortened: read from its beginning|
-| (a tlog)   | the same, at the times of what it holds       | at its end, for good              |
+| (a tlog)   | the same; bytes at their recorded times       | at its end, for good              |
 """
 
 import asyncio
@@ -40,10 +40,10 @@ RETRY_S: Final = 1.0
 FILE_POLL_S: Final = 0.05
 POLL_S: Final = 0.1
 ANSWER_S: Final = 3.0
-"""Longest time for an answer."""
+"""Timeout of an answer."""
 MAX_ANSWER: Final = 1 << 20
 TOKEN_BYTES: Final = 9
-"""Of a token that the URL does not set: 72 bits."""
+"""Bytes of a token that the URL does not set: 72 bits."""
 DEFAULT_BAUD: Final = {"crsf": 420_000, "ltm": 9600}
 USUAL_BAUD: Final = 115_200
 
@@ -68,7 +68,7 @@ class SourcePort:
         self._task: asyncio.Task[None] | None = None
         self._complaint = ""
         self.token = ""
-        """By which content is pushed; empty if this source takes none."""
+        """Token for pushing content; empty if this source accepts none."""
         if source.url.transport == "push":
             self.token = source.url.options.get("token") or secrets.token_urlsafe(TOKEN_BYTES)
 
@@ -118,7 +118,7 @@ class SourcePort:
         self._source.lost(reason)
 
     def _lost(self, reason: str) -> None:
-        """Note and log once why it is not open."""
+        """Note, and log once, the reason why it is not open."""
         if self._source.connected or reason != self._complaint:
             log.warning("source %s: %s; trying again", self._source.url.name, reason)
         self._complaint = reason
@@ -137,7 +137,7 @@ class SourcePort:
             port.close()
 
     async def _read_file(self, port: serial.Serial) -> None:
-        """Read an open port until it hangs up."""
+        """Read an open port until it is disconnected."""
         loop, lost = asyncio.get_running_loop(), asyncio.get_running_loop().create_future()
         file = port.fileno()
 
@@ -204,7 +204,7 @@ class SourcePort:
             writer.close()
 
     async def _poll(self) -> None:
-        """Send the decoder's requests, and take each answer as a line."""
+        """Send the decoder's requests, and pass each answer on as a line."""
         decoder = self._source.decoder
         assert isinstance(decoder, PolledDecoder)
         url = self._source.url
@@ -230,7 +230,7 @@ class SourcePort:
         self._source.count(Fault("token", size, "a post to the panel had a wrong token"))
 
     def push(self, data: bytes) -> None:
-        """Take content that was posted with the token."""
+        """Process content that was posted with the token."""
         if data and not self._source.connected:
             self._opened()
         self._feed(data)
@@ -253,7 +253,7 @@ class SourcePort:
             self._feed(data)
 
     async def _file(self) -> None:
-        """Follow a file; one that has become shorter was written again."""
+        """Follow a file; one that has become shorter is read again from its beginning."""
         path = self._source.url.address
         if path.endswith(TLOG):
             await self._recorded(path)
@@ -270,14 +270,14 @@ class SourcePort:
                 await asyncio.sleep(FILE_POLL_S)
 
     async def _recorded(self, path: str) -> None:
-        """Read what a recording has of this source, at the times at which it came."""
+        """Read the bytes of this source from a recording, at their recorded times."""
         from gateway.recordings.tlog import TlogScanner
 
         scanner, loop, start_s = TlogScanner(), asyncio.get_running_loop(), None
         with open(path, "rb") as file:  # noqa: PTH123
             self._opened()
             while block := file.read(READ_SIZE):
-                # It may hold gigabytes of other messages.
+                # The recording may contain gigabytes of other messages.
                 await asyncio.sleep(0)
                 batch = scanner.feed(block)
                 for record in batch.records(np.flatnonzero(batch.message_ids == TUNNEL_ID)):
@@ -294,7 +294,7 @@ async def _get(host: str, port: int, path: str) -> bytes:
     """Request a path by HTTP, and return the answer's content; raises OSError without one."""
     reader, writer = await asyncio.open_connection(host, port)
     try:
-        # Of version 1.0 an answer ends with the connection.
+        # In version 1.0 an answer ends with the connection.
         writer.write(f"GET {path} HTTP/1.0\r\nHost: {host}:{port}\r\n\r\n".encode())
         answer = b""
         while len(answer) <= MAX_ANSWER and (data := await reader.read(READ_SIZE)):
@@ -303,7 +303,7 @@ async def _get(host: str, port: int, path: str) -> bytes:
         writer.close()
     head, gap, content = answer.partition(b"\r\n\r\n")
     if head.split()[1:2] != [b"200"] or not gap or len(answer) > MAX_ANSWER:
-        raise ConnectionError("no answer of HTTP with status 200")
+        raise ConnectionError("no HTTP answer with status 200")
     return content
 
 
@@ -315,10 +315,10 @@ class _Datagrams(asyncio.DatagramProtocol):
         self.closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     def datagram_received(self, data: bytes, _address: object) -> None:
-        """Pass on a datagram, which ends its last line."""
+        """Pass on a datagram."""
         self._feed(data)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
-        """End the wait."""
+        """Report that the socket is closed."""
         if not self.closed.done():
             self.closed.set_result(None)

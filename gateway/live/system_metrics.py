@@ -1,7 +1,7 @@
 """Metrics of every vehicle of the hub, foreign ones included, from their newest MAVLink.
 
-The frames of a system that were lost on its way here are counted by its sequence numbers; several
-links to one system count the frames that all of them lost.
+The lost frames of a system are counted by its sequence numbers; with several links to one system,
+only frames that all of them lost count.
 """
 
 import math
@@ -18,16 +18,16 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
 
 MAX_SYSTEMS: Final = 32
-"""Values of the label; a time series each, and more are forged."""
+"""Maximum values of the label, each a time series; more are forged."""
 SYSTEM: Final = ("system",)
 HALF: Final = 128
-"""A number that is further ahead is an older one, of a frame that came late or twice."""
+"""A sequence number that is further ahead is an older one, of a late or repeated frame."""
 Value = Callable[[NewestState, int], float]
 
 
 @dataclass(slots=True)
 class _Stream:
-    """Frames of the vehicle of a system."""
+    """Frame counters of the vehicle of a system."""
 
     sequence: int
     frames: int = 0
@@ -84,7 +84,7 @@ class SystemMetrics:
             stream.count(frame.sequence)
 
     def families(self, now_us: int) -> Iterator[Metric]:
-        """Yield the metrics of the systems that were heard lately."""
+        """Yield the metrics of the systems that were received recently."""
         present = self._present(now_us)
         for name, (text, value_of) in GAUGES.items():
             samples = [

@@ -1,9 +1,9 @@
-"""A process and its terminal: how it ends, keys, and output that never blocks.
+"""A process and its terminal: its end, keys, and output that never blocks.
 
 A parent process gives a child a pipe as standard input and keeps the other end open: the kernel
 closes that end even if the parent is killed. A terminal that is stopped (Ctrl-S, a hanging
 connection) and a pipe that is not read block a writing process, which in a gateway would be the
-event loop; so a thread writes, and output beyond a bound is dropped meanwhile.
+event loop; so a thread writes, and while it is blocked, output beyond a bound is dropped.
 """
 
 import asyncio
@@ -23,9 +23,9 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final, TextIO
 
 READ_BYTES: Final = 1024
-"""Nothing is meant to come; what comes is ignored."""
+"""Bytes of one read of standard input, whose content is ignored."""
 MAX_TEXTS: Final = 256
-"""Lines of the log, or pictures of the live view, that wait: at most about a megabyte."""
+"""Maximum waiting texts, lines of the log or live views: at most about a megabyte."""
 FLUSH_TIMEOUT_S: Final = 1.0
 """Longest wait at the end for pending output."""
 KEY_BYTES: Final = 64
@@ -46,9 +46,9 @@ def on_parent_gone(end: Callable[[], None]) -> None:
 
 
 def on_end_signals(end: Callable[[], None]) -> None:
-    """Call back on the running event loop on SIGINT, SIGTERM, and SIGHUP, with a terminal's end.
+    """Call back on the running event loop on SIGINT, SIGTERM, and SIGHUP (terminal closed).
 
-    SIGHUP stays ignored where it is at the start, as by `nohup`.
+    SIGHUP stays ignored if it is ignored at the start, as by `nohup`.
     """
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -78,7 +78,7 @@ class DetachedStream(io.TextIOBase):
 
     @property
     def encoding(self) -> str:  # type: ignore[override]
-        """That of the stream."""
+        """Encoding of the stream."""
         return self._stream.encoding
 
     def fileno(self) -> int:
@@ -115,7 +115,7 @@ class DetachedStream(io.TextIOBase):
                 except BlockingIOError:
                     select.select([], [self._file], [])
                 except OSError:
-                    # The terminal has gone, or the disk is full: nobody reads this one.
+                    # The terminal has gone, or the disk is full: the text is lost.
                     break
 
 

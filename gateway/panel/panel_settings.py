@@ -10,9 +10,9 @@ LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
 ORIGIN: Final = re.compile(r"https?://[a-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
 """Origin of a page as a browser writes it; the port only if it is not the default one."""
 LEAST_COST: Final = 1 << 14
-"""Least N of scrypt: fewer make a stolen hash easy to guess."""
+"""Least N of scrypt: a smaller one makes a stolen hash easy to guess."""
 LEAST_BYTES: Final = 16
-"""Of salt and digest."""
+"""Least length of salt and of digest."""
 
 
 class MapStyle(Settings, frozen=True):
@@ -22,8 +22,8 @@ class MapStyle(Settings, frozen=True):
     url: Annotated[
         str,
         setting(
-            "Where its tiles come from, with {z}, {x} and {y} in it: an https:// or http:// URL, "
-            "or the path of an MBTiles or PMTiles file.",
+            "Source of its tiles: an https:// or http:// URL with {z}, {x} and {y} in it, or the "
+            "path of an MBTiles or PMTiles file.",
         ),
     ]
     attribution: Annotated[str, setting("Attribution that the owner requires.")] = ""
@@ -31,7 +31,7 @@ class MapStyle(Settings, frozen=True):
 
 
 def why_weak(hashed: str) -> str:
-    """Return why a password's hash is not accepted; empty if it is."""
+    """Return the reason why a password's hash is not accepted; empty if it is."""
     try:
         _, cost, *parts = hashed.split("$")
         number = int(cost) if cost.isascii() and cost.isdigit() and len(cost) < 9 else 0
@@ -48,7 +48,7 @@ def why_weak(hashed: str) -> str:
 class PanelSettings(Settings, frozen=True):
     """The web page that shows the aircraft; a separate process."""
 
-    enabled: Annotated[bool, setting("Whether `mavgate run` starts it.")] = False
+    enabled: Annotated[bool, setting("Whether `mavgate run` starts the panel.")] = False
     address: Annotated[
         str,
         setting(
@@ -56,7 +56,7 @@ class PanelSettings(Settings, frozen=True):
             "TLS or insecure = true."
         ),
     ] = "127.0.0.1"
-    port: Annotated[int, setting("Its port; 0 for any free one.", ge=0, le=65535)] = 14590
+    port: Annotated[int, setting("Port to listen on; 0 for any free one.", ge=0, le=65535)] = 14590
     hosts: Annotated[
         tuple[str, ...],
         setting(
@@ -92,7 +92,7 @@ class PanelSettings(Settings, frozen=True):
     ] = ""
     certificate_key: Annotated[
         str,
-        setting("PEM file of its private key; empty if it is in the same file.", path=True),
+        setting("PEM file of the private key; empty if it is in the same file.", path=True),
     ] = ""
     insecure: Annotated[
         bool,
@@ -106,7 +106,7 @@ class PanelSettings(Settings, frozen=True):
     tiles_limit_mb: Annotated[
         int,
         setting(
-            "Size limit of the cached tiles; beyond it the oldest are deleted.",
+            "Maximum size of the cached tiles; beyond it the oldest are deleted.",
             "MB",
             ge=0,
             le=1_000_000,

@@ -11,7 +11,7 @@ VehicleType = Literal[
     "airship", "free_balloon", "rocket", "ground_rover", "surface_boat", "submarine",
     "flapping_wing", "kite", "vtol_tiltrotor", "parafoil",
 ]  # fmt: skip
-"""The MAV_TYPE names that every ground station takes for a vehicle."""
+"""The MAV_TYPE names that every ground station shows as a vehicle."""
 
 Autopilot = Literal["generic", "ardupilotmega", "px4"]
 """The MAV_AUTOPILOT names that programs require."""
@@ -26,7 +26,7 @@ def _rate(message: str) -> msgspec.Meta:
 
 
 class RateSettings(Settings, frozen=True):
-    """How often each message is sent; never more often than its sensor delivers."""
+    """Rate of each message, at most that of its sensor."""
 
     attitude_quaternion_hz: Annotated[float, _rate("ATTITUDE_QUATERNION")] = 50.0
     attitude_hz: Annotated[float, _rate("ATTITUDE")] = 50.0
@@ -88,7 +88,7 @@ class VehicleSettings(Settings, frozen=True):
     node_silent_s: Annotated[
         float,
         setting(
-            "A node or sensor that has sent nothing for this long is unhealthy.",
+            "A node or sensor that has sent no data for this time is unhealthy.",
             "s",
             ge=0.2,
             le=60.0,

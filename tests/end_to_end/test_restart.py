@@ -101,7 +101,7 @@ async def test_broken_file_is_reported_when_the_aircraft_appears(
     # It listens before the gateway begins: a later client may miss the text.
     client = connect(port := free_port())
     texts = await run(folder, lambda _: texts_until_file_is_named(client), f"udp:127.0.0.1:{port}")
-    assert texts[-1].startswith("Mission, mark and home not kept: 1.places.json")
+    assert texts[-1].startswith("Mission, mark and home not stored: 1.places.json")
     assert "HEARTBEAT" in texts, "ground stations show no text before it"
     assert file.read_text() == "{"
 
