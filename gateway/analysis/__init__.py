@@ -1,1 +1,1 @@
-"""Tables in, numbers and pictures out."""
+"""Analyse flights: from tables to figures and plots."""

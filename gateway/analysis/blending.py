@@ -1,8 +1,8 @@
-"""Interpolated GPS and withheld fixes as references of the position, and Table I of the paper.
+"""Position references: interpolated GPS and withheld fixes; and Table I of the paper.
 
-The paper measures its fused track against interpolated GPS, the same fixes that it was fused from.
-That favours a filter that copies the GPS; so here it is also measured against withheld fixes, and
-the reference if there is one.
+The paper compares its fused track with interpolated GPS, which consists of the same fixes that were
+fused. That favours a filter that copies the GPS, so tracks are also compared with withheld fixes
+here, and with the reference if there is one.
 """
 
 from dataclasses import dataclass
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_GAP_S: Final = 2.0
-"""Across a longer gap a straight line is no reference for a curved flight."""
+"""Longest gap to interpolate; over a longer one a straight line is no reference for a curve."""
 ENDING: Final = 0.2
-"""The part of a span in which a fix ends it."""
+"""Last part of a span, as a share of it, in which a fix counts as its end."""
 PAPER_ERRORS: Final = (
     (0.1, 0.1, 2.036, 2.652),
     (0.1, 0.5, 4.412, 5.497),
@@ -50,11 +50,11 @@ PAPER_ERRORS: Final = (
     (0.9, 0.5, 11.372, 11.957),
     (0.9, 0.9, 30.411, 31.506),
 )
-"""The paper's Table I: alpha, beta, mean error in latitude and longitude, in metres."""
+"""Rows of the paper's Table I: alpha, beta, mean error in latitude and in longitude, m."""
 
 
 def interpolate(fixes: Fixes, time_us: IntArray) -> FlightTrack:
-    """Interpolate linearly between the fixes, at the times at which they were valid."""
+    """Interpolate linearly between the fixes, at their times of validity."""
     size = len(time_us)
     if len(fixes) < 2:
         unknown = (np.full((size, *shape), np.nan) for shape in ((4,), (), (), (), (3,)))
@@ -72,10 +72,10 @@ def interpolate(fixes: Fixes, time_us: IntArray) -> FlightTrack:
 
 
 def thin(flight: Flight, interval_s: float) -> BoolArray:
-    """Choose fixes at least an interval apart; unusable ones are all kept."""
+    """Select fixes at least an interval apart; unusable ones are all kept."""
     keep = np.ones(len(flight.fixes), np.bool_)
     last_us: int | None = None
-    # Half a fix interval of tolerance: arrival jitters.
+    # A tolerance of a tenth of the interval, for jitter of the arrival.
     least_us = round(interval_s * US_PER_S * 0.9)
     for k, fix in enumerate(flight.fixes):
         if not is_usable(fix, flight.fusion.estimation.reference):
@@ -88,7 +88,7 @@ def thin(flight: Flight, interval_s: float) -> BoolArray:
 
 
 def withhold(flight: Flight, every: int) -> BoolArray:
-    """Choose all fixes but every n-th usable one."""
+    """Select all fixes except every n-th usable one."""
     usable = np.array(
         [is_usable(fix, flight.fusion.estimation.reference) for fix in flight.fixes], np.bool_
     )
@@ -96,9 +96,9 @@ def withhold(flight: Flight, every: int) -> BoolArray:
 
 
 def withhold_spans(flight: Flight, span_s: float, every_s: float) -> tuple[BoolArray, BoolArray]:
-    """Choose all fixes but those of the last `span_s` in every `every_s`; and each span's last.
+    """Select all fixes except those in the last `span_s` of every `every_s`; and each span's last.
 
-    A span that a fix does not end, as in an outage or at the end of the flight, has no last one.
+    A span without a fix near its end, as in an outage or at the end of the flight, has no last one.
     """
     keep = np.ones(len(flight.fixes), np.bool_)
     ends = np.zeros(len(flight.fixes), np.bool_)
@@ -108,7 +108,7 @@ def withhold_spans(flight: Flight, span_s: float, every_s: float) -> tuple[BoolA
         phase_s = (fix.time_us - int(flight.time_us[0])) / US_PER_S % every_s
         keep[k] = phase_s < every_s - span_s
         ends[k] = phase_s >= every_s - ENDING * span_s
-    # Of several fixes at the end of a span, only the last.
+    # Of several fixes at the end of a span, only the last one counts.
     rows = np.flatnonzero(ends)
     late = [row for row, following in pairwise(rows) if following == row + 1]
     ends[late] = False
@@ -116,12 +116,12 @@ def withhold_spans(flight: Flight, span_s: float, every_s: float) -> tuple[BoolA
 
 
 def error_at_fixes_m(track: FlightTrack, fixes: Fixes) -> FloatArray:
-    """Compare a track with fixes, each at the time at which it was valid."""
+    """Return the horizontal error of a track at fixes, at their times of validity."""
     if not len(fixes):
         return np.empty((0, 2))
     meridian, parallel = radii_m(float(fixes.lat_deg[0]), float(fixes.alt_amsl_m[0]))
     lat = np.interp(fixes.valid_us, track.time_us, track.lat_deg, left=np.nan, right=np.nan)
-    # From the first fix, not from Greenwich: halfway over the date line is not longitude 0.
+    # Relative to the first fix, so that interpolation works across the date line.
     lon_deg = fixes.lon_deg[0]
     east_deg = wrap_180(track.lon_deg - lon_deg)
     east = np.interp(fixes.valid_us, track.time_us, east_deg, left=np.nan, right=np.nan)
@@ -140,33 +140,33 @@ def paper_table() -> "pd.DataFrame":
 
 @dataclass(frozen=True, slots=True)
 class Judge:
-    """The data against which the tracks of one flight are scored."""
+    """The fixes used to fuse and to score the tracks of one flight."""
 
     fused: Flight
-    """The flight with only the fixes that are fused."""
+    """The flight with only the fixes to be fused."""
     interpolated: FlightTrack
-    """Straight lines between those."""
+    """Straight lines between the fused fixes."""
     held_flight: Flight
-    """The flight with only the fixes that are not fused."""
+    """The flight with only the withheld fixes."""
     held: Fixes
-    """The same as arrays; may be empty."""
+    """The withheld fixes as arrays; may be empty."""
 
 
 def make_judge(flight: Flight, keep: BoolArray) -> Judge:
-    """Split the fixes of a flight into those to fuse, and those to compare with."""
+    """Split the fixes of a flight into those to fuse and those to compare with."""
     return judge_of(flight.with_fixes(keep), flight.with_fixes(~keep))
 
 
 def judge_of(fused: Flight, held: Flight) -> Judge:
-    """Build a judge from a flight with the fused fixes, and one with the withheld ones."""
+    """Build a judge from a flight with the fused fixes and one with the withheld fixes."""
     return Judge(fused, interpolate(fixes_of(fused), fused.time_us), held, fixes_of(held))
 
 
 def score(track: FlightTrack, judge: Judge) -> dict[str, float]:
-    """Score one track; NaN where the flight has nothing to compare with."""
+    """Score one track; NaN if there is nothing to compare with."""
     flight = judge.fused
     to_gps = position_error_m(track, judge.interpolated)[flight.scored]
-    # The withheld fixes that fall among the scored samples.
+    # Only withheld fixes during scored samples.
     nearest = np.searchsorted(flight.time_us, judge.held.valid_us).clip(0, len(flight.time_us) - 1)
     to_held = error_at_fixes_m(track, judge.held)[flight.scored[nearest]]
     found = {
@@ -187,6 +187,6 @@ def score(track: FlightTrack, judge: Judge) -> dict[str, float]:
 
 
 def grows(table: "pd.DataFrame", column: str) -> bool:
-    """Return whether an error grows with alpha and with beta, row by row and column by column."""
+    """Return whether an error increases with alpha and with beta, in every row and column."""
     grid = table.pivot_table(index="alpha", columns="beta", values=column).to_numpy()
     return bool(np.all(np.diff(grid, axis=0) > 0.0) and np.all(np.diff(grid, axis=1) > 0.0))

@@ -32,29 +32,29 @@ from gateway.units import US_PER_S
 ESTIMATORS: Final[tuple[str, ...]] = tuple(
     name for name in OWN_ESTIMATORS if name in EstimationSettings.__struct_fields__
 )
-"""Every estimator has a section of settings of its own name."""
+"""Names of the estimators, each of which has a section of settings of that name."""
 
 SMOOTHED: Final = "smoothed"
-"""Name of the smoothed track, which uses the whole flight."""
+"""Name of the smoothed track, whose states use the whole flight."""
 HOLD_OUT: Final = 5
 """Every n-th fix is withheld for comparison."""
 OUTAGE_S: Final = 10.0
 OUTAGE_EVERY_S: Final = 30.0
-"""Two thirds of the time are left for the estimator to settle again."""
+"""Period of the outages, which leaves two thirds of the time for the estimator to converge."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A flight, the settings it is fused with, and the results."""
+    """A flight, the settings to fuse it with, and the results."""
 
     flight: Flight
     fusion: FusionSettings
     tracks: dict[str, FlightTrack]
-    """By estimator, and `SMOOTHED` if requested."""
+    """Tracks by estimator, and `SMOOTHED` if requested."""
     frame: LocalFrame | None
-    """Metres about the first fix; None in a flight without GPS."""
+    """Local frame in metres around the first fix; None for a flight without GPS."""
     smoothed_latency_s: float | None = None
-    """The GPS latency of the smoothed track; another than is set where the motion contradicts."""
+    """GPS latency of the smoothed track, estimated if the motion contradicts the setting."""
 
     @property
     def chosen(self) -> str:
@@ -68,17 +68,17 @@ class Case:
 
     @cached_property
     def fixes(self) -> Fixes:
-        """The usable fixes."""
+        """The usable GPS fixes."""
         return fixes_of(self.flight)
 
     @cached_property
     def figures(self) -> PilotFigures | None:
-        """The flight in figures; None without GPS."""
+        """Key figures of the flight; None without GPS."""
         return None if self.frame is None else pilot_figures(self.flight, self.track, self.frame)
 
     @property
     def truth_name(self) -> str:
-        """Name of the reference in a legend."""
+        """Name of the reference for legends."""
         reference = self.flight.reference
         return "truth" if reference is not None and reference.is_exact else "reference"
 
@@ -91,14 +91,14 @@ def make_case(
     tracks = {name: fuse_track(flight, with_estimator(fusion, name)) for name in ESTIMATORS}
     latency_s = None
     if smooth:
-        # Where the clock was set back there is no order to smooth in.
+        # Smoothing is not possible if the clock was set back.
         with suppress(ValueError):
             tracks[SMOOTHED], latency_s = smooth_track(flight, fusion)
     return Case(flight, fusion, tracks, local_frame(flight), latency_s)
 
 
 def summarise(case: Case) -> dict[str, float]:
-    """Summarise a flight."""
+    """Return the summary of a flight, by name."""
     flight, track = case.flight, case.track
     gap_s = np.diff(case.fixes.arrival_us) / US_PER_S
     alt_m = track.alt_amsl_m[flight.scored]
@@ -131,14 +131,14 @@ def summarise(case: Case) -> dict[str, float]:
 
 
 def withheld_error_m(case: Case, estimator: str) -> float:
-    """Fuse without every n-th fix, and measure the horizontal RMS error at those."""
+    """Fuse without every n-th fix; return the horizontal RMS error at those fixes."""
     return _held_m(case, estimator, make_judge(case.flight, withhold(case.flight, HOLD_OUT)))
 
 
 def outage_error_m(case: Case, estimator: str) -> float:
-    """Fuse without the fixes of 10 s in every 30 s; return the horizontal RMS error at their ends.
+    """Fuse without the fixes of 10 s in every 30 s; return the horizontal RMS error at the ends.
 
-    NaN for a flight that is too short.
+    NaN if the flight is too short.
     """
     flight = case.flight
     keep, ends = withhold_spans(flight, OUTAGE_S, OUTAGE_EVERY_S)

@@ -1,6 +1,6 @@
-"""One flight for the analysis: its calibrated samples, the truth if known, and its fused tracks.
+"""One flight to analyse: its calibrated samples, the truth if known, and its fused tracks.
 
-Flights of all sources have the same form: the samples of a recording in the order in which they
+Flights from all sources have the same form: the samples of a recording in the order in which they
 were processed, on the gateway clock.
 """
 
@@ -45,7 +45,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 SETTLING_US: Final = 5_000_000
-"""After the first fix; earlier samples are not scored."""
+"""Time after the first fix from which samples are scored."""
 NEAR_US: Final = 50_000
 """Maximum difference between the times of a state and of the sample it is compared with."""
 
@@ -56,7 +56,7 @@ class FlightTrack:
 
     time_us: IntArray
     q_nb: FloatArray
-    """Shape (N, 4), scalar first; NaN where not known."""
+    """Shape (N, 4), scalar first; NaN if unknown."""
     lat_deg: FloatArray
     lon_deg: FloatArray
     alt_amsl_m: FloatArray
@@ -66,52 +66,52 @@ class FlightTrack:
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """The reference of an estimate, at the times of the IMU samples."""
+    """The reference for an estimate, at the times of the IMU samples."""
 
     track: FlightTrack
     is_exact: bool
-    """Whether it is the exact truth and not another estimate."""
+    """Whether it is the exact truth; otherwise it is another estimate."""
     description: str
-    """One sentence: where it comes from."""
+    """One sentence on its origin."""
 
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One flight's samples."""
+    """The samples of one flight."""
 
     name: str
     description: str
-    """One sentence: where it comes from."""
+    """One sentence on its origin."""
     fusion: FusionSettings
-    """The settings that belong to it, such as its GPS latency."""
+    """The settings for this flight, including its GPS latency."""
     samples: Samples
     scored: BoolArray
-    """Shape (N,), which samples count for errors."""
+    """Shape (N,), whether a sample is scored."""
     mag_uncalibrated_b_ut: FloatArray | None = None
     node_time_us: IntArray | None = None
-    """When the node sampled, on its own clock."""
+    """Time of each sample on the node's clock."""
     reference: Reference | None = None
     recorded: FlightTrack | None = None
-    """The states fused in flight."""
+    """The states that were fused in flight."""
 
     @property
     def time_us(self) -> IntArray:
-        """Shape (N,), of the IMU samples."""
+        """Shape (N,), times of the IMU samples."""
         return self.samples.imu.time_us
 
     @property
     def imu(self) -> ImuLog:
-        """The calibrated IMU samples; the magnetometer is NaN unless newly sampled."""
+        """The calibrated IMU samples; the magnetic field is NaN in samples without a new one."""
         return self.samples.imu
 
     @property
     def fixes(self) -> list[GpsFix]:
-        """In the order of their arrival."""
+        """The GPS fixes in the order of their arrival."""
         return [record for _, record in self.samples.aiding if isinstance(record, GpsFix)]
 
     @property
     def baro(self) -> tuple[IntArray, FloatArray]:
-        """Times in us, and heights in the standard atmosphere in m, of the barometer samples."""
+        """Times in µs and standard-atmosphere heights in m of the barometer samples."""
         found = [record for _, record in self.samples.aiding if isinstance(record, BaroSample)]
         times_us = np.array([record.time_us for record in found], np.int64)
         return times_us, np.array([record.alt_pressure_m for record in found], np.float64)
@@ -123,19 +123,19 @@ class Flight:
 
     @property
     def duration_s(self) -> float:
-        """From the first to the last sample."""
+        """Time from the first to the last sample."""
         return float(self.time_s[-1])
 
     @property
     def rate_hz(self) -> float:
-        """IMU samples a second, by the median interval; by the mean one where most are zero."""
+        """Rate of IMU samples, from the median interval; from the mean one if that is zero."""
         intervals_us = np.diff(self.time_us)
         typical_us = float(np.median(intervals_us)) or max(float(np.mean(intervals_us)), 1.0)
         return US_PER_S / typical_us
 
     @property
     def latency_s(self) -> float:
-        """How old a fix is at its arrival."""
+        """Age of a fix at its arrival."""
         return self.fusion.estimation.reference.gps_latency_s
 
     def seconds(self, time_us: IntArray) -> FloatArray:
@@ -143,7 +143,7 @@ class Flight:
         return np.asarray((time_us - self.time_us[0]) / US_PER_S, np.float64)
 
     def with_fixes(self, keep: Sequence[bool] | BoolArray) -> "Flight":
-        """Return the same flight with some of its fixes."""
+        """Return the same flight with the selected fixes only."""
         kept = iter(keep)
         aiding = [(k, r) for k, r in self.samples.aiding if not isinstance(r, GpsFix) or next(kept)]
         return replace(self, samples=Samples(self.samples.imu, aiding))
@@ -155,7 +155,7 @@ class Fixes:
 
     arrival_us: IntArray
     valid_us: IntArray
-    """When each fix was true."""
+    """Time of validity of each fix."""
     lat_deg: FloatArray
     lon_deg: FloatArray
     alt_amsl_m: FloatArray
@@ -167,13 +167,13 @@ class Fixes:
 
 
 def max_speed_mps(flight: Flight) -> float:
-    """Return the greatest speed over ground of its usable fixes, 0 without any."""
+    """Return the greatest ground speed of the usable fixes; 0 without any."""
     speeds = (math.hypot(*fix.vel_n_mps[:2]) for fix in flight.fixes if fix.fix_ok)
     return max((speed for speed in speeds if math.isfinite(speed)), default=0.0)
 
 
 def fixes_of(flight: Flight) -> Fixes:
-    """Return the fixes that an estimator would use."""
+    """Return the fixes that an estimator uses."""
     reference = flight.fusion.estimation.reference
     used = [fix for fix in flight.fixes if is_usable(fix, reference)]
     arrival = np.array([fix.time_us for fix in used], np.int64)
@@ -189,7 +189,7 @@ def fixes_of(flight: Flight) -> Fixes:
 
 @dataclass(frozen=True, slots=True)
 class LocalFrame:
-    """Metres north and east of one position."""
+    """Local plane: metres north and east of one position."""
 
     lat_deg: float
     lon_deg: float
@@ -201,7 +201,7 @@ class LocalFrame:
         return np.asarray(np.radians(lat_deg - self.lat_deg) * meridian)
 
     def east_m(self, lon_deg: FloatArray) -> FloatArray:
-        """Convert longitudes to metres east, the shortest way round."""
+        """Convert longitudes to metres east, in the shorter direction."""
         _, parallel = radii_m(self.lat_deg, self.alt_m)
         return np.asarray(np.radians(wrap_180(lon_deg - self.lon_deg)) * parallel)
 
@@ -211,7 +211,7 @@ class LocalFrame:
 
 
 def local_frame(flight: Flight) -> LocalFrame | None:
-    """Return a frame with its origin at the first usable fix; None without one."""
+    """Return a frame with its origin at the first usable fix; None without any."""
     fixes = fixes_of(flight)
     if not len(fixes):
         return None
@@ -228,7 +228,7 @@ def flight_of_files(
 ) -> tuple[Flight, RecordedTable, AircraftSettings]:
     """Read the parts of a recording as one flight; also return its table and its settings.
 
-    With `checked` a remark is added where the motion contradicts the latency of a recording.
+    With `checked`, a remark is added if the motion contradicts the latency of a recording.
     FlightError or OSError if a file cannot be read, ValueError for fewer than two IMU samples.
     """
     table = joined_tables([open_rows(file, options) for file in files])
@@ -281,7 +281,7 @@ def flight_of_blocks(
 
 
 def _settled(flight: Flight) -> BoolArray:
-    """Score from the time on at which any estimator can have settled."""
+    """Return the samples from the time on when any estimator should have converged."""
     reference = flight.fusion.estimation.reference
     first_us = next((fix.time_us for fix in flight.fixes if is_usable(fix, reference)), None)
     start_us = int(flight.time_us[0]) if first_us is None else first_us
@@ -289,37 +289,37 @@ def _settled(flight: Flight) -> BoolArray:
 
 
 def _track_of_cells(cells: FloatArray) -> FlightTrack:
-    """Make a track of the columns `NAV` of a table."""
+    """Make a track from the columns `NAV` of a table."""
     return track_of(cells[:, 0].astype(np.int64), cells[:, 1:])
 
 
 def fuse_track(flight: Flight, settings: FusionSettings) -> FlightTrack:
-    """Fuse a flight causally, from the samples only, with the estimator that the settings name."""
+    """Fuse a flight causally, from the samples only, with the estimator in the settings."""
     estimator = estimator_of(flight, settings)
     return track_of(flight.time_us, fuse(flight.samples, estimator).states)
 
 
 def estimator_of(flight: Flight, settings: FusionSettings) -> Estimator:
-    """Build the estimator that the settings name, in the state stored at the begin if that fits."""
+    """Build the estimator in the settings, in the state stored at the start if that is valid."""
     with suppress(ValueError):
         return flight.samples.estimator(settings.estimation)
     return make_estimator(settings.estimation)
 
 
 def smooth_track(flight: Flight, settings: FusionSettings) -> tuple[FlightTrack, float]:
-    """Smooth a flight; also return the GPS latency that was used, s. See `fuse`."""
+    """Smooth a flight; also return the GPS latency used, s. See `fuse`."""
     estimator = estimator_of(flight, with_estimator(settings, SMOOTHED_ESTIMATOR))
     fused = fuse(flight.samples, estimator, smoothed=True)
-    # Smoothed states are in the order of time, in which a late sample is not.
+    # Smoothed states are in order of time; the samples are not, if one came late.
     states = np.empty_like(fused.states)
     states[np.argsort(flight.time_us, kind="stable")] = fused.states
     return track_of(flight.time_us, states), fused.latency_s
 
 
 def track_of(time_us: IntArray, states: FloatArray) -> FlightTrack:
-    """Return the values that the flags of fused states mark as valid, others as NaN.
+    """Return the values that the flags of fused states mark as valid, with NaN for others.
 
-    An attitude counts as known without a heading only if there never is one.
+    An attitude without a heading is valid only if the track has no heading at all.
     """
     flags = states[:, NAV_FLAGS].astype(np.int64)
 
@@ -344,9 +344,9 @@ def track_of(time_us: IntArray, states: FloatArray) -> FlightTrack:
 
 
 def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight:
-    """Take the states of a recording as a flight's reference.
+    """Use the states of a recording as a flight's reference.
 
-    Raises ValueError if the recording contains no state.
+    Raises ValueError if the recording contains no states.
     """
     states = [block.cells[has_group(block.cells, NAV)][:, NAV] for block in blocks]
     if not sum(map(len, states)):
@@ -358,7 +358,7 @@ def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight
 
 
 def at_times(track: FlightTrack, time_us: IntArray) -> FlightTrack:
-    """Return the rows of a track nearest to given times; NaN without one within `NEAR_US`."""
+    """Return the rows of a track nearest to given times; NaN if none is within `NEAR_US`."""
     after = np.searchsorted(track.time_us, time_us).clip(1, max(len(track.time_us) - 1, 1))
     before = after - 1
     after = after.clip(0, len(track.time_us) - 1)

@@ -8,22 +8,22 @@ from gateway.geometry.geodesy import radii_m
 
 
 def rms(values: FloatArray) -> float:
-    """Root of the mean square of the known values; NaN if none is known."""
+    """Return the root mean square of the known values; NaN if none is known."""
     return float(np.sqrt(np.mean(np.square(known)))) if len(known := _known(values)) else np.nan
 
 
 def mean_abs(values: FloatArray) -> float:
-    """Mean size of the known values; NaN if none is known."""
+    """Return the mean absolute value of the known values; NaN if none is known."""
     return float(np.mean(np.abs(known))) if len(known := _known(values)) else np.nan
 
 
 def worst(values: FloatArray) -> float:
-    """Greatest size among the known values; NaN if none is known."""
+    """Return the greatest absolute value of the known values; NaN if none is known."""
     return greatest(np.abs(values))
 
 
 def greatest(values: FloatArray) -> float:
-    """Greatest of the known values; NaN if none is known."""
+    """Return the greatest of the known values; NaN if none is known."""
     return float(known.max()) if len(known := _known(values)) else np.nan
 
 
@@ -32,7 +32,7 @@ def _known(values: FloatArray) -> FloatArray:
 
 
 def rotation_error(q_nb: FloatArray, reference_q_nb: FloatArray) -> FloatArray:
-    """Find the rotation in NED from the reference to the estimate: `q * conj(reference)`."""
+    """Return the rotation in NED from the reference to the estimate: `q * conj(reference)`."""
     pw, px, py, pz = q_nb.T
     w, x, y, z = reference_q_nb.T
     error = np.column_stack(
@@ -47,24 +47,24 @@ def rotation_error(q_nb: FloatArray, reference_q_nb: FloatArray) -> FloatArray:
 
 
 def total_error_rad(error: FloatArray) -> FloatArray:
-    """Angle of a rotation error of shape (N, 4)."""
+    """Return the angle of a rotation error of shape (N, 4)."""
     return np.asarray(2.0 * np.arctan2(np.linalg.norm(error[:, 1:], axis=1), error[:, 0]))
 
 
 def heading_error_rad(error: FloatArray) -> FloatArray:
-    """Part of a rotation error about the vertical, signed, clockwise from above positive."""
+    """Return the part of a rotation error about the vertical, clockwise from above positive."""
     return np.asarray(2.0 * np.arctan2(error[:, 3], error[:, 0]))
 
 
 def inclination_error_rad(error: FloatArray) -> FloatArray:
-    """Part of a rotation error about a horizontal axis; at least 0."""
+    """Return the part of a rotation error about a horizontal axis; at least 0."""
     return np.asarray(
         2.0 * np.arctan2(np.hypot(error[:, 1], error[:, 2]), np.hypot(error[:, 0], error[:, 3]))
     )
 
 
 def euler_rad(q_nb: FloatArray) -> FloatArray:
-    """Split attitudes into roll, pitch and yaw, shape (N, 3): eq. 16, corrected."""
+    """Convert attitudes to roll, pitch and yaw, shape (N, 3): eq. 16, corrected."""
     w, x, y, z = q_nb.T
     return np.column_stack(
         [
@@ -76,7 +76,7 @@ def euler_rad(q_nb: FloatArray) -> FloatArray:
 
 
 def position_error_m(track: FlightTrack, reference: FlightTrack) -> FloatArray:
-    """Displacement from the reference to the estimate, shape (N, 3): north, east, up."""
+    """Return the displacement from the reference to the estimate, shape (N, 3): north, east, up."""
     known = np.isfinite(reference.lat_deg)
     if not known.any():
         return np.full((len(track.lat_deg), 3), np.nan)
@@ -95,7 +95,7 @@ def position_error_m(track: FlightTrack, reference: FlightTrack) -> FloatArray:
 
 
 def errors_over_time(track: FlightTrack, reference: FlightTrack) -> dict[str, FloatArray]:
-    """Compute every error at every sample, in the units of their names."""
+    """Return every error at every sample, in the units of their names."""
     turned = rotation_error(track.q_nb, reference.q_nb)
     angles = np.degrees(wrap_pi(euler_rad(track.q_nb) - euler_rad(reference.q_nb)))
     error_m = position_error_m(track, reference)

@@ -11,14 +11,14 @@ from gateway.recordings.figures import gps_outages_us
 from gateway.units import US_PER_S
 
 AIRBORNE_MPS: Final = 3.0
-"""Faster than a person carries the aircraft about."""
+"""Minimum ground speed in flight, more than that of a person who carries the aircraft."""
 AIRBORNE_M: Final = 3.0
 HELD_S: Final = 2.0
-"""Least time in the air, or on the ground, to count."""
+"""Minimum duration of an interval in the air or on the ground."""
 LINK_LOSS_S: Final = 0.5
-"""A longer gap between IMU samples is a loss of the link."""
+"""Minimum gap between IMU samples that counts as a loss of the link."""
 LONGEST_STEP_M: Final = 200.0
-"""Between two samples; more is a jump of the position, not a flown distance."""
+"""Maximum distance between two samples; a longer one is a jump of the position."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,33 +26,33 @@ class FlightEvent:
     """An event at one moment."""
 
     time_s: float
-    """Since the first sample."""
+    """Time since the first sample."""
     kind: str
-    """Kind of its mark on the timeline: flight, gps or link."""
+    """Kind of mark on the timeline: flight, gps or link."""
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class PilotFigures:
-    """One flight in figures; NaN if unknown."""
+    """Key figures of one flight; NaN if unknown."""
 
     began_unix_s: float
     airborne_s: float
     distance_m: float
-    """Over ground, while airborne."""
+    """Distance over ground while airborne."""
     highest_m: float
-    """Above the first fix."""
+    """Greatest height above the first fix."""
     fastest_mps: float
-    """Over ground."""
+    """Greatest ground speed."""
     climb_mps: float
-    """Greatest, over a second."""
+    """Greatest climb rate, averaged over a second."""
     farthest_m: float
-    """From the first fix."""
+    """Greatest distance from the first fix."""
     gps_outages_s: tuple[tuple[float, float], ...]
-    """Begin and end of each, since the first sample."""
+    """Start and end of each outage since the first sample."""
     link_losses_s: tuple[tuple[float, float], ...]
     events: tuple[FlightEvent, ...]
-    """In the order of their times."""
+    """Events in the order of their times."""
 
 
 def pilot_figures(flight: Flight, track: FlightTrack, frame: LocalFrame) -> PilotFigures:
@@ -93,7 +93,7 @@ def _outages_s(flight: Flight) -> tuple[tuple[float, float], ...]:
 
 
 def _began_unix_s(flight: Flight) -> float:
-    """Return the civil time of the first sample, from the first fix that has it."""
+    """Return the civil time of the first sample, from the first fix that contains civil time."""
     for fix in flight.fixes:
         if fix.utc_us is not None:
             return float(fix.utc_us - fix.time_us + flight.time_us[0]) / US_PER_S
@@ -101,7 +101,7 @@ def _began_unix_s(flight: Flight) -> float:
 
 
 def _smoothed(values: FloatArray, count: int) -> FloatArray:
-    """Average over a number of samples, ignoring unknown ones."""
+    """Return the moving average over a number of samples, ignoring unknown ones."""
     known = np.isfinite(values)
     window = np.ones(max(count, 1))
     total = np.convolve(np.where(known, values, 0.0), window, "same")
@@ -110,7 +110,7 @@ def _smoothed(values: FloatArray, count: int) -> FloatArray:
 
 
 def _held(seconds: FloatArray, state: np.ndarray) -> np.ndarray:
-    """Drop intervals shorter than `HELD_S`, first the pauses and then the hops."""
+    """Merge intervals shorter than `HELD_S` with their neighbours, first those on the ground."""
     found = np.asarray(state, bool).copy()
     for wanted in (False, True):
         edges = np.flatnonzero(np.diff(found)) + 1
@@ -130,7 +130,7 @@ def _distance_m(pos_m: FloatArray, airborne: np.ndarray) -> float:
 def _gaps(
     times_s: FloatArray, duration_s: float, longest_s: float
 ) -> tuple[tuple[float, float], ...]:
-    """Find the gaps between the first of some times and the end of the flight."""
+    """Return the gaps between some times, from the first one to the end of the flight."""
     if not len(times_s):
         return ()
     ends = np.append(times_s[1:], duration_s)

@@ -1,4 +1,4 @@
-"""Forked processes, which share all that this one has computed."""
+"""Forked processes, which share all data that this process has computed."""
 
 import gc
 import multiprocessing
@@ -17,7 +17,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _work: Callable[[Any], Any]
-"""The work of a process of `forked`."""
+"""The function that a process of `forked` runs."""
 
 
 def cores() -> int:
@@ -29,9 +29,9 @@ def cores() -> int:
 def forked(
     work: Callable[[Item], Result], jobs: int | None = None
 ) -> Iterator[Callable[[Sequence[Item]], Iterator[tuple[int, Result]]]]:
-    """Open processes that work on items; yields the function that numbers their results.
+    """Open processes for work on items; yields the function that returns numbered results.
 
-    The results come in any order. The processes share all that the work refers to.
+    The results are in any order. The processes share all data that the function refers to.
     """
     count = jobs or cores()
     if count == 1:
@@ -41,7 +41,7 @@ def forked(
         pool = multiprocessing.get_context(START).Pool(count, _begin, (_set_work, work))
 
     def run(items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
-        # Few messages, and an even load.
+        # Large chunks need few messages, small ones balance the load.
         chunk = max(1, min(8, len(items) // (16 * count)))
         return pool.imap_unordered(_do, enumerate(items), chunk)
 
@@ -60,14 +60,14 @@ def _do(numbered: tuple[int, Any]) -> tuple[int, Any]:
 
 
 def begin_copy(work: Callable[[Any, Connection], None], argument: Any) -> Connection:
-    """Call a function in a background process, which sends its results."""
+    """Run a function in a background process; return the connection for its results."""
     receiver, sender = multiprocessing.Pipe(duplex=False)
     process = multiprocessing.Process(
         target=_begin, args=(_send, work, argument, sender, receiver), daemon=True
     )
     with no_warning_of_threads():
         process.start()
-    # So that the pipe ends with that process.
+    # Closed here, so that the pipe ends when the process does.
     sender.close()
     return receiver
 
@@ -75,7 +75,7 @@ def begin_copy(work: Callable[[Any, Connection], None], argument: Any) -> Connec
 def _send(
     work: Callable[[Any, Connection], None], argument: Any, sender: Connection, receiver: Connection
 ) -> None:
-    # So that the pipe reports when no process receives.
+    # Closed here, so that the pipe reports when the parent no longer receives.
     receiver.close()
     threading.Thread(target=_end_without_receiver, args=(sender,), daemon=True).start()
     with suppress(BrokenPipeError):
@@ -85,7 +85,7 @@ def _send(
 def _end_without_receiver(sender: Connection) -> None:
     """End this process when the pipe has no receiver, even if nothing is being sent."""
     hang_up = select.poll()
-    hang_up.register(sender, 0)  # no event but that one
+    hang_up.register(sender, 0)  # only POLLHUP and POLLERR
     hang_up.poll()
     os._exit(0)
 
@@ -98,15 +98,15 @@ def _begin(work: Callable[..., None], *arguments: Any) -> None:
 def keep_inherited() -> None:
     """Exclude objects of the parent process from garbage collection, in a forked process.
 
-    Destructors may wait for the parent's threads, as that of a Zenoh session does, and a forked
-    process has none of them.
+    Destructors may wait for the parent's threads, as that of a Zenoh session does, and these do not
+    exist in a forked process.
     """
     gc.freeze()
 
 
 @contextmanager
 def no_warning_of_threads() -> Iterator[None]:
-    """Suppress Python's warning about forking with threads: those of linear algebra are idle."""
+    """Suppress Python's warning about forking with threads: the linear algebra threads are idle."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         yield

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 PAPER_RATE_HZ: Final = 1000.0
-"""The paper's figures: order 2, 10 Hz cutoff at 1000 samples a second."""
+"""Sample rate in the paper's figures, whose filters have order 2 and a cutoff of 10 Hz."""
 RESPONSE_POINTS: Final = 400
 STEP_S: Final = 0.5
 TIMED_SAMPLES: Final = 5_000
@@ -32,10 +32,10 @@ TIMED_RUNS: Final = 3
 SEGMENT_S: Final = 8.0
 ALLAN_POINTS: Final = 40
 MIN_CLUSTERS: Final = 4
-"""With fewer averages the deviation is a guess."""
+"""Minimum number of averages; with fewer, the Allan deviation is too uncertain."""
 REST_GYRO_RADPS: Final = 0.02
 REST_ACCEL_MPS2: Final = 0.15
-"""Greatest standard deviation within a second at rest."""
+"""Maximum standard deviation within a second at rest."""
 
 
 def design_lowpass(
@@ -43,8 +43,8 @@ def design_lowpass(
 ) -> Coefficients:
     """Design a second-order low-pass; see `discretise`.
 
-    Chebyshev is of type I, with its ripple in dB. The cutoff in Hz is -3 dB for Butterworth and the
-    end of the ripple for Chebyshev.
+    The Chebyshev filter is of type I, with its ripple in dB. The cutoff, Hz, is the -3 dB frequency
+    for Butterworth, and the end of the ripple for Chebyshev.
     """
     return discretise(*prototype_of(kind, ripple_db), cutoff_hz, rate_hz)
 
@@ -57,17 +57,17 @@ class VectorFilter:
         self.retune(rate_hz)
 
     def retune(self, rate_hz: float) -> None:
-        """Redesign for another sample rate; the filter starts again at the next sample."""
+        """Redesign for another sample rate; the filter restarts at the next sample."""
         self._coefficients = self._design(rate_hz)
         self.state = [math.nan] * 6
-        """See `filter_step`. May be read and restored."""
+        """See `filter_step`. Can be read and restored."""
 
     def step(self, x: Vec3) -> Vec3:
         """Filter one finite vector."""
         return filter_step(self._coefficients, self.state, x)
 
     def run(self, x: FloatArray) -> FloatArray:
-        """Filter an array of shape (n, 3), as that many calls of `step`."""
+        """Filter an array of shape (n, 3), with the result of n calls of `step`."""
         return np.array([self.step((v[0], v[1], v[2])) for v in x.tolist()]).reshape(-1, 3)
 
 
@@ -101,7 +101,7 @@ def response(kind: Kind, settings: PaperSettings, rate_hz: float) -> Response:
 
 
 def apply(kind: Kind, settings: PaperSettings, rate_hz: float, x: FloatArray) -> FloatArray:
-    """Filter an array of shape (N, 3) as the gateway does."""
+    """Filter an array of shape (N, 3) in the way the gateway does."""
     return _low_pass(kind, settings, rate_hz).run(np.where(np.isfinite(x), x, 0.0))
 
 
@@ -114,7 +114,7 @@ def _design(kind: Kind, settings: PaperSettings, rate_hz: float) -> Coefficients
 
 
 def compare(settings: PaperSettings, rate_hz: float) -> "pd.DataFrame":
-    """Compare the filters' properties in a table."""
+    """Return a table of the filters' properties."""
     import pandas as pd
 
     return pd.DataFrame([_properties(kind, settings, rate_hz) for kind in KINDS])
@@ -124,7 +124,7 @@ def _properties(kind: Kind, settings: PaperSettings, rate_hz: float) -> dict[str
     found = response(kind, settings, rate_hz)
     cutoff = settings.accel_cutoff_hz
     passed = found.gain_db[found.frequency_hz <= cutoff]
-    # The Butterworth gain falls monotonically: only a later rise is ripple.
+    # The Butterworth gain decreases monotonically, so only a later increase is ripple.
     ripple_db = float(np.max(np.maximum.accumulate(passed[::-1])[::-1] - passed[0]))
     steps = np.ones((round(STEP_S * rate_hz), 3))
     steps[0] = 0.0
@@ -142,7 +142,7 @@ def _properties(kind: Kind, settings: PaperSettings, rate_hz: float) -> dict[str
 
 
 def _time_ns(kind: Kind, settings: PaperSettings, rate_hz: float) -> float:
-    """Measure the time a sample on three axes takes, best of some runs."""
+    """Measure the time per sample on three axes, best of several runs."""
     x = np.zeros((TIMED_SAMPLES, 3))
     low_pass = _low_pass(kind, settings, rate_hz)
     low_pass.run(x)
@@ -151,7 +151,7 @@ def _time_ns(kind: Kind, settings: PaperSettings, rate_hz: float) -> float:
 
 
 def power_density(x: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """Estimate frequencies without 0 Hz and one-sided power spectral density, by Welch."""
+    """Estimate the one-sided power spectral density by Welch's method; frequencies without 0 Hz."""
     from scipy import signal
 
     size = min(len(x), round(SEGMENT_S * rate_hz))
@@ -174,7 +174,7 @@ def allan_deviation(x: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArr
 
 
 def longest_rest(accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, rate_hz: float) -> slice:
-    """Find the longest stretch in which the sensors measure only noise."""
+    """Return the longest part in which the sensors measure only noise."""
     window = max(round(rate_hz), 2)
     if len(gyro_b_radps) < window:
         return slice(0, 0)
@@ -186,12 +186,12 @@ def longest_rest(accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, rate_hz: fl
         return slice(0, 0)
     begins, ends = edges[::2], edges[1::2]
     best = int(np.argmax(ends - begins))
-    # The last window may already hold the slow start of a motion.
+    # The last window may already contain the slow start of a motion.
     return slice(int(begins[best]), int(ends[best]))
 
 
 def _spread(x: FloatArray, window: int) -> FloatArray:
-    """Greatest standard deviation of the three axes in each window of samples."""
+    """Return the greatest standard deviation of the three axes in each window of samples."""
     x = np.nan_to_num(x - np.nanmean(x, axis=0))
     first = np.cumsum(np.vstack([np.zeros(x.shape[1]), x]), axis=0)
     second = np.cumsum(np.vstack([np.zeros(x.shape[1]), x * x]), axis=0)

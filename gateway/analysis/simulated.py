@@ -1,6 +1,6 @@
-"""The built-in simulated flight, for the analysis, with its exact truth.
+"""The built-in simulated flight with its exact truth, for the analysis.
 
-Apart from `flight`: the simulator loads all of SciPy, which the panel does not need.
+Separate from `flight`, because the simulator imports all of SciPy, which the panel does not need.
 """
 
 from collections.abc import Iterator
@@ -37,7 +37,7 @@ def simulated_flight(
     fusion: FusionSettings | None = None,
     duration_s: float = FLIGHT_S,
 ) -> Flight:
-    """Fly the built-in flight, with losses and jitter of radio and serial line as live."""
+    """Simulate the built-in flight, with realistic losses and jitter of radio and serial line."""
     settings = msgspec.structs.replace(settings or SimulatorSettings(), vehicles=1)
     aircraft = SimulatedAircraft(settings)
     builder = RowBuilder()
@@ -62,7 +62,7 @@ def received(settings: SimulatorSettings, duration_s: float) -> Iterator[ImuRaw 
 
 
 def ideal_calibration(errors: SensorErrors) -> NodeCalibration:
-    """Return the calibration that undoes the simulated sensors' constant errors."""
+    """Return the calibration that corrects the simulated sensors' constant errors."""
     return msgspec.convert(errors, NodeCalibration, from_attributes=True)
 
 

@@ -1,7 +1,7 @@
-"""Settings tried out on a flight: every point of a grid, or by an optimiser, on all cores.
+"""Try settings on a flight: every point of a grid, or by an optimiser, on all cores.
 
 Each trial fuses the flight causally, from the samples only. Some GPS fixes are withheld from the
-fusion to score it: a filter that only copies its GPS, noise included, gains nothing.
+fusion and used to score it, so a filter that only copies its GPS, noise included, gains nothing.
 """
 
 import itertools
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from scipy.optimize import OptimizeResult
 
 SHORT: Final = {"alpha": "estimation.paper.alpha_accel", "beta": "estimation.paper.beta_velocity"}
-"""The paper's own names."""
+"""Names that the paper uses, for settings."""
 ESTIMATOR_KEY: Final = "estimation.estimator"
 LARGEST_GRID: Final = 100_000
 
@@ -50,14 +50,14 @@ _LACKING: Final[dict[Metric, str]] = {
 SEED: Final = 1
 Scores = dict[str, float]
 Trial = tuple[Values, Scores]
-"""The values that were tried, and their scores."""
+"""Values that were tried, and their scores."""
 WEIGHTS: Final = (0.1, 0.5, 0.9)
 """Values of alpha and of beta in Table I of the paper."""
 Run = Callable[[Sequence[Values]], Iterator[tuple[int, Scores]]]
 
 
 class SweepError(UserError, ValueError):
-    """A sweep that cannot be done; the text says why."""
+    """A sweep that cannot be done; the text states the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class Axis:
 
 
 def full_key(name: str) -> str:
-    """Find a setting by its path, the end of its path, or the paper's name."""
+    """Return the path of a setting given by its path, the end of its path, or the paper's name."""
     name = SHORT.get(name, name)
     found = [key for key in setting_keys(FusionSettings) if key == name or key.endswith(f".{name}")]
     if not found:
@@ -81,7 +81,7 @@ def full_key(name: str) -> str:
 
 
 def parse_axis(name: str, text: str) -> Axis:
-    """Read an axis: `0.1:0.9:9` for nine values from 0.1 to 0.9, or `0.1,0.5` for a list.
+    """Parse an axis: `0.1:0.9:9` for nine values from 0.1 to 0.9, or `0.1,0.5` for a list.
 
     Raises SweepError if the text is neither, or a value is not allowed.
     """
@@ -91,7 +91,7 @@ def parse_axis(name: str, text: str) -> Axis:
         values: Values
         if len(parts) == 3:
             steps = np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
-            # Rounded to remove the error of binary fractions.
+            # Rounded to remove the error of binary floating point.
             values = tuple(float(f"{step:.12g}") for step in steps)
         elif len(parts) == 2:
             values = (float(parts[0]), float(parts[1]))
@@ -109,7 +109,7 @@ def parse_axis(name: str, text: str) -> Axis:
 def grid(axes: Sequence[Axis]) -> list[Values]:
     """List every point of a grid; the first axis varies slowest.
 
-    Raises SweepError if there are too many.
+    Raises SweepError if there are too many points.
     """
     size = math.prod(len(axis.values) for axis in axes)
     if size > LARGEST_GRID:
@@ -136,14 +136,14 @@ def with_value(settings: Any, key: str, value: Value) -> Any:
 def with_values(
     fusion: FusionSettings, keys: Sequence[str], values: Sequence[Value]
 ) -> FusionSettings:
-    """Return settings with values changed by key; raises SweepError as `with_value`."""
+    """Return settings with several values changed; raises SweepError as `with_value`."""
     for key, value in zip(keys, values, strict=True):
         fusion = with_value(fusion, key, value)
     return fusion
 
 
 def with_estimator_of(fusion: FusionSettings, keys: Sequence[str]) -> FusionSettings:
-    """Choose the estimator that the keys belong to, if to one; raises SweepError if to several."""
+    """Select the estimator to which the keys belong; raises SweepError if there are several."""
     named = {key.split(".")[1] for key in keys if key.startswith("estimation.")} & set(ESTIMATORS)
     if len(named) > 1:
         raise SweepError(f"one sweep cannot vary several estimators: {', '.join(sorted(named))}")
@@ -159,7 +159,7 @@ def _value(text: str) -> Value:
 
 @dataclass(frozen=True, slots=True)
 class Contest:
-    """The data shared by all trials; each process gets a copy."""
+    """Data for all trials; each process gets a copy."""
 
     fusion: FusionSettings
     keys: tuple[str, ...]
@@ -178,7 +178,7 @@ def make_contest(
     fusion = with_estimator_of(fusion, keys)
     keep = np.ones(len(flight.fixes), np.bool_)
     if interval_s:
-        # Not both: thinning and withholding together would leave gaps, or no fixes.
+        # Never both: thinned and withheld fixes together would leave gaps, or no fixes.
         keep = thin(flight, interval_s)
     elif hold_out:
         keep = withhold(flight, hold_out)
@@ -186,10 +186,10 @@ def make_contest(
 
 
 def score_of(contest: Contest, fusion: FusionSettings) -> Scores:
-    """Fuse the flight with any settings, and score it by the fixes of the contest."""
+    """Fuse the flight with given settings, and score it at the fixes of the contest."""
     judge = contest.judge
     if fusion.estimation.reference != judge.fused.fusion.estimation.reference:
-        # Scored with the latency of the trial: that of the recording would favour itself.
+        # Scored with the latency of the trial, as the recorded latency would favour itself.
         judge = judge_of(*(replace(f, fusion=fusion) for f in (judge.fused, judge.held_flight)))
     return score(fuse_track(judge.fused, fusion), judge)
 
@@ -213,7 +213,7 @@ def blend_table(flight: Flight, fusion: FusionSettings, interval_s: float) -> "p
 
 
 def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> "pd.DataFrame":
-    """Return trials as a table, the best first."""
+    """Return a table of trials, the best one first."""
     import pandas as pd
 
     rows = [{**dict(zip(keys, values, strict=True)), **scores} for values, scores in trials]
@@ -228,9 +228,9 @@ def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> "p
 
 
 def best_of(trials: Sequence[Trial], metric: Metric) -> Values:
-    """Return the values of the trial with the least error, the first of equal ones.
+    """Return the values of the trial with the least error; of several, the first.
 
-    Not from the table, whose numbers are NumPy types.
+    The table is not used, since its numbers are NumPy types.
     """
     judged = COLUMN_OF[metric]
     scored = [trial for trial in trials if not math.isnan(trial[1][judged])]
@@ -238,12 +238,12 @@ def best_of(trials: Sequence[Trial], metric: Metric) -> Values:
 
 
 def idle_axes(contest: Contest, axes: Sequence[Axis]) -> list[str]:
-    """Return the settings that change nothing, such as those that the estimator does not use.
+    """Return the settings without effect, such as those of another estimator.
 
-    Each is tried at its first, middle and last value, all others at their first, with every
-    estimator that is varied.
+    Each is tried at its first, middle and last value, with all others at their first, and with
+    every estimator that is varied.
     """
-    # Of the estimator all values, of any other setting the first.
+    # All values of the estimator, the first one of any other setting.
     varied = [axis.values if axis.key == ESTIMATOR_KEY else axis.values[:1] for axis in axes]
     bases = list(itertools.product(*varied))
     found = []
@@ -268,7 +268,7 @@ def optimise(
     generations: int,
     on_generation: Callable[[float], None] = lambda _: None,
 ) -> Values:
-    """Search between the least and greatest value of each axis by differential evolution."""
+    """Search between the limits of each axis by differential evolution."""
     from scipy.optimize import differential_evolution
 
     bounds = []
@@ -293,5 +293,5 @@ def optimise(
 
 
 def pool(contest: Contest, jobs: int | None = None) -> AbstractContextManager[Run]:
-    """Open a pool of processes that run trials."""
+    """Open a pool of processes for trials."""
     return forked(partial(run_trial, contest), jobs)

@@ -1,1 +1,1 @@
-"""Thousands of recordings: an index of them, and one task on all, here or on other machines."""
+"""Thousands of recordings: an index, and tasks on all of them, local or on other machines."""

@@ -1,4 +1,4 @@
-"""The catalogue of the recordings under a folder: a SQLite file, kept up to date and queried."""
+"""Catalogue of the recordings in a folder: a SQLite file that is updated and queried."""
 
 import math
 import os
@@ -44,17 +44,17 @@ from gateway.units import DEG_PER_DEGE7, M_PER_CM
 
 CATALOGUE_NAME: Final = "catalogue.sqlite"
 SCHEMA: Final = 2
-"""A catalogue of another schema is made again."""
+"""Version of the schema; a catalogue of another version is recreated."""
 BUSY_S: Final = 10.0
-"""How long a writer waits for another one to end."""
+"""Time that a writer waits for another one to finish, s."""
 MAX_STEPS: Final = 20_000_000
-"""Of SQLite's machine for one query; some seconds."""
+"""Maximum steps of SQLite's virtual machine per query; some seconds."""
 _STEPS: Final = 100_000
 MAX_QUERY_S: Final = 5.0
 MAX_QUERY_LENGTH: Final = 10_000
-"""Characters of a condition."""
+"""Maximum length of a condition, in characters."""
 MAX_VALUE_BYTES: Final = 100_000
-"""Of any value that a condition computes."""
+"""Maximum size of any value that a condition computes."""
 FUNCTIONS: Final = frozenset(
     {
         "abs", "coalesce", "date", "datetime", "glob", "ifnull", "instr", "julianday", "length",
@@ -62,7 +62,7 @@ FUNCTIONS: Final = frozenset(
         "time", "trim", "unixepoch", "upper",
     }
 )  # fmt: skip
-"""A condition may call these: none of them makes a value much larger than its arguments."""
+"""Functions allowed in a condition: none returns a value much larger than its arguments."""
 
 _FILE_COLUMNS: Final = {
     "path": "TEXT NOT NULL", "name": "TEXT NOT NULL", "kind": "TEXT", "size": "INTEGER NOT NULL",
@@ -71,32 +71,32 @@ _FILE_COLUMNS: Final = {
 _SQL: Final = {int | None: "INTEGER", float | None: "REAL", str | None: "TEXT"}
 _FACT_COLUMNS: Final = {name: _SQL[kind] for name, kind in get_type_hints(FlightFacts).items()}
 COLUMNS: Final = (*_FILE_COLUMNS, *_FACT_COLUMNS)
-"""Columns that a query may use."""
+"""Columns that a query can use."""
 _POSITION: Final = struct.Struct("<iii")
-"""Latitude and longitude in 1e-7 deg, height in cm."""
+"""A position: latitude and longitude in 1e-7 deg, height in cm."""
 _UNKNOWN: Final = -(1 << 31)
-"""Height that is not known; latitude where the track is broken."""
+"""Unknown height; as a latitude, an interruption of the track."""
 _BREAK: Final = _POSITION.pack(_UNKNOWN, 0, 0)
 _ALLOWED: Final = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION}
-_DAMAGED: Final = "if it is no catalogue or damaged, delete it and index again"
+_DAMAGED: Final = "if it is damaged or not a catalogue, delete it and index again"
 _NOT_WRITABLE: Final = "make the folder of the recordings writable, or copy them"
 _REMEDIES: Final = {
     sqlite3.SQLITE_FULL: "make room on the disk and index again",
-    sqlite3.SQLITE_BUSY: "another indexing is at work; wait for its end",
+    sqlite3.SQLITE_BUSY: "another process is indexing; wait for its end",
     sqlite3.SQLITE_READONLY: _NOT_WRITABLE,
     sqlite3.SQLITE_CANTOPEN: _NOT_WRITABLE,
 }
-"""By SQLite's code of the error."""
+"""Remedy by SQLite's error code."""
 
 Row = dict[str, Any]
 ENDINGS: Final = (".tlog", ".csv")
-"""Files of other endings are looked at where a format knows their first bytes."""
+"""Suffixes of recordings; other files are checked for the first bytes of known formats."""
 LATEST_NS: Final = 2**63 - 1
-"""The greatest number that SQLite keeps; a file's time may lie beyond it."""
+"""Greatest integer that SQLite stores; the modification time of a file may exceed it."""
 KEEP_S: Final = 1.0
-"""Interval of storing the files that were read: an interruption loses no more."""
+"""Interval of storing the files read so far, which bounds the loss by an interruption."""
 Wanted = tuple[str, str]
-"""Path from the folder on, and the digest that is known of it or nothing."""
+"""Path relative to the folder, and the known digest, or empty if unknown."""
 
 
 class CatalogueError(UserError):
@@ -108,22 +108,22 @@ class CataloguedFile:
     """One file of the catalogue, and its flights."""
 
     path: str
-    """From the folder of the catalogue on."""
+    """Path relative to the folder of the catalogue."""
     name: str
-    """Of the recording that it is a part of."""
+    """Name of the recording to which the file belongs."""
     kind: str | None
     size: int
     modified_ns: int
     digest: str
-    """SHA-256 of its bytes, in hexadecimal digits."""
+    """SHA-256 of the content, hexadecimal."""
     error: str | None = None
-    """Why it is broken."""
+    """Reason why the file cannot be read; None if it can."""
     flights: tuple[Flown, ...] = ()
-    """One for each vehicle; none in a broken file."""
+    """One flight per vehicle; empty for an unreadable file."""
 
 
 class Catalogue:
-    """The catalogue, open to be changed."""
+    """The catalogue, open for writing."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / CATALOGUE_NAME
@@ -139,25 +139,25 @@ class Catalogue:
             self._db.commit()
 
     def known(self) -> dict[str, tuple[int, int, str]]:
-        """Return size, time of modification and digest of every file."""
+        """Return size, modification time and digest of every file, by path."""
         with _catalogue_errors(self.path):
             rows = self._db.execute("SELECT DISTINCT path, size, modified, digest FROM flights")
             return {path: (size, modified, digest) for path, size, modified, digest in rows}
 
     def put(self, files: Iterable[CataloguedFile]) -> None:
-        """Replace the rows of files, all or none."""
+        """Replace the rows of files, all or none of them."""
         with _catalogue_errors(self.path), self._db:
             for file in files:
                 self._delete(file.path)
                 self._insert(file)
 
     def touch(self, path: str, modified_ns: int) -> None:
-        """Note that a file has another time of modification and the same bytes."""
+        """Store a new modification time of a file whose content is unchanged."""
         with _catalogue_errors(self.path), self._db:
             self._db.execute("UPDATE flights SET modified = ? WHERE path = ?", (modified_ns, path))
 
     def discard(self, paths: Iterable[str]) -> None:
-        """Drop files that are gone."""
+        """Remove files that no longer exist."""
         with _catalogue_errors(self.path), self._db:
             for path in paths:
                 self._delete(path)
@@ -169,7 +169,7 @@ class Catalogue:
         columns = {**_FILE_COLUMNS, **_FACT_COLUMNS}
         listed = ", ".join(f"{name} {kind}" for name, kind in columns.items())
         with self._db:
-            # Another indexing may have made it meanwhile, and have put flights into it.
+            # Another process may just have created the tables, and filled them.
             self._db.execute("BEGIN IMMEDIATE")
             if self._is_made():
                 return
@@ -199,17 +199,17 @@ class Catalogue:
 
 
 def find_flights(folder: Path, where: str = "") -> list[Row]:
-    """Return the flights of a catalogue for which a condition holds.
+    """Return the flights of a catalogue that satisfy a condition.
 
-    Raises CatalogueError if there is no catalogue, or the condition is none.
+    Raises CatalogueError if there is no catalogue, or the condition is invalid.
     """
-    with _asked(folder) as db:
+    with _open_read_only(folder) as db:
         rows = _select(db, ", ".join(COLUMNS), where)
         return [dict(zip(COLUMNS, row, strict=True)) for row in rows]
 
 
 class FlightFigures(msgspec.Struct, frozen=True):
-    """Length in s, distance over ground in m, greatest height in m, share of lost samples.
+    """Duration in s, distance over ground in m, greatest height in m, share of lost samples.
 
     None if unknown.
     """
@@ -221,14 +221,14 @@ class FlightFigures(msgspec.Struct, frozen=True):
 
 
 Figures = dict[PurePath, dict[int | None, FlightFigures]]
-"""By recording, with its folder, and by vehicle."""
+"""Figures by recording (path with folder) and by vehicle."""
 
 
 def figures_of(rows: Iterable[Row]) -> Figures:
-    """Sum up the recordings of a catalogue: the one definition, for every list of recordings.
+    """Sum up the recordings of a catalogue; all lists of recordings use this function.
 
-    Tables and tlogs of a recording hold the same flight: of each figure the table's is taken. The
-    parts of a recording are added up; broken ones are left out.
+    The tables and tlogs of a recording contain the same flight: the table's figures have priority.
+    The parts of a recording are added up; unreadable ones are left out.
     """
     parts: dict[tuple[PurePath, int | None], list[Row]] = {}
     for row in rows:
@@ -257,8 +257,8 @@ def figures_of(rows: Iterable[Row]) -> Figures:
 
 
 def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
-    """Lay the tracks of flights out as GeoJSON; see `find_flights`."""
-    with _asked(folder) as db:
+    """Return the tracks of flights as GeoJSON; see `find_flights`."""
+    with _open_read_only(folder) as db:
         packed = dict(db.execute("SELECT id, places FROM tracks"))
         found = [
             (row[0], dict(zip(COLUMNS, row[1:], strict=True)))
@@ -271,13 +271,13 @@ def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
 
 
 @contextmanager
-def _asked(folder: Path) -> Iterator[sqlite3.Connection]:
-    """Open a catalogue for reading alone."""
+def _open_read_only(folder: Path) -> Iterator[sqlite3.Connection]:
+    """Open a catalogue read-only."""
     path = folder / CATALOGUE_NAME
-    # An indexing on a full disk leaves an empty file.
+    # If the disk is full, indexing leaves an empty file.
     if not path.exists() or not path.stat().st_size:
         raise CatalogueError(
-            f"{folder} has no catalogue yet; `mavgate catalogue {folder}` makes one"
+            f"{folder} has no catalogue yet; `mavgate catalogue {folder}` creates one"
         )
     with _catalogue_errors(path):
         db = sqlite3.connect(
@@ -286,7 +286,7 @@ def _asked(folder: Path) -> Iterator[sqlite3.Connection]:
         try:
             if db.execute("PRAGMA user_version").fetchone()[0] != SCHEMA:
                 raise CatalogueError(
-                    f"{path} is of another version; `mavgate catalogue {folder}` makes it again"
+                    f"{path} is of another version; `mavgate catalogue {folder}` recreates it"
                 )
             yield db
         finally:
@@ -294,7 +294,7 @@ def _asked(folder: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _select(db: sqlite3.Connection, columns: str, where: str) -> Sequence[tuple[Any, ...]]:
-    """Run a query that can read columns of flights, call functions, and nothing else."""
+    """Run a query that can only read columns of flights and call functions."""
     steps, selects, deadline_s = 0, 0, time.monotonic() + MAX_QUERY_S
     timed_out = False
 
@@ -339,11 +339,11 @@ def _select(db: sqlite3.Connection, columns: str, where: str) -> Sequence[tuple[
 
 @contextmanager
 def _catalogue_errors(path: Path) -> Iterator[None]:
-    """Raise SQLite's errors as CatalogueError, with the catalogue's path and what to do."""
+    """Raise SQLite's errors as CatalogueError, with the catalogue's path and a remedy."""
     try:
         yield
     except sqlite3.Error as error:
-        # The lowest byte; the others are more specific.
+        # The lowest byte is the basic error code; the others make it more specific.
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
         raise CatalogueError(f"{path}: {error}; {_REMEDIES.get(code, _DAMAGED)}") from error
 
@@ -369,13 +369,13 @@ def _unpacked(packed: bytes) -> Segments:
 
 @dataclass(frozen=True, slots=True)
 class IndexReport:
-    """Counts of an indexing."""
+    """Counts of an indexing run."""
 
     read: int = 0
     unchanged: int = 0
     gone: int = 0
     broken: int = 0
-    """Of those that were read."""
+    """Number of unreadable files among those that were read."""
 
 
 def index_folder(
@@ -384,7 +384,7 @@ def index_folder(
     executor: Executor,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> IndexReport:
-    """Bring the catalogue of a folder up to date.
+    """Update the catalogue of a folder.
 
     Raises CatalogueError if the catalogue cannot be written.
     """
@@ -406,7 +406,7 @@ def index_folder(
 
 
 def recordings_below(folder: Path) -> Iterator[Path]:
-    """Find all files that may be recordings, by path; hidden ones and folders are passed over."""
+    """Find all files that may be recordings, sorted by path; hidden ones are skipped."""
     for inner, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in sorted(files):
@@ -416,7 +416,7 @@ def recordings_below(folder: Path) -> Iterator[Path]:
 
 
 def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedFile:
-    """Read one file for the catalogue; its `error` is the reason why it cannot be read."""
+    """Read one file for the catalogue; a failure is stored as its `error`."""
     name, known_digest = wanted
     path = folder / name
     found = CataloguedFile(as_text(name), as_text(recording_name(path)), None, 0, 0, "")
@@ -484,7 +484,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 def _stamp_if_there(path: Path) -> tuple[int, int] | None:
-    """Return the same; None of a file that has gone meanwhile."""
+    """Return the stamp of a file; None if the file has been deleted."""
     try:
         return _stamp(path)
     except OSError:
@@ -518,6 +518,6 @@ def _flights_in(path: Path, options: ReadOptions) -> list[Flown]:
     rows = open_rows(path, options)
     for block in rows.blocks:
         tally.add(TableBlock(block.cells))
-    # Those of its header are of mavgate, not of the program that wrote the log.
+    # The header made for another program's log has the settings of mavgate, not of the log.
     plain = {"mavgate_version": "", "settings": {}, "calibration": {}}
     return tally.flown(msgspec.structs.replace(rows.header, **plain))

@@ -1,4 +1,4 @@
-"""Where the work on many recordings is done: in local processes, or on a Dask cluster."""
+"""Executors of the work on many recordings: local processes, or a Dask cluster."""
 
 import asyncio
 import ctypes
@@ -22,51 +22,51 @@ from gateway.extensions import load_extensions
 from gateway.printable import UserError, reason_of
 
 WAITING: Final = 2
-"""Pieces of work a process that are handed out: one is worked at, one waits. Bounds the memory."""
+"""Items submitted per process: one in work and one waiting, to bound the memory."""
 LOOK_S: Final = 1.0
-"""Between two looks at whether the parent process lives."""
+"""Interval of checking whether the parent process is alive, s."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 CONNECT_S: Final = 10.0
 WORKERS_S: Final = 30.0
-"""How long to wait for the first worker."""
+"""Timeout for the first worker, s."""
 M_TRIM_THRESHOLD: Final = -1
 M_MMAP_THRESHOLD: Final = -3
-"""Of malloc.h."""
+"""Option number of mallopt, from malloc.h."""
 KEPT_BYTES: Final = 256 << 20
 LARGEST_KEPT_BYTES: Final = 32 << 20
-"""Larger blocks are freed at once; glibc takes no more."""
+"""Blocks larger than this are freed at once; glibc allows no greater value."""
 _SAME: Final = f"install mavgate[batch]=={__version__} on every worker"
 
 
 class WorkError(UserError):
-    """Work that cannot be done; the text says why."""
+    """Work that cannot be done; the text states the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkFailed:
-    """Work that came to no result, through no fault of the others."""
+    """An item whose work failed without affecting the others."""
 
     reason: str
 
 
 class Executor(Protocol):
-    """Does a work on many items, in any order."""
+    """Runs a function on many items, in any order."""
 
     def run(
         self, work: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | WorkFailed]]:
-        """Yield the number of each item and its result, as it is done.
+        """Yield the index of each item and its result when it is finished.
 
-        An exception of the work fails that item alone; where a process or machine dies, its items
-        are done again by others, and one that kills all who take it fails.
+        An exception fails that item alone. If a process or machine dies, its items are repeated by
+        others; an item that kills every process that runs it fails.
         """
         ...
 
 
 class ThisProcess:
-    """Do little work in the calling process, which would not repay starting others."""
+    """Run small tasks in the calling process, since starting others would take longer."""
 
     def run(
         self, work: Callable[[Item], Result], items: Sequence[Item]
@@ -92,7 +92,7 @@ class LocalProcesses:
         waiting = deque(range(len(items)))
         suspects: deque[int] = deque()
         while waiting or suspects:
-            # After a death each that may have caused it is tried alone.
+            # After a process died, the items it may have run are repeated one by one.
             queue, jobs = (suspects, 1) if suspects else (waiting, min(self._jobs, len(waiting)))
             lost = yield from _run_in_one_pool(work, items, queue, jobs)
             if jobs == 1 and lost:
@@ -104,7 +104,7 @@ class LocalProcesses:
 def _run_in_one_pool(
     work: Callable[[Item], Result], items: Sequence[Item], queue: deque[int], jobs: int
 ) -> Any:
-    """Work the queue off until a process dies; return the items that were in work then."""
+    """Process the queue until a process dies; return the items in work at that time."""
     running: dict[Future[Result], int] = {}
     with _processes(jobs) as pool:
         while queue or running:
@@ -123,7 +123,7 @@ def _run_in_one_pool(
 
 
 def failure_of(error: BaseException) -> WorkFailed:
-    """Describe the error of an item."""
+    """Describe the exception of an item."""
     if isinstance(error, WorkError):
         return WorkFailed(str(error))
     if isinstance(error, OSError) and error.filename:
@@ -137,7 +137,7 @@ def _processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
     stop = context.Event()
     with no_warning_of_threads():
         pool = ProcessPoolExecutor(jobs, context, _begin, (stop, os.getpid()))
-        # All processes begin now, before a thread of the pool's own.
+        # Start all processes now, before the pool starts a thread of its own.
         pool.submit(os.getpid).result()
     try:
         yield pool
@@ -149,7 +149,7 @@ def _processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _begin(stop: Event, parent: int) -> None:
-    """Leave an interrupt to the parent, and end when it does."""
+    """Leave interrupts to the parent, and exit when it does."""
     keep_inherited()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -163,13 +163,13 @@ def _begin(stop: Event, parent: int) -> None:
 
 
 class ClusterError(UserError):
-    """A cluster that cannot be used; the text says why."""
+    """A cluster that cannot be used; the text states the reason."""
 
 
 class DaskCluster:
     """Workers of a Dask cluster.
 
-    Raises ClusterError if there is none, it has no worker, or its workers run another version
+    Raises ClusterError if it cannot be reached, has no worker, or its workers run another version
     of mavgate.
     """
 
@@ -181,7 +181,7 @@ class DaskCluster:
             )
         except (OSError, ValueError, TimeoutError) as error:
             raise ClusterError(
-                f"{address}: no Dask scheduler answers ({error}); start one: `dask scheduler`"
+                f"{address}: no Dask scheduler responds ({error}); start one: `dask scheduler`"
             ) from error
         try:
             self._client.wait_for_workers(1, timeout=WORKERS_S)
@@ -196,13 +196,13 @@ class DaskCluster:
             raise
 
     def close(self) -> None:
-        """Leave the cluster; its unfinished work for this client is cancelled."""
+        """Disconnect; the cluster cancels this client's unfinished work."""
         self._client.close()
 
     def run(
         self, work: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | WorkFailed]]:
-        """See `Executor`: a worker that dies is made up for by the others."""
+        """See `Executor`; the items of a worker that dies are repeated by others."""
         done = self._distributed.as_completed(loop=self._client.loop)
         numbers: dict[Any, int] = {}
         waiting = iter(range(len(items)))
@@ -228,34 +228,34 @@ class DaskCluster:
         if isinstance(error, self._distributed.KilledWorker):
             return WorkFailed("every worker that took it died: out of memory, or killed")
         if isinstance(error, asyncio.CancelledError):
-            return WorkFailed("it was given up, or its data was lost with a worker")
+            return WorkFailed("it was cancelled, or its data was lost with a worker")
         return failure_of(error)
 
     def _check_versions(self) -> None:
         try:
             versions = self._client.run(prepare_worker)
         except (ImportError, ModuleNotFoundError) as error:
-            raise ClusterError(f"a worker cannot do the work: {error}; {_SAME}") from error
+            raise ClusterError(f"a worker cannot run the task: {error}; {_SAME}") from error
         other = {name: version for name, version in versions.items() if version != __version__}
         if other:
             listed = ", ".join(f"{name} has {version}" for name, version in sorted(other.items()))
-            raise ClusterError(f"here is mavgate {__version__}, but {listed}; {_SAME}")
+            raise ClusterError(f"this is mavgate {__version__}, but {listed};  {_SAME}")
 
 
 def prepare_worker() -> str:
-    """Let a worker load its extensions, and return its version."""
+    """Load the extensions in a worker, and return its version."""
     load_extensions()
     _keep_freed_memory()
     return __version__
 
 
 def _keep_freed_memory() -> None:
-    """Have the C library keep freed memory, up to `KEPT_BYTES`, for the next flight.
+    """Let the C library keep freed memory, up to `KEPT_BYTES`, for the next flight.
 
-    Dask's nanny sets MALLOC_TRIM_THRESHOLD_ to 64 KiB, so that every large array costs new pages:
-    a third of the time that a flight takes.
+    Dask's nanny sets MALLOC_TRIM_THRESHOLD_ to 64 KiB, so every large array needs new pages, which
+    costs a third of the time per flight.
     """
-    # Only glibc has it.
+    # Only glibc has mallopt.
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
         mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
         mallopt(M_MMAP_THRESHOLD, LARGEST_KEPT_BYTES)

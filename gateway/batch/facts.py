@@ -41,16 +41,16 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 TOLERANCE_M: Final = 3.0
-"""Less than the error of the GPS."""
+"""Tolerance of a simplified track, less than the error of GPS."""
 MAX_POSITIONS: Final = 400
-"""Of one track; a day in circles gets coarser instead of larger."""
+"""Maximum positions of a track: a day of circling gets a coarser track, not a larger one."""
 
 Segments = list[list[TrackPoint]]
-"""A track; it is broken between two of them."""
+"""The uninterrupted parts of a track."""
 POINT_US: Final = US_PER_S // 10
-"""Positions nearer in time than this add nothing new of a flight."""
+"""Minimum interval of positions; closer ones add no information on a flight."""
 EARLIEST_US: Final = 315_532_800 * US_PER_S
-"""1980, when GPS began: an earlier time counts from the start of a clock."""
+"""1980, the start of GPS time; an earlier time counts from the start of a clock."""
 SYS_STATUS_ID: Final = MESSAGE_IDS["SYS_STATUS"]
 USED_IDS: Final = frozenset({SYS_STATUS_ID, PARAM_VALUE_ID, AUTOPILOT_VERSION_ID, *GPS_IDS})
 ERROR: Final = 3
@@ -63,7 +63,7 @@ _POSITION_AND_SPEED: Final = [
 
 
 def simplified(points: Sequence[TrackPoint]) -> list[TrackPoint]:
-    """Leave out points that the straight lines between the others pass within a few metres."""
+    """Leave out points that are within a tolerance of the straight lines between the others."""
     if len(points) < 3:
         return list(points)
     lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points]).T
@@ -94,7 +94,7 @@ def _kept(plane: NDArray[np.float64], tolerance_m: float) -> NDArray[np.bool_]:
 def _distances_m(
     points: NDArray[np.float64], begin: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Distances from the line between two points: it ends there."""
+    """Return the distances from the line segment between two points."""
     line = end - begin
     length2 = float(line @ line)
     share = ((points - begin) @ line / length2).clip(0.0, 1.0) if length2 else np.zeros(len(points))
@@ -102,47 +102,47 @@ def _distances_m(
 
 
 class FlightFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """One flight in the catalogue; None is unknown.
+    """Facts of one flight in the catalogue; None is unknown.
 
-    The names are those of the columns that a query may use.
+    The names are also the names of columns that a query can use.
     """
 
     vehicle: int | None = None
     """MAVLink system id."""
     began: str | None = None
-    """Begin, UTC: YYYY-MM-DD HH:MM:SS."""
+    """Start in UTC, as YYYY-MM-DD HH:MM:SS."""
     duration: float | None = None
-    """From the first record to the last, s."""
+    """Time from the first record to the last, s."""
     distance: float | None = None
-    """Over ground, m."""
+    """Distance over ground, m."""
     highest: float | None = None
-    """Above the first position, m."""
+    """Greatest height above the first position, m."""
     fastest: float | None = None
-    """Over ground, m/s."""
+    """Greatest speed over ground, m/s."""
     lat_min: float | None = None
-    """South end, deg."""
+    """Southern limit, deg."""
     lat_max: float | None = None
-    """North end, deg."""
+    """Northern limit, deg."""
     lon_min: float | None = None
-    """West end, deg."""
+    """Western limit, deg."""
     lon_max: float | None = None
-    """East end; below lon_min across 180 degrees, deg."""
+    """Eastern limit, deg; less than lon_min across the date line."""
     takeoff_lat: float | None = None
-    """Where it left the ground, deg."""
+    """Latitude of the take-off, deg."""
     takeoff_lon: float | None = None
-    """Where it left the ground, deg."""
+    """Longitude of the take-off, deg."""
     gps_outages: int | None = None
-    """GPS outages."""
+    """Number of GPS outages."""
     gps_lost: float | None = None
-    """All of them together, s."""
+    """Total duration of the GPS outages, s."""
     faults: int | None = None
-    """Bus errors and failed sensors of the nodes; texts of severity ERROR."""
+    """Number of bus errors and failed sensors of nodes, and of texts of severity ERROR or worse."""
     loss: float | None = None
-    """Share of the samples lost on the radio, 0 to 1."""
+    """Proportion of samples lost on the radio link, 0 to 1."""
     damaged: int | None = None
-    """Damaged bytes of the file."""
+    """Number of damaged bytes in the file."""
     version: str | None = None
-    """Of mavgate, or of the autopilot's firmware."""
+    """Version of mavgate, or of the autopilot's firmware."""
     settings: str | None = None
     """Checksum of settings and calibration."""
 
@@ -161,7 +161,7 @@ class FlightTally:
         self.faults = 0
 
     def add_position(self, point: TrackPoint, speed_mps: float, boot_us: int | None = None) -> None:
-        """Take a position in, with the speed over ground; see `Continuity`."""
+        """Add a position with the speed over ground; see `Continuity`."""
         at = (point.time_us, point.lat_deg, point.lon_deg)
         self.distance.update(*at, boot_us)
         if self.segments and 0 <= point.time_us - self._newest_us < POINT_US:
@@ -179,12 +179,12 @@ class FlightTally:
             self.distance = other.distance
 
     def add_gps(self, time_us: int, *, fixed: bool) -> None:
-        """Note that the receiver sent something, and whether it had a fix."""
+        """Add a report of the receiver, and whether it has a fix."""
         self._gps_us.append(time_us)
         self._fixed.append(fixed)
 
     def facts(self, end_us: int | None) -> FlightFacts:
-        """Sum up, with all that depends on positions and fixes alone."""
+        """Return the facts that depend only on positions and fixes."""
         outages = gps_outages_us(np.array(self._gps_us), np.array(self._fixed, bool), end_us or 0)
         known = FlightFacts(faults=self.faults)
         if outages is not None:
@@ -213,12 +213,12 @@ class FlightTally:
         )
 
     def track(self) -> Segments:
-        """Return the track in as few points as show it."""
+        """Return the simplified track."""
         return [*map(simplified, self.segments)]
 
 
 def began_text(unix_us: int | None) -> str | None:
-    """Write a civil time as the catalogue does; None if it can be none."""
+    """Return a civil time in the form of the catalogue; None if it is out of range."""
     moment = None if unix_us is None or unix_us < EARLIEST_US else civil_time(unix_us)
     return None if moment is None else f"{moment:%Y-%m-%d %H:%M:%S}"
 
@@ -229,7 +229,7 @@ def _greatest(values: NDArray[np.float64]) -> float | None:
 
 
 def _longitudes(lon_deg: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the west and the east end, the short way round."""
+    """Return the western and the eastern limit, in the shorter direction."""
     turned = lon_deg[0] + wrap_180(lon_deg - lon_deg[0])
     west, east = float(turned.min()), float(turned.max())
     return (wrap_180(west), wrap_180(east))
@@ -240,7 +240,7 @@ Flown = tuple[FlightFacts, Segments]
 
 
 class TableTally:
-    """Sums up a table, or the rows that another format was read as."""
+    """Sum up a table, or rows that were read from another format."""
 
     def __init__(self) -> None:
         self._fixes, self._states = FlightTally(), FlightTally()
@@ -278,13 +278,13 @@ class TableTally:
         """Count the failures of a node since its last report."""
         before = self._nodes.get(status.node.node_id)
         errors, failed = (before.bus_errors, before.sensors_failed) if before else (0, 0)
-        # A restart sets the counter back.
+        # A restart of the node resets the counter.
         self._fixes.faults += max(status.bus_errors - errors, 0)
         self._fixes.faults += (status.sensors_failed & ~failed).bit_count()
         self._nodes[status.node.node_id] = status
 
     def flown(self, header: TableHeader | None) -> list[Flown]:
-        """Return the one flight of the table; none if it contains no row."""
+        """Return the table's only flight; empty if it contains no row."""
         first_us = self._span.first_us
         if first_us is None:
             return []
@@ -305,7 +305,7 @@ class TableTally:
 
 
 class TlogTally:
-    """Sums up a tlog batch by batch, a flight a vehicle."""
+    """Sum up a tlog batch by batch, with one flight per vehicle."""
 
     def __init__(self, senders: Senders) -> None:
         self._index, self._span = TlogIndex(), TimesSpan()
@@ -331,7 +331,7 @@ class TlogTally:
                 sent.update(message)
 
     def flown(self) -> list[Flown]:
-        """Return a flight for each vehicle; one without a vehicle where there is none."""
+        """Return a flight for each vehicle, or one without a vehicle if there is none."""
         index = self._index
         self._update(self._reader.flush())
         if not index.count:
@@ -350,7 +350,7 @@ class TlogTally:
 
 
 class _Sent:
-    """Facts of one vehicle from the messages that it sent."""
+    """Facts of one vehicle from its messages."""
 
     def __init__(self, vehicle: RecordedSender) -> None:
         self.span = TimesSpan()
@@ -397,7 +397,7 @@ class _Sent:
 def _checksum(header: TableHeader) -> str | None:
     if not header.settings:
         return None
-    # Sorted, so that a version that writes its sections in another order changes nothing.
+    # Sorted, so that the order of the sections has no effect.
     return _digits(msgspec.json.encode([header.settings, header.calibration], order="sorted"))
 
 

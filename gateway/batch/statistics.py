@@ -1,4 +1,4 @@
-"""Statistics over many flights and their page: chance, cross-validation, errors."""
+"""Statistics over many flights and their page: significance, cross-validation, errors."""
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -21,37 +21,37 @@ RESAMPLES: Final = 9_999
 SEED: Final = 1
 CONFIDENCE: Final = 0.95
 CHANCE: Final = 0.05
-"""A smaller p is more than chance."""
+"""Significance level: a smaller p is more than chance."""
 FOLDS: Final = 10
 WORSE: Final = 1.05
 WORSE_M: Final = 0.05
-"""A flight counts as worse if its error grew by more than 5 % and 5 cm."""
+"""Minimum increase of the error in m, in addition to 5 %, of a flight that counts as worse."""
 ALL: Final = "all"
 REASONS: Final = {
     "eskf": "it distinguishes manoeuvres from gravity by the GPS velocity, which keeps it level",
     "paper": "it follows the newest fix closely",
 }
-"""Of the estimators: where their lead comes from."""
+"""Reason for the lead of an estimator, by its name."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lead:
-    """How much smaller the errors of one are than those of the other."""
+    """Ratio of the errors of one estimator or point of a grid to those of another."""
 
     flights: int
     units: int
-    """Aircraft-days: flights of one day share their weather and their sensors' state."""
+    """Number of aircraft-days: flights of one day share weather and the state of the sensors."""
     ratio: float
-    """Geometric mean of one error over the other; below 1 is better."""
+    """Geometric mean of the ratio of the errors; below 1, the first one is better."""
     low: float | None
     high: float | None
-    """Where the ratio is with 95 % confidence; None for a single unit."""
+    """Limits of the ratio's 95 % confidence interval; None for a single unit."""
     p: float | None
-    """How often signs drawn by lot give as great a lead; None for a single unit."""
+    """p-value: share of random signs that give as great a lead; None for a single unit."""
 
     @property
     def text(self) -> str:
-        """Describe it in one sentence."""
+        """Describe the lead in one sentence."""
         change = f"{_percent(self.ratio)} error over {counted(self.flights, 'flight')}"
         if self.p is None or self.low is None or self.high is None:
             return f"{change}, all of one aircraft and day: it cannot be separated from chance"
@@ -69,12 +69,12 @@ def _percent(ratio: float) -> str:
 
 
 def lead_of(errors: FloatArray, others: FloatArray, groups: Sequence[str]) -> Lead | None:
-    """Compare two errors of the same flights."""
+    """Compare two errors on the same flights."""
     known = np.isfinite(errors) & np.isfinite(others) & (errors > 0.0) & (others > 0.0)
     if not known.any():
         return None
-    # A permutation test over the signs of the groups' averages gives p, a bootstrap over the
-    # groups the interval.
+    # p is from a permutation test over the signs of the groups' averages, the interval from a
+    # bootstrap over the groups.
     logs = np.log(errors[known] / others[known])
     labels = np.array(groups)[known]
     units = np.array([logs[labels == label].mean() for label in np.unique(labels)])
@@ -103,25 +103,25 @@ class Choice:
     """Result of a season's sweep."""
 
     winner: int
-    """Point of the grid with the least mean error over all flights."""
+    """Index of the point of the grid with the least mean error over all flights."""
     means: FloatArray
     """Shape (P,): geometric mean of the error of each point over all flights."""
     judged: FloatArray
-    """Shape (F,): error of each flight with the point that the other folds chose."""
+    """Shape (F,): error of each flight with the point chosen by the other folds."""
     folds: int
     stable: int
-    """Folds without which the same point wins."""
+    """Number of folds without which the same point is chosen."""
     over_base: Lead | None
-    """Lead of the other folds' choice over the settings that the flights came with."""
+    """Lead of the points chosen by the other folds over the recorded settings."""
     over_second: Lead | None
-    """Lead of the winner over the second; both were chosen by the same flights."""
+    """Lead of the winner over the second point; both were chosen by the same flights."""
 
 
 def choose(errors: FloatArray, base: FloatArray, groups: Sequence[str]) -> Choice:
-    """Choose a point for all flights, and judge the choosing."""
+    """Choose a point for all flights, and cross-validate the choice."""
     known = np.asarray((np.isfinite(errors) & (errors > 0.0)).all(axis=1))
     if not known.any():
-        raise ValueError("no flight can judge all of these settings: they hold too few fixes")
+        raise ValueError("no flight has enough fixes to score all of these settings")
     logs = np.where(known[:, np.newaxis], np.log(np.where(known[:, np.newaxis], errors, 1.0)), 0.0)
     fold = folds_of(groups)
     count = int(fold.max()) + 1
@@ -151,7 +151,7 @@ def choose(errors: FloatArray, base: FloatArray, groups: Sequence[str]) -> Choic
 
 
 def folds_of(groups: Sequence[str]) -> NDArray[np.int64]:
-    """Deal groups out to folds of about equal numbers of flights; with one group, flights."""
+    """Assign groups to folds of about equal numbers of flights; a single group by flights."""
     labels = list(groups) if len(set(groups)) > 1 else [str(k) for k in range(len(groups))]
     sizes = Counter(labels)
     load = [0] * min(FOLDS, len(sizes))
@@ -164,18 +164,18 @@ def folds_of(groups: Sequence[str]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class Versus:
-    """A season against the same flights of another version."""
+    """Comparison of a season with the same flights of another version."""
 
     leads: dict[str, Lead]
-    """Of now over then, by estimator."""
+    """Lead of the new results over the former ones, by estimator."""
     worse: pd.DataFrame
-    """`location`, `estimator`, `before_m` and `after_m` of flights, the worst first."""
+    """`location`, `estimator`, `before_m` and `after_m` of flights that got worse, worst first."""
     compared: int
-    """Flights that both have."""
+    """Number of flights in both results."""
 
 
 def group_of(result: FlightResult) -> str:
-    """Name aircraft and day, which share weather and the state of the sensors.
+    """Return the name of aircraft and day; flights of a group share weather and sensors' state.
 
     A flight without a day is a group of its own.
     """
@@ -183,7 +183,7 @@ def group_of(result: FlightResult) -> str:
 
 
 def errors_by_group(results: Sequence[FlightResult]) -> pd.DataFrame:
-    """Sum errors at withheld fixes up: all aircraft together first, then each."""
+    """Summarise errors at withheld fixes, of all aircraft together and of each aircraft."""
     errors = pd.DataFrame(
         [(r.vehicle, name, m) for r in results for name, m in r.figures.get(HELD, {}).items()],
         columns=["vehicle", "estimator", "m"],
@@ -205,10 +205,10 @@ def errors_by_group(results: Sequence[FlightResult]) -> pd.DataFrame:
 
 
 def why_leads(results: Sequence[FlightResult]) -> str:
-    """Describe which estimator leads, by how much, and why; empty if there is no second.
+    """Describe which estimator leads, by how much, and why; empty if there is only one.
 
-    It leads at the withheld fixes, which lie a second from others; without GPS its attitude and
-    velocity matter, so errors there show where the lead comes from.
+    The lead is at the withheld fixes, which are a second from others. Without GPS, attitude and
+    velocity determine the error, so errors there show the origin of the lead.
     """
     ranked = sorted((median, name) for name, median in _medians_m(results, HELD).items())
     if len(ranked) < 2:
@@ -244,7 +244,7 @@ def _medians_m(results: Sequence[FlightResult], key: str) -> dict[str, float]:
 
 
 def versus(now: Iterable[FlightResult], then: Iterable[FlightResult]) -> Versus:
-    """Compare the flights that both have errors of, by the digests of their files."""
+    """Compare the flights that both results contain, by the digests of their files."""
     before = {old.digest: old.figures[HELD] for old in then if HELD in old.figures}
     both = [new for new in now if HELD in new.figures and new.digest in before]
     changes = pd.DataFrame(
@@ -270,7 +270,7 @@ def versus(now: Iterable[FlightResult], then: Iterable[FlightResult]) -> Versus:
 
 
 def flight_table(results: Sequence[FlightResult]) -> pd.DataFrame:
-    """Lay all results out, a row a recording."""
+    """Return all results as a table, one row per recording."""
     return pd.DataFrame([_row(result) for result in results])
 
 
@@ -278,7 +278,7 @@ def write_season_page(
     results: Sequence[FlightResult], folder: Path, compared: Versus | None
 ) -> Path:
     """Write the season's page, its figure and its tables into a folder."""
-    # They need the extra plot, for which the command has looked.
+    # Imported here: these require the extra `plot`, which the command has checked.
     from gateway.analysis.reporting.page import Fact, Report, ReportTable, Section, write_report
 
     judged = [result for result in results if HELD in result.figures]
@@ -286,7 +286,7 @@ def write_season_page(
     sections = [
         Section(
             "Errors by aircraft and estimator",
-            "Each flight was fused without every fifth fix, which then judged: the figures are the "
+            "Each flight was fused without every fifth fix and scored at those: figures are the "
             f"root mean square errors of the flights, horizontal. {why_leads(judged)}".strip(),
             [_picture(judged)] if any(result.figures[HELD] for result in judged) else [],
             [ReportTable("errors", errors_by_group(judged), "Errors at withheld fixes.")],
@@ -297,11 +297,11 @@ def write_season_page(
     if broken:
         rows = [(_file_name(result.location), result.error) for result in broken]
         failed = ReportTable("failed", pd.DataFrame(rows, columns=["recording", "why"]), "Failed.")
-        lead = "They are in none of the other tables."
+        lead = "These are not in any of the other tables."
         sections.append(Section("Recordings that failed", lead, tables=[failed]))
     if len(broken) < len(results):
         flights = flight_table([result for result in results if result.error is None])
-        # The page is narrow; a flight's distance is in flights.csv.
+        # The page is narrow; the distance of a flight is in flights.csv only.
         flights = flights.drop(columns=["failed", "distance, m"])
         table = ReportTable("flight_errors", flights, "Flights.")
         sections.append(Section("Flights", "In the order given.", tables=[table]))
@@ -343,13 +343,13 @@ def _versus_section(compared: Versus) -> Any:
 
     leads = pd.DataFrame(
         [(name, lead.text) for name, lead in compared.leads.items()],
-        columns=["estimator", "now against then"],
+        columns=["estimator", "new to former error"],
     )
     lead = (
         f"Both fused {counted(compared.compared, 'flight')}. A flight is listed as worse where its "
         "error grew by more than 5 % and 5 cm."
     )
-    tables = [ReportTable("versus", leads, "Errors of now over those of then.")]
+    tables = [ReportTable("versus", leads, "Ratio of the new errors to the former ones.")]
     if len(compared.worse):
         worse = compared.worse.drop(columns="group").assign(
             location=compared.worse["location"].map(_file_name)

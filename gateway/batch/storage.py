@@ -1,4 +1,4 @@
-"""Recordings wherever they are: local paths, and anything that fsspec opens by a URL."""
+"""Access recordings anywhere: local paths, and URLs that fsspec can open."""
 
 import re
 import shutil
@@ -19,58 +19,58 @@ from gateway.recordings.files import CHUNK, GZIP
 from gateway.recordings.index import parts_together, recording_name
 
 MARK: Final = "://"
-"""Separates the scheme of a URL from the rest; no local path has it."""
+"""Separator after the scheme of a URL; local paths do not contain it."""
 HERE: Final = "file"
-"""The file system that needs no package."""
+"""Scheme of the local file system, which requires no package."""
 REMOTE_ENDINGS: Final = (*ENDINGS, ".parquet", ".ulg", ".bin")
-"""Of recordings in a folder elsewhere, whose files are not opened to recognise their format."""
+"""Suffixes of recordings in remote folders, whose files are not opened to recognise formats."""
 STAMPS: Final = (
     "ETag", "etag", "md5Hash", "generation", "mtime", "LastModified", "last_modified", "updated",
 )  # fmt: skip
-"""Keys under which storages report the version or the last change of a file."""
+"""Keys under which storages report the version or the last modification of a file."""
 PACKAGES: Final = {
     "s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "sftp": "paramiko",
     "ssh": "paramiko", "az": "adlfs", "abfs": "adlfs", "http": "aiohttp", "https": "aiohttp",
 }  # fmt: skip
-"""Packages that fsspec needs in addition, by the scheme of the URL."""
+"""Packages that fsspec requires in addition, by the scheme of the URL."""
 _USER: Final = re.compile(r"(?<=://)[^/@]*@")
 
 
 class StorageError(WorkError):
-    """A location that cannot be reached; the text says which and why."""
+    """A location that cannot be accessed; the text states the location and the reason."""
 
 
 class BatchItem(msgspec.Struct, frozen=True):
-    """One recording to work on: its parts, in order."""
+    """One recording to be processed: its parts, in order."""
 
     locations: tuple[str, ...]
-    """Local paths or URLs of its parts."""
+    """Local paths or URLs of the parts."""
 
     @property
     def location(self) -> str:
-        """Path or URL of its first part, without a user's name and password."""
+        """Path or URL of the first part, without user name and password."""
         return without_user(self.locations[0])
 
     @property
     def is_fetched(self) -> bool:
-        """Whether a part of it has to be fetched from elsewhere."""
+        """Whether a part of the recording is remote."""
         return any(map(is_url, self.locations))
 
 
 def is_url(name: str) -> bool:
-    """Return whether a name is a URL and no path."""
+    """Return whether a name is a URL, not a path."""
     return MARK in name
 
 
 def without_user(url: str) -> str:
-    """Return a URL without user name and password, as it may be shown and kept."""
+    """Return a URL without user name and password, so that it can be shown and stored."""
     return _USER.sub("", url)
 
 
 def items_of(names: Sequence[str]) -> list[BatchItem]:
-    """Find the recordings that are meant.
+    """Find the recordings for some names.
 
-    Raises StorageError if there is nothing of a name, or its storage cannot be reached.
+    Raises StorageError if a name matches nothing, or its storage cannot be accessed.
     """
     locations = list(dict.fromkeys(location for name in names for location in _locations(name)))
     by_path = {Path(location): location for location in locations}
@@ -83,10 +83,10 @@ def items_of(names: Sequence[str]) -> list[BatchItem]:
 
 
 def stamp_of_item(item: BatchItem) -> str:
-    """Return a digest that changes when a recording does, in hexadecimal digits.
+    """Return a hexadecimal digest that changes when a recording changes.
 
-    That is the SHA-256 of its files, or of the versions that their storage reports, so that
-    nothing is fetched for it; raises OSError and StorageError.
+    It is the SHA-256 of local files, or of the versions that a storage reports, so that remote
+    files are not fetched; raises OSError and StorageError.
     """
     if item.is_fetched:
         stamps = [_stamp_of(location) for location in item.locations]
@@ -104,7 +104,7 @@ def digest_of_files(paths: Sequence[Path]) -> str:
 
 @contextmanager
 def local_files(item: BatchItem) -> Iterator[list[Path]]:
-    """Have the files of a recording on this machine's disk."""
+    """Provide the files of a recording on the local disk."""
     if not item.is_fetched:
         yield [Path(location) for location in item.locations]
         return
@@ -137,7 +137,7 @@ def _locations(name: str) -> list[str]:
             found = storage.find(remote)
         else:
             return [name]
-    # A host that is in the URL is not in the path.
+    # The path of a remote file lacks the host of its URL.
     plain = name.rstrip("/")
     begin = plain.removesuffix(remote) if plain.endswith(remote) else None
     locations = [
@@ -147,12 +147,12 @@ def _locations(name: str) -> list[str]:
     ]
     if not locations:
         endings = ", ".join(REMOTE_ENDINGS)
-        raise StorageError(f"{without_user(name)}: no recording is there ({endings})")
+        raise StorageError(f"{without_user(name)}: contains no recording ({endings})")
     return locations
 
 
 def _plain(location: str) -> str:
-    """Return a path as absolute, and the URL of a local file as its path."""
+    """Return the absolute path of a local path or URL."""
     if not is_url(location):
         return str(Path(location).absolute())
     storage, remote = _storage(location)
@@ -161,7 +161,7 @@ def _plain(location: str) -> str:
 
 
 def _stamp_of(location: str) -> str:
-    """Return a file's location, size and change as its storage reports them, or nothing."""
+    """Return a file's location, size and modification as its storage reports them, or empty."""
     if not is_url(location):
         return ""
     storage, remote = _storage(location)
@@ -172,7 +172,7 @@ def _stamp_of(location: str) -> str:
 
 
 def _storage(url: str) -> tuple[Any, str]:
-    """Return a file system of fsspec and the path in it; raises StorageError."""
+    """Return a file system of fsspec and the path on it; raises StorageError."""
     fsspec = import_module("fsspec")
     try:
         with _storage_errors(url):
@@ -186,14 +186,14 @@ def _storage(url: str) -> tuple[Any, str]:
 
 @contextmanager
 def _storage_errors(url: str) -> Iterator[None]:
-    """Make a StorageError of whatever a storage raises but for a missing package."""
+    """Raise any exception of a storage as StorageError, except for missing packages."""
     try:
         yield
     except (ImportError, StorageError):
         raise
     except FileNotFoundError as error:
-        raise StorageError(f"{without_user(url)}: is not there") from error
-    # Each of fsspec's storages has exceptions of its own packages.
+        raise StorageError(f"{without_user(url)}: does not exist") from error
+    # The storages of fsspec raise exceptions of their own packages.
     except Exception as error:
         text = str(error) or type(error).__name__
         raise StorageError(f"{without_user(url)}: {without_user(text)}") from error

@@ -1,4 +1,4 @@
-"""Tasks on single recordings, their results in a folder, and a run over all recordings."""
+"""Tasks on single recordings, a folder of results, and runs over all recordings."""
 
 import errno
 import fcntl
@@ -38,37 +38,37 @@ from gateway.recordings.recorded_fusion import fused_lines, header_of_states
 from gateway.recordings.recorded_table import ReadOptions
 
 HELD: Final = "held_m"
-"""Errors at the withheld fixes, by estimator."""
+"""Key of the errors at withheld fixes, by estimator."""
 DRIFT: Final = "drift_m"
-"""Errors after 10 s without GPS, by estimator."""
+"""Key of the errors after 10 s without GPS, by estimator."""
 Files = Mapping[str, bytes]
 RESULTS: Final = "results"
 PARTIAL: Final = ".partial"
-"""Where files are written before they are put in their place."""
+"""Subfolder in which files are written before they are moved to their final path."""
 Report = Callable[[str, int, int], None]
-"""Called with the item that was done last, how many are done, and of how many."""
+"""Callback with the last finished item, the number of finished items, and the total."""
 LOOKING: Final = "looking for changes"
-"""The first step: it decides which recordings are to be worked on."""
+"""First step, which determines the recordings to be processed."""
 
 
 class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
     """Result of a task on one recording, as it is stored."""
 
     location: str = msgspec.field(name="place")
-    """Path or URL of its first file."""
+    """Path or URL of the first file."""
     digest: str
     key: str
-    """Of file, task, settings and version together."""
+    """Digest of file, task, settings and version."""
     task: str
     version: str
     vehicle: int | None = None
     began: str | None = None
     error: str | None = None
-    """Why there are no figures."""
+    """Reason why there are no figures."""
     figures: dict[str, Any] = {}
-    """JSON alone."""
+    """Figures as JSON."""
     files: tuple[str, ...] = ()
-    """Files that were written, relative to the folder of the results."""
+    """Files written, relative to the folder of results."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,15 +83,15 @@ class Worked:
 
 @dataclass(frozen=True)
 class FlightTask(ABC):
-    """One work on one recording; only how that is read changes the outcome."""
+    """A task on one recording; its outcome depends only on its settings and the recording."""
 
     name: ClassVar[str]
-    """Of the command."""
+    """Name of the command."""
     options: ReadOptions
 
     @property
     def fingerprint(self) -> bytes:
-        """All that affects the result, except the recording and the version."""
+        """Return the bytes of everything that affects the result, except recording and version."""
         current = self.options.current
         values = {
             "default": current.default,
@@ -104,12 +104,12 @@ class FlightTask(ABC):
 
     @abstractmethod
     def do(self, files: list[Path], name: str) -> Worked:
-        """Do it; raises FlightError, OSError, ValueError if there is no flight in it."""
+        """Do the task; raises FlightError, OSError, ValueError if there is no flight."""
 
 
 @dataclass(frozen=True)
 class JudgeTask(FlightTask):
-    """Judge every estimator by withheld fixes, write the settings' own states, and a page."""
+    """Score every estimator at withheld fixes, write the states of the settings, and a page."""
 
     pages: bool
     name: ClassVar[str] = "report"
@@ -133,7 +133,7 @@ class JudgeTask(FlightTask):
 
 def _page_of(case: Case, name: str) -> Files:
     """Make the page of a flight."""
-    # They need the extra plot, and take a second to import.
+    # Imported here: these require the extra `plot`, and take a second to import.
     from gateway.analysis.reporting.compose import make_report
     from gateway.analysis.reporting.page import write_report
 
@@ -179,7 +179,7 @@ class SweepTask(FlightTask):
 
 @dataclass(frozen=True, slots=True)
 class ReadFlight:
-    """A flight, and the facts in the head of its file."""
+    """A flight, and the facts in the header of its file."""
 
     flight: Flight
     header: Any
@@ -202,9 +202,9 @@ def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -
 def work_on(
     task: FlightTask, wanted: tuple[BatchItem, str, FlightResult]
 ) -> tuple[FlightResult, Files]:
-    """Do a task on one recording of that name, and complete its result.
+    """Do a task on one recording, and complete its result.
 
-    The `error` of the result is the reason of a failure.
+    A failure is stored as the `error` of the result.
     """
     item, name, result = wanted
     result = msgspec.structs.replace(result, version=__version__)
@@ -214,7 +214,7 @@ def work_on(
         try:
             worked = task.do(files, name)
         except SweepError:
-            # The settings of the sweep are wrong, not the recording.
+            # The settings of the sweep are invalid, not the recording.
             raise
         except (FlightError, ValueError) as error:
             text = str(error) or type(error).__name__
@@ -232,7 +232,7 @@ def work_on(
 
 
 def without_secrets(options: ReadOptions) -> ReadOptions:
-    """Leave out the signing passphrase, which no other machine needs."""
+    """Remove the signing passphrase, which other machines do not need."""
     current = options.current
 
     def plain(aircraft: Any) -> Any:
@@ -248,7 +248,7 @@ def without_secrets(options: ReadOptions) -> ReadOptions:
 
 
 def name_of(item: BatchItem) -> str:
-    """Return the name of a recording in the folder of the results."""
+    """Return the name of a recording in the folder of results."""
     name = as_text(recording_name(Path(item.location)))
     for ending in (".gz", ".csv", ".tlog"):
         name = name.removesuffix(ending)
@@ -256,7 +256,7 @@ def name_of(item: BatchItem) -> str:
 
 
 def _figures(case: Case) -> dict[str, Any]:
-    """Sum one flight up; unknown values are left out, since JSON has none."""
+    """Summarise one flight; unknown values are left out, since JSON cannot represent NaN."""
     known = {name: value for name, value in summarise(case).items() if value == value}
     held = {name: withheld_error_m(case, name) for name in case.tracks}
     drift = {name: outage_error_m(case, name) for name in case.tracks}
@@ -267,7 +267,7 @@ def _figures(case: Case) -> dict[str, Any]:
 
 
 class ResultFolder:
-    """Results of many recordings; raises OSError if it cannot be written."""
+    """Results of many recordings; raises OSError if the folder cannot be written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -275,9 +275,9 @@ class ResultFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other runs out, and remove partial files, of a killed run or of this one.
+        """Lock out other runs; remove partial files of a killed run, and of this one at its end.
 
-        Raises OSError if another run is at work in it.
+        Raises OSError if another run uses the folder.
         """
         descriptor = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
@@ -288,26 +288,26 @@ class ResultFolder:
             finally:
                 shutil.rmtree(self.folder / PARTIAL, ignore_errors=True)
         finally:
-            # Processes that were forked meanwhile have it open, too.
+            # Forked processes have inherited the descriptor, so closing it is not enough.
             with suppress(OSError):
                 fcntl.flock(descriptor, fcntl.LOCK_UN)
             os.close(descriptor)
 
     def find(self, key: str) -> FlightResult | None:
-        """Return a result that is kept with all its files; None if it is to be made."""
+        """Return a stored result if all its files exist; None if it must be computed."""
         found = _read(self._path(key))
         if found is None or not all((self.folder / name).exists() for name in found.files):
             return None
         return found
 
     def keep(self, result: FlightResult, files: Files) -> None:
-        """Write a result: its files first, all under other names, then itself."""
+        """Write a result: first its files, all under temporary names, then the result itself."""
         staged = self.folder / PARTIAL / result.key
         for name, content in files.items():
             path = staged / name
             path.parent.mkdir(parents=True, exist_ok=True)
             write_new(path, [content])
-        # Files that belong together (a page and its figures) are a folder, put in place at once.
+        # Files of one folder (a page and its figures) are moved into place together.
         for unit in {Path(*Path(name).parts[:2]) for name in files}:
             target = self.folder / unit
             target.parent.mkdir(exist_ok=True)
@@ -322,21 +322,21 @@ class ResultFolder:
 
 
 def _lock(descriptor: int, folder: Path) -> None:
-    """Lock a folder as long as it is open; the lock ends with the process, however that ends."""
+    """Lock a folder while the descriptor is open; the lock ends with the process in any case."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        text = "another mavgate batch writes its results here; wait, or name another folder"
+        text = "another mavgate batch writes its results here; wait, or give another folder"
         raise OSError(errno.EBUSY, text, str(folder)) from error
     except OSError:
-        # Some network disks have no locks.
+        # Some network file systems do not support locks.
         return
 
 
 def read_results(folder: Path) -> Iterator[FlightResult]:
-    """Read all results of a folder, the newest last; raises OSError if there is none.
+    """Read all results in a folder, newest last; raises OSError if there is none.
 
-    Those of one tick of the file system's clock stand by name.
+    Results of the same modification time are sorted by name.
     """
     paths = list((folder / RESULTS).iterdir())
     for path in sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name)):
@@ -358,7 +358,7 @@ def run_season(
     folder: ResultFolder | None,
     report: Report,
 ) -> list[FlightResult]:
-    """Do a task on every recording that it is not done on yet."""
+    """Do a task on every recording for which it is not done yet."""
     found: list[FlightResult | None] = [None] * len(items)
     todo: dict[int, tuple[BatchItem, str, FlightResult]] = {}
     stamps = _stamps(items, executor, report)
@@ -382,7 +382,7 @@ def run_season(
         else:
             result, files = outcome
             if result.version != __version__:
-                result = _failed(blank, f"done by mavgate {result.version}; here is {__version__}")
+                result = _failed(blank, f"done by mavgate {result.version}; this is {__version__}")
             elif folder is not None:
                 folder.keep(result, files)
         found[numbers[index]] = result
@@ -401,7 +401,7 @@ def _stamps(
 
 
 def _names(items: Sequence[BatchItem], stamps: Sequence[str | WorkFailed]) -> list[str]:
-    """Return names for the results; equal names of recordings get a part of their stamps."""
+    """Return names for the results; recordings of equal names get a part of their digests."""
     names = [name_of(item) for item in items]
     often = Counter(names)
     return [

@@ -376,12 +376,12 @@ def test_missing_package_of_a_storage_is_named(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_url_without_a_file_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match="no recording is there"):
+    with pytest.raises(StorageError, match="contains no recording"):
         items_of(["memory://nothing/*.csv"])
     with pytest.raises(StorageError, match="gopher"):
         items_of(["gopher://old/flights"])
     code, text = run(tmp_path, "-o", tmp_path / "out")
-    assert (code, "no recording is there" in text) == (2, True)
+    assert (code, "contains no recording" in text) == (2, True)
 
 
 @pytest.mark.parametrize(

@@ -82,7 +82,7 @@ def test_missing_scheduler_is_reported(
     season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gateway.batch.executors.CONNECT_S", 0.3)
-    with pytest.raises(ClusterError, match="no Dask scheduler answers"):
+    with pytest.raises(ClusterError, match="no Dask scheduler responds"):
         DaskCluster("tcp://127.0.0.1:9")
 
 
@@ -90,5 +90,5 @@ def test_workers_of_another_version_are_rejected(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gateway.batch.executors.__version__", "0.0.1")
-    with pytest.raises(ClusterError, match=r"here is mavgate 0\.0\.1, but"):
+    with pytest.raises(ClusterError, match=r"this is mavgate 0\.0\.1, but"):
         DaskCluster(address)

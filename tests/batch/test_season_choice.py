@@ -67,7 +67,7 @@ def test_flights_without_scores_are_left_out() -> None:
     assert found.winner == 0
     assert np.isnan(found.judged[1])
     assert found.means == pytest.approx([1.0, 6.0**0.5])
-    with pytest.raises(ValueError, match="too few fixes"):
+    with pytest.raises(ValueError, match="no flight has enough fixes"):
         choose(np.full((2, 2), np.nan), np.ones(2), ["a", "b"])
 
 

@@ -1,1 +1,1 @@
-"""The report of a flight as one page."""
+"""The report of a flight as a page."""

@@ -1,4 +1,4 @@
-"""The report of one flight, put together from its sections; the first is for pilots."""
+"""Compose the report of one flight from its sections; the first one is for pilots."""
 
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -37,7 +37,7 @@ FEET_PER_M: Final = 3.28084
 
 
 def the_flight(case: Case) -> Section | None:
-    """Build the section; None without GPS."""
+    """Build the section on the flight; None without GPS."""
     figures = case.figures
     if figures is None:
         return None
@@ -93,7 +93,7 @@ def _figures_table(case: Case, figures: PilotFigures) -> pd.DataFrame:
         ("GPS outages", len(outages), "", longest),
         ("link losses", len(figures.link_losses_s), "", ""),
     ]
-    # As objects, the counts stay whole numbers.
+    # As objects, so that counts stay integers.
     return pd.DataFrame(rows, columns=["figure", "value", "unit", "also"], dtype=object)
 
 
@@ -185,8 +185,8 @@ SECTIONS: Final[tuple[Callable[[Case], Section | None], ...]] = (
     noise,
     timing,
 )
-"""In the order of the page: the flight itself, then the study of filters. A section that the flight
-has no data for is left out."""
+"""Sections in the order of the page: the flight, then the study of filters. Sections without data
+are left out."""
 
 
 def make_report(case: Case, other: Case | None = None) -> Report:
@@ -202,7 +202,7 @@ def make_report(case: Case, other: Case | None = None) -> Report:
 
 
 def _facts(case: Case) -> list[Fact]:
-    """Choose the numbers for the page's header."""
+    """Return the key figures for the header of the page."""
     flight, figures = case.flight, case.figures
     facts = [
         Fact(f"{flight.duration_s:.0f} s", "recorded"),

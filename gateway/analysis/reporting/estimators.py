@@ -1,4 +1,4 @@
-"""The estimators side by side, two cases side by side, and Table I of the paper."""
+"""Compare the estimators, or two cases; and Table I of the paper."""
 
 from typing import Final
 
@@ -36,21 +36,21 @@ from gateway.geometry.angle import wrap_180
 COLOURS: Final = {"paper": style.ORANGE, "eskf": style.PINK}
 DESCRIPTION: Final = (
     "Every estimator fused the same samples, and is compared with {}. `paper` is the paper's "
-    "fusion with its equations corrected: in a turn its accelerometer takes the bank for level "
-    "flight and slowly tilts the horizon. `eskf` uses the GPS velocity to distinguish the "
-    "manoeuvre from gravity."
+    "fusion with its equations corrected: in a turn it interprets the bank as level flight, which "
+    "slowly tilts its horizon. `eskf` uses the GPS velocity to distinguish the manoeuvre from "
+    "gravity."
 )
 SMOOTHED_DESCRIPTION: Final = (
-    " `smoothed` uses the whole flight for each state: `eskf` from both ends, which only a "
-    "recording can be."
+    " `smoothed` uses the whole flight for each state: `eskf` forwards and backwards, which "
+    "requires a recording."
 )
 LATENCY_DESCRIPTION: Final = (
-    " The manoeuvres contradict the GPS latency set, {:.2f} s: `smoothed` uses the {:.2f} s "
-    "they show, from the beginning."
+    " The manoeuvres contradict the GPS latency set, {:.2f} s: `smoothed` uses {:.2f} s, "
+    "which they indicate, from the start."
 )
 OWN_GPS: Final = (
-    "its own interpolated GPS, which is not independent: what follows the fixes' own errors agrees "
-    "best"
+    "its own interpolated GPS, which is not independent: a track that follows the fixes' errors "
+    "agrees best"
 )
 OTHER: Final = style.GREEN
 ERROR_COLUMNS: Final = (
@@ -69,19 +69,19 @@ BARS: Final = {
     "horizontal, m": "position live (m)",
     DRIFT: f"position after {OUTAGE_S:.0f} s without GPS (m)",
 }
-"""Titles of the bars, by the column of the table."""
+"""Titles of the bar charts, by the column of the table."""
 TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
 SAME_POSITION_DEG: Final = 0.5
-"""Flights further apart do not fit on one map."""
+"""Maximum distance of two flights, in deg, that are drawn on one map."""
 NAMES: Final = ("A", "B")
 AB_COLOURS: Final = (style.BLUE, style.RED)
 INTERVAL_S: Final = 1.0
-"""Fixes a second of the paper's receiver, by the gaps that its figure 13 shows."""
+"""Interval of the fixes of the paper's receiver, from the gaps in its figure 13."""
 COLOUR_MAP: Final = "cividis_r"
 
 
 def estimators(case: Case) -> Section | None:
-    """Build the section; None without a reference, or where no sample counts."""
+    """Build the section; None without a reference, or if no sample is scored."""
     reference = _reference(case)
     if reference is None:
         return None
@@ -127,7 +127,7 @@ def estimators(case: Case) -> Section | None:
 def error_table(
     tracks: dict[str, FlightTrack], reference: Reference, scored: BoolArray
 ) -> pd.DataFrame:
-    """Score tracks against a reference."""
+    """Return a table of the errors of tracks against a reference."""
     rows = []
     for name, track in tracks.items():
         found = errors_over_time(track, reference.track)
@@ -138,7 +138,7 @@ def error_table(
 
 
 def _reference(case: Case) -> Reference | None:
-    """Choose the flight's own reference, or its interpolated GPS."""
+    """Return the flight's own reference, or its interpolated GPS."""
     if case.flight.reference is not None:
         return case.flight.reference
     if case.frame is None:
@@ -148,7 +148,7 @@ def _reference(case: Case) -> Reference | None:
 
 
 def _smoothed_description(case: Case) -> str:
-    """Describe the origin of the smoothed track, if there is one."""
+    """Describe how the smoothed track was computed; empty if there is none."""
     set_s, used_s = case.fusion.estimation.reference.gps_latency_s, case.smoothed_latency_s
     if used_s is None:
         return ""
@@ -185,7 +185,7 @@ def _draw_errors(case: Case, reference: Reference, table: pd.DataFrame, width_in
 def _error_panels(
     width_in: float, labels: list[str], table: pd.DataFrame
 ) -> tuple[Figure, list[Axes], list[Axes]]:
-    """Create the panels of the bars, next to each other if there is room, and those over time."""
+    """Create the panels of the bars, side by side if there is room, and the panels over time."""
     count = sum(column in table for column in BARS)
     shape = (1, count) if width_in >= style.WIDE_IN else (count, 1)
     heights_in = (shape[0] * (0.7 + 0.3 * len(table)), 1.75 * len(labels))
@@ -200,7 +200,7 @@ def _error_panels(
 
 
 def _draw_bars(axes: Axes, table: pd.DataFrame, column: str) -> None:
-    """Draw a bar for each estimator, with its value; the best is on top."""
+    """Draw a bar with its value for each estimator, the best one on top."""
     rows = table[["estimator", column]].dropna().sort_values(column, ascending=False)
     colours = [COLOURS.get(name, OTHER) for name in rows["estimator"]]
     bars = axes.barh(rows["estimator"], rows[column], color=colours, height=0.6)
@@ -211,7 +211,7 @@ def _draw_bars(axes: Axes, table: pd.DataFrame, column: str) -> None:
 
 
 def comparison(a: Case, b: Case) -> Section:
-    """Build the section."""
+    """Build the section on two cases."""
     same = np.array_equal(a.flight.time_us, b.flight.time_us)
     what = "the same flight with other settings" if same else b.flight.name
     lead = f"A is {a.flight.name}, fused by `{a.chosen}`; B is {what}, fused by `{b.chosen}`."
@@ -247,7 +247,7 @@ def _tables(a: Case, b: Case) -> list[ReportTable]:
     ]
     numbers = pd.DataFrame(rows)
     numbers["B − A"] = numbers["B"] - numbers["A"]
-    tables = [ReportTable("comparison", numbers, "Both in numbers, and B less A.")]
+    tables = [ReportTable("comparison", numbers, "Both in figures, and B minus A.")]
     if changes := changed_settings(a.fusion, b.fusion):
         settings = pd.DataFrame(changes, columns=["setting", "A", "B"]).astype(str)
         tables.append(ReportTable("comparison_settings", settings, "Settings that differ."))
@@ -263,7 +263,9 @@ def _on_one_map(a: Case, b: Case) -> bool:
 
 
 def _draw_difference(a: Case, b: Case, width_in: float) -> Figure:
-    figure, (above, below) = style.over_time(width_in, 1.9, ["apart (m)", "turned apart (deg)"])
+    figure, (above, below) = style.over_time(
+        width_in, 1.9, ["distance (m)", "attitude difference (deg)"]
+    )
     time = a.flight.time_s
     apart = position_error_m(b.track, a.track)
     turned = total_error_rad(rotation_error(b.track.q_nb, a.track.q_nb))
@@ -303,7 +305,7 @@ def _draw_map(a: Case, b: Case, width_in: float) -> Figure:
 
 
 def weights(case: Case) -> Section | None:
-    """Build the section; None without GPS."""
+    """Build the section on Table I; None without GPS."""
     if case.frame is None:
         return None
     thinned = blend_table(case.flight, case.fusion, INTERVAL_S)

@@ -1,4 +1,4 @@
-"""Attitude and position over the flight: yaw, quaternion, map, interpolated GPS."""
+"""Sections on attitude and position over the flight: yaw, quaternion, map, interpolated GPS."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -29,30 +29,30 @@ ROUND_M: Final = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 5
 
 
 def orientation(case: Case) -> Section | None:
-    """Build the section; None without a compass."""
+    """Build the section on yaw; None without a compass."""
     flight = case.flight
     if not np.isfinite(flight.imu.mag_b_ut).any():
         return None
     lines = yaw_lines(case)
-    below = "its error" if flight.reference else f"how far it is from the estimator {case.chosen}"
+    below = "its error" if flight.reference else f"its difference from the estimator {case.chosen}"
     return Section(
         "Yaw and quaternion",
         "Yaw by integrating the gyroscope alone drifts without limit; the magnetometer corrects "
-        "it (figure 7 of the paper). In long turns the paper's filter slowly takes the bank "
-        "for level flight, which tilts its compass; the drift of the gyroscope may be less "
-        "than that for some minutes, but it never comes back. The quaternion has no gimbal lock "
+        "it (figure 7 of the paper). In long turns the paper's filter interprets the bank as level "
+        "flight, which tilts its compass; for some minutes the gyroscope's drift may be less than "
+        "this error, but it never decreases. The quaternion has no gimbal lock "
         "and no jump at 360° (figure 8).",
         [
             Picture(
                 "fig07_yaw",
                 lambda width: _draw_yaw(case, lines, width),
-                f"Above: yaw over the flight, turns counted on. Below: {below}.",
+                f"Above: unwrapped yaw over the flight. Below: {below}.",
             ),
             Picture(
                 "fig08_quaternion",
                 lambda width: _draw_quaternion(case, width),
                 f"The attitude of the estimator `{case.chosen}`, body to north-east-down, the "
-                "scalar part w first. The sign is chosen so that no part jumps.",
+                "scalar w first. The sign is chosen so that no component jumps.",
             ),
         ],
         [
@@ -65,17 +65,17 @@ def orientation(case: Case) -> Section | None:
 
 @dataclass(frozen=True, slots=True)
 class YawLines:
-    """Yaw by several methods, continuous, in degrees."""
+    """Yaw by several methods, unwrapped, in degrees."""
 
     yaw_deg: dict[str, FloatArray]
-    """Shape (N,) each, by name in the legend."""
+    """Shape (N,) each, by name for the legend."""
     reference_deg: FloatArray
-    """The reference."""
+    """Yaw of the reference, shape (N,)."""
     description: str
     """Description of the reference."""
 
     def error_deg(self, name: str) -> FloatArray:
-        """Error of a line; that of the gyroscope may exceed a turn."""
+        """Return the error of a line; that of the gyroscope may exceed a full turn."""
         error = self.yaw_deg[name] - self.reference_deg
         if name == GYRO:
             return error
@@ -83,7 +83,7 @@ class YawLines:
 
 
 def yaw_lines(case: Case) -> YawLines:
-    """Compare yaw by the gyroscope alone with yaw of the paper's filter and the chosen one's."""
+    """Compute yaw from the gyroscope alone, from the paper's filter, and from the chosen one."""
     flight, reference = case.flight, case.flight.reference
     fused = {COMPASS: case.tracks[PAPER]}
     if reference and case.chosen != PAPER:
@@ -101,7 +101,7 @@ def yaw_lines(case: Case) -> YawLines:
     yaw = {GYRO: continuous_yaw_deg(gyro_q)}
     yaw |= {name: continuous_yaw_deg(track.q_nb) for name, track in fused.items()}
     for name, line in yaw.items():
-        # All start in the same turn.
+        # Remove whole turns between the lines at their start.
         both = np.flatnonzero(np.isfinite(line) & np.isfinite(reference_deg))
         turns = np.round((line[both[:1]] - reference_deg[both[:1]]) / 360.0)
         yaw[name] = line - 360.0 * (turns[0] if len(turns) else 0.0)
@@ -110,7 +110,7 @@ def yaw_lines(case: Case) -> YawLines:
 
 
 def continuous_yaw_deg(q_nb: FloatArray) -> FloatArray:
-    """Count yaw on over full turns; NaN where the attitude is not known."""
+    """Return unwrapped yaw; NaN where the attitude is unknown."""
     yaw = euler_rad(q_nb)[:, 2]
     known = np.isfinite(yaw)
     yaw[known] = np.unwrap(yaw[known])
@@ -134,7 +134,7 @@ def _yaw_table(lines: YawLines) -> pd.DataFrame:
 
 
 def _attitude_by_rate(time_us: IntArray, gyro_b_radps: FloatArray, q_nb: FloatArray) -> FloatArray:
-    """Integrate the rate, except over steps that go back in time or exceed `MAX_STEP_S`."""
+    """Integrate the rate, except over steps back in time or longer than `MAX_STEP_S`."""
     dt_s = np.diff(time_us, prepend=time_us[:1]) / US_PER_S
     dt_s = np.where((dt_s > 0.0) & (dt_s <= MAX_STEP_S), dt_s, 0.0)
     return integrate_rate(dt_s, np.nan_to_num(gyro_b_radps), q_nb)
@@ -142,7 +142,7 @@ def _attitude_by_rate(time_us: IntArray, gyro_b_radps: FloatArray, q_nb: FloatAr
 
 def _draw_yaw(case: Case, lines: YawLines, width_in: float) -> Figure:
     below_label = "yaw error (deg)" if case.flight.reference else "difference (deg)"
-    labels = ["yaw, turns counted on (deg)", below_label]
+    labels = ["unwrapped yaw (deg)", below_label]
     figure, (above, below) = style.over_time(width_in, 2.3, labels)
     time = case.flight.time_s
     if case.flight.reference:
@@ -157,7 +157,7 @@ def _draw_yaw(case: Case, lines: YawLines, width_in: float) -> Figure:
 
 
 def _draw_quaternion(case: Case, width_in: float) -> Figure:
-    figure, (axes,) = style.over_time(width_in, 2.8, ["part of the quaternion (1)"])
+    figure, (axes,) = style.over_time(width_in, 2.8, ["quaternion component (1)"])
     q_nb = continuous(case.track.q_nb)
     colours = (style.INK, style.BLUE, style.RED, style.GREEN)
     for name, part, colour in zip("wxyz", q_nb.T, colours, strict=True):
@@ -168,7 +168,7 @@ def _draw_quaternion(case: Case, width_in: float) -> Figure:
 
 
 def continuous(q_nb: FloatArray) -> FloatArray:
-    """Choose the signs of quaternions of shape (N, 4) so that no part jumps."""
+    """Choose the signs of quaternions, shape (N, 4), so that no component jumps."""
     nearer = np.einsum("ij,ij->i", q_nb[1:], q_nb[:-1]) < 0.0
     signs = np.where(np.cumsum(np.concatenate([[False], nearer])) % 2 == 1, -1.0, 1.0)
     return np.asarray(q_nb * signs[:, np.newaxis])
@@ -195,7 +195,7 @@ def ground_track(case: Case) -> Section | None:
 
 
 def gps_interpolation(case: Case) -> Section | None:
-    """Build the section of figures 11 to 13; None without GPS."""
+    """Build the section with figures 11 to 13; None without GPS."""
     if case.frame is None:
         return None
     count = len(case.fixes)
@@ -257,7 +257,7 @@ def _draw_map(case: Case, width_in: float) -> Figure:
 def draw_path(
     axes: Axes, frame: LocalFrame, track: FlightTrack, colour: str, label: str, **style_of: float
 ) -> None:
-    """Draw a track from above, thinned."""
+    """Draw a track from above, with a limited number of points."""
     step = max(1, len(track.lat_deg) // 4000)
     pos_m = frame.local_m(track.lat_deg[::step], track.lon_deg[::step])
     axes.plot(pos_m[:, 1], pos_m[:, 0], color=colour, label=label, **style_of)
@@ -285,7 +285,7 @@ def _graticule(axes: Axes, frame: LocalFrame) -> None:
 
 
 def _scale_and_north(axes: Axes, east_m: FloatArray, north_m: FloatArray) -> None:
-    """Draw the scale in the emptiest corner, and the arrow in the emptiest of the others."""
+    """Draw the scale in the emptiest corner, and the north arrow in the next one."""
     low, high = axes.get_xlim()
     bottom, top = axes.get_ylim()
     across, up = (east_m - low) / (high - low), (north_m - bottom) / (top - bottom)
@@ -309,7 +309,7 @@ def _scale_and_north(axes: Axes, east_m: FloatArray, north_m: FloatArray) -> Non
 
 
 def _excerpt(case: Case) -> tuple[int, int]:
-    """Choose the fixes around the sharpest turn of the track."""
+    """Return the range of fixes around the sharpest turn of the track."""
     fixes = case.fixes
     course = np.unwrap(np.arctan2(fixes.vel_n_mps[:, 1], fixes.vel_n_mps[:, 0]))
     speed = np.hypot(fixes.vel_n_mps[:, 0], fixes.vel_n_mps[:, 1])

@@ -1,4 +1,4 @@
-"""The report as one self-contained HTML page, and its figures and tables as files."""
+"""Write the report as one self-contained HTML page, and its figures and tables as files."""
 
 import re
 from collections.abc import Callable, Iterable
@@ -29,32 +29,32 @@ PAGE_NAME: Final = "index.html"
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One figure and its caption."""
+    """A figure and its caption."""
 
     name: str
-    """File name without its ending."""
+    """File name without suffix."""
     draw: Callable[[float], Figure]
-    """Draws it for a width in inches."""
+    """Function that draws the figure for a width in inches."""
     caption: str
 
 
 @dataclass(frozen=True, slots=True)
 class ReportTable:
-    """One table; numbers are shown with `digits` decimals and written with all."""
+    """A table; numbers are shown with `digits` decimals and written with all."""
 
     name: str
     frame: pd.DataFrame
     caption: str
     digits: int = 2
     strong: tuple[int, ...] = ()
-    """Rows to emphasise."""
+    """Indices of rows to emphasise."""
 
     def rows(self) -> list[list[str]]:
-        """Write the cells as text."""
+        """Return the cells as text."""
         return [[self._text(value) for value in row] for row in self.frame.itertuples(index=False)]
 
     def is_text(self, column: int) -> bool:
-        """Return whether a column holds words, which begin at the left."""
+        """Return whether a column contains text, which is aligned left."""
         return any(isinstance(value, str) for value in self.frame.iloc[:, column])
 
     def _text(self, value: object) -> str:
@@ -69,19 +69,19 @@ class Section:
 
     title: str
     lead: str
-    """A few sentences; parts in backticks are code."""
+    """A few sentences; parts in backticks are set as code."""
     pictures: list[Picture] = field(default_factory=list)
     tables: list[ReportTable] = field(default_factory=list)
 
     @property
     def anchor(self) -> str:
-        """Its anchor in the page's address."""
+        """Anchor of the section in the page's address."""
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")
 
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """One number in the page's header."""
+    """A key figure in the header of the page."""
 
     value: str
     meaning: str
@@ -122,7 +122,7 @@ def write_report(
         drawn = {}
 
         def draw(number: int) -> Drawn:
-            # A picture cannot be sent to another process, only be inherited.
+            # A Picture cannot be pickled for another process, only inherited.
             return _drawn(pictures[number], fresh)
 
         with forked(draw, jobs if START == "fork" else 1) as run:
@@ -147,7 +147,7 @@ def render_page(report: Report, drawn: dict[str, Drawn]) -> str:
 
 
 def prose(text: str) -> Markup:
-    """Escape a text and set parts in backticks as code."""
+    """Escape a text, and set parts in backticks as code."""
     escaped = str(jinja2.filters.do_forceescape(text))
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped))
 

@@ -1,4 +1,4 @@
-"""The sensors: acceleration filters, magnetometer, heights, noise, timing and loss."""
+"""Sections on the sensors: acceleration filters, magnetometer, heights, noise, timing, loss."""
 
 from typing import Final
 
@@ -32,24 +32,24 @@ MAX_DOTS: Final = 800
 
 
 def acceleration(case: Case) -> Section:
-    """Build the section; if the flight's rate is too low for the filters, only their design."""
+    """Build the section; only the filters' design if the flight's rate is too low for them."""
     paper, rate_hz = case.fusion.estimation.paper, case.flight.rate_hz
     cutoff = paper.accel_cutoff_hz
     if cutoff >= 0.5 * rate_hz:
         return Section(
             "Acceleration filters",
-            f"At this flight's {rate_hz:.0f} samples/s a low-pass at {cutoff:g} Hz does nothing: "
+            f"At this flight's {rate_hz:.0f} samples/s a low-pass at {cutoff:g} Hz has no effect: "
             "half the sample rate is the highest possible frequency. So there is nothing to "
-            "draw of this flight; the table shows the filters at the paper's rate.",
+            "plot for this flight; the table is for the filters at the paper's rate.",
             [],
             [_paper_table(case)],
         )
     return Section(
         "Acceleration filters",
         f"Second-order low-passes at {cutoff:g} Hz, as in figures 9 and 10 of the paper. "
-        "Chebyshev passes all up to the cutoff and falls faster from there, but rings after a "
+        "Chebyshev passes all frequencies up to the cutoff and falls off faster, but rings after a "
         "step and delays unevenly. "
-        "The paper says that it also takes longer; with the same order both are the same five "
+        "The paper states that it also takes longer; with the same order both are the same five "
         f"multiplications per sample, and the table gives their time here.",
         [
             _excerpt(case, 0, "fig09_acceleration_x"),
@@ -93,7 +93,7 @@ def _excerpt(case: Case, axis: int, name: str) -> Picture:
 
 
 def liveliest(flight: Flight, axis: int) -> slice:
-    """Find the stretch of `EXCERPT_S` in which a smoothed axis of the acceleration moves most."""
+    """Return the part of `EXCERPT_S` in which a smoothed axis of the acceleration varies most."""
     count = min(max(round(EXCERPT_S * flight.rate_hz), 2), len(flight.time_us))
     x = np.nan_to_num(flight.imu.accel_b_mps2[:, axis])
     first = np.concatenate([[0.0], np.cumsum(x)])
@@ -144,7 +144,7 @@ def _draw_response(case: Case, width_in: float) -> Figure:
 
 
 def noise(case: Case) -> Section:
-    """Build the section of spectra and Allan deviations."""
+    """Build the section on spectra and Allan deviations."""
     flight = case.flight
     rest = longest_rest(flight.imu.accel_b_mps2, flight.imu.gyro_b_radps, flight.rate_hz)
     rest_s = (rest.stop - rest.start) / flight.rate_hz
@@ -162,7 +162,7 @@ def noise(case: Case) -> Section:
                 "allan_deviation",
                 lambda width: _draw_allan(flight, rest, width),
                 f"Allan deviation in the longest rest, {rest_s:.0f} s. A slope of -1/2 is white "
-                "noise; where the line turns up, the bias wanders. So short a rest shows averaging "
+                "noise; where the line rises again, the bias drifts. This rest shows averaging "
                 f"times up to {rest_s / 4.0:.1f} s only.",
             )
         )
@@ -171,21 +171,21 @@ def noise(case: Case) -> Section:
         tail = " The flight has no rest long enough for an Allan deviation."
     return Section(
         "Noise",
-        "Spectrum of the inertial sensors, and how far averaging at rest helps." + tail,
+        "Spectrum of the inertial sensors, and the effect of averaging at rest." + tail,
         pictures,
     )
 
 
 def timing(case: Case) -> Section | None:
-    """Build the section of jitter and loss; None if the recording has no node times."""
+    """Build the section on jitter and loss; None if the recording has no node times."""
     node = case.flight.node_time_us
     if node is None or len(node) < 3:
         return None
     table = loss_table(case.flight, node)
     return Section(
         "Timing and loss",
-        "How evenly samples come, on the gateway's clock and on the node's own, and what is "
-        "missing between them.",
+        "Regularity of the samples, by the gateway's clock and by the node's own, and "
+        "samples that are missing.",
         [
             Picture(
                 "timing",
@@ -199,7 +199,7 @@ def timing(case: Case) -> Section | None:
 
 
 def loss_table(flight: Flight, node_time_us: IntArray) -> pd.DataFrame:
-    """Measure jitter and loss."""
+    """Return a table of jitter and loss."""
     interval_us = np.diff(node_time_us) % NODE_WRAP_US
     nominal_us = float(np.median(interval_us))
     missing = missing_samples(node_time_us)
@@ -220,7 +220,7 @@ def loss_table(flight: Flight, node_time_us: IntArray) -> pd.DataFrame:
 
 
 def magnetometer(case: Case) -> Section | None:
-    """Build the section of the magnetometer's sphere; None without one."""
+    """Build the section on the magnetometer; None without one."""
     before, after = case.flight.mag_uncalibrated_b_ut, case.flight.imu.mag_b_ut
     if before is None or not np.isfinite(after).any():
         return None
@@ -259,7 +259,7 @@ def magnetometer(case: Case) -> Section | None:
 
 
 def heights(case: Case) -> Section | None:
-    """Build the section of height sources; None if there is only one."""
+    """Build the section on sources of height; None if there is only one."""
     flight = case.flight
     if case.frame is None or not len(flight.baro[0]):
         return None
@@ -273,7 +273,7 @@ def heights(case: Case) -> Section | None:
             Picture(
                 "heights",
                 lambda width: _draw_heights(case, offset_m, width),
-                "Above: heights. Below: what each is away from "
+                "Above: heights. Below: the difference of each from "
                 + (f"the {case.truth_name}." if flight.reference else "the fused height."),
             )
         ],
@@ -284,7 +284,7 @@ def heights(case: Case) -> Section | None:
 
 
 def baro_offset_m(case: Case) -> float:
-    """Mean difference of GPS height and barometer height."""
+    """Return the mean difference of GPS height and barometer height."""
     baro_m = np.interp(case.fixes.valid_us, *case.flight.baro)
     return float(np.nanmean(case.fixes.alt_amsl_m - baro_m))
 
@@ -335,7 +335,7 @@ def _draw_heights(case: Case, offset_m: float, width_in: float) -> Figure:
         style.draw(above, flight.time_s, truth, style.REFERENCE, case.truth_name, lw=3, alpha=0.3)
     for name, (time_us, alt_m, colour) in _height_lines(case, offset_m).items():
         seconds = flight.seconds(time_us)
-        # Nothing was measured in a dropout: the line ends at its start.
+        # In a dropout there is no measurement: the line is interrupted.
         alt_m = np.where(np.diff(seconds, append=seconds[-1:]) > MAX_GAP_S, np.nan, alt_m)
         style.draw(above, seconds, alt_m, colour, name, lw=1.0)
         style.draw(below, seconds, alt_m - _height_reference(case, time_us), colour, name, lw=1.0)
@@ -364,7 +364,7 @@ def _draw_allan(flight: Flight, rest: slice, width_in: float) -> Figure:
 def _draw_logarithmic(
     lines: dict[str, tuple[FloatArray, FloatArray]], xlabel: str, line_width: float, width_in: float
 ) -> Figure:
-    """Draw x and the values of three axes over it, by the label of the panel."""
+    """Draw the values of three axes over x, by the label of the panel."""
     figure, axes = style.panels(width_in, 1, 2.7, columns=2, share_x=False)
     for panel, (label, (x, values)) in zip(axes, lines.items(), strict=True):
         for part, name, colour in zip(values.T, "xyz", AXIS_COLOURS, strict=True):

@@ -1,7 +1,7 @@
-"""Style of the report's figures, which serve a light page, a dark page and a file.
+"""Style of the report's figures, for a light page, a dark page and files.
 
-A figure is drawn once, in the light theme and with no ground. Inside the page its few colours are
-replaced by CSS variables, so the page's own theme colours it.
+A figure is drawn once, in the light theme and without background. In the page its colours are
+replaced by CSS variables, so the page's theme colours it.
 """
 
 import io
@@ -33,17 +33,17 @@ CSS_NAMES: Final = {
     BLUE: "blue", ORANGE: "orange", GREEN: "green", RED: "red", PINK: "pink", SKY: "sky",
     INK: "ink", MUTED: "muted", GRID: "grid",
 }  # fmt: skip
-"""The palette of Okabe and Ito, distinguishable for colour-blind readers, and the page's greys."""
+"""The colour-blind safe palette of Okabe and Ito, and the greys of the page."""
 
 REFERENCE: Final = INK
-"""Truth or reference is always drawn in the colour of the text."""
+"""Colour of the truth or reference in all figures, the same as that of text."""
 
 WIDE_IN: Final = 7.6
 NARROW_IN: Final = 3.9
-"""Widths of a figure for a desktop page and for a phone, where text must not shrink."""
+"""Widths of a figure for a desktop page and for a phone, where text must not be scaled down."""
 
 MAX_POINTS: Final = 1500
-"""Points of a line; a denser one is drawn by its envelope."""
+"""Maximum number of points of a line; a denser one is drawn as its envelope."""
 
 PNG_DPI: Final = 130
 
@@ -84,7 +84,7 @@ RC: Final = {
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Draw in the report's style."""
+    """Apply the report's style while drawing."""
     with mpl.rc_context(RC):
         yield
 
@@ -92,7 +92,7 @@ def styled() -> Iterator[None]:
 def panels(
     width_in: float, rows: int, row_height_in: float, *, columns: int = 1, share_x: bool = True
 ) -> tuple[Figure, list[Axes]]:
-    """Create a figure of panels one below the other, or side by side if there is room."""
+    """Create a figure of panels, one below the other, or side by side if there is room."""
     if width_in < WIDE_IN:
         rows, columns = rows * columns, 1
     figure = Figure(figsize=(width_in, rows * row_height_in))
@@ -103,7 +103,7 @@ def panels(
 def over_time(
     width_in: float, row_height_in: float, labels: Sequence[str]
 ) -> tuple[Figure, list[Axes]]:
-    """Create labelled panels one below the other over a time in seconds."""
+    """Create labelled panels, one below the other, over time in seconds."""
     figure, axes = panels(width_in, len(labels), row_height_in)
     for panel, label in zip(axes, labels, strict=True):
         panel.set_ylabel(label)
@@ -112,7 +112,7 @@ def over_time(
 
 
 def envelope(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Thin a long line to the least and the greatest value of each stretch."""
+    """Reduce a long line to the minimum and maximum of each interval."""
     stretch = -(-len(x) // (MAX_POINTS // 2))
     if stretch <= 2:
         return x, y
@@ -130,12 +130,12 @@ def envelope(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
 def draw(
     axes: Axes, x: FloatArray, y: FloatArray, colour: str, label: str, **style: object
 ) -> None:
-    """Draw a line, thinned."""
+    """Draw a line with a limited number of points."""
     axes.plot(*envelope(x, y), color=colour, label=label, **style)
 
 
 def legend_above(axes: Axes, columns: int = 4) -> None:
-    """Put the legend between title and panel, where it hides nothing."""
+    """Put the legend between title and panel, where it covers nothing."""
     axes.legend(
         loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncols=columns, borderaxespad=0.1,
         handlelength=1.4, columnspacing=1.2,
@@ -154,7 +154,7 @@ def legend_outside(figure: Figure, axes: Axes, columns: int) -> None:
 
 
 def fit_square(axes: Axes, x: FloatArray, y: FloatArray) -> None:
-    """Show all points at one scale in both directions, with 6 % of room at each end."""
+    """Show all points at the same scale in both directions, with a margin of 6 %."""
     spread = max(float(np.ptp(x)), float(np.ptp(y)), 1e-9)
     half = 0.56 * spread
     middle_x, middle_y = 0.5 * float(np.min(x) + np.max(x)), 0.5 * float(np.min(y) + np.max(y))
@@ -164,31 +164,31 @@ def fit_square(axes: Axes, x: FloatArray, y: FloatArray) -> None:
 
 
 def to_svg(figure: Figure) -> str:
-    """Write a figure as an SVG with the colours of the light theme and no ground."""
+    """Write a figure as an SVG with the colours of the light theme and without background."""
     buffer = io.StringIO()
     FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
-    # It is laid out now; the next file of the same figure need not do it again.
+    # The layout is computed now, and need not be repeated for the next file.
     figure.set_layout_engine("none")
     return _tidy(buffer.getvalue())
 
 
 def to_png(figure: Figure) -> bytes:
-    """Write a figure as a PNG on white."""
+    """Write a figure as a PNG on a white background."""
     buffer = io.BytesIO()
     figure.dpi = PNG_DPI
     figure.set_facecolor("white")
-    # Not by `savefig`, which draws twice.
+    # Not `savefig`, which draws twice.
     FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()
 
 
 def stand_alone(svg: str) -> str:
-    """Give an SVG of `to_svg` a white ground, so that any viewer shows it well."""
+    """Give an SVG of `to_svg` a white background, for any viewer."""
     return svg.replace("<svg ", '<svg style="background: #ffffff" ', 1)
 
 
 def for_page(svg: str) -> str:
-    """Let the page's theme colour an SVG of `to_svg`."""
+    """Replace the colours of an SVG of `to_svg` by those of the page's theme."""
     svg = svg[svg.index("<svg ") :]
     for colour, name in CSS_NAMES.items():
         svg = svg.replace(colour, f"var(--{name})")
@@ -197,10 +197,10 @@ def for_page(svg: str) -> str:
 
 
 def _tidy(svg: str) -> str:
-    """Drop what only matplotlib itself needs; the groups' names repeat from figure to figure."""
+    """Remove parts that only matplotlib needs; names of groups are not unique between figures."""
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r"<!--.*?-->", "", svg, flags=re.DOTALL)
     svg = re.sub(r'<g id="[a-zA-Z]+[0-9_]*">', "<g>", svg)
-    # A hundredth of a point is finer than any screen shows; texts keep their digits.
+    # A hundredth of a point is below the resolution of screens; texts keep their digits.
     svg = re.sub(r"<[^>]+>", lambda tag: re.sub(r"(\d\.\d\d)\d+", r"\1", tag[0]), svg)
     return re.sub(r"\n\s*", "\n", svg)

@@ -77,7 +77,7 @@ class SeasonWork:
         except OSError as error:
             refuse(str(error))
         if not items:
-            refuse(f"{', '.join(self.names)}: no recording is there")
+            refuse(f"{', '.join(self.names)}: contains no recording")
         return items
 
     @contextmanager
