@@ -1,13 +1,14 @@
 """Payloads contain the readings of the simulated sensors, at their times of sampling."""
 
 from itertools import takewhile
+from typing import Any
 
 import numpy as np
 import pytest
 
 from gateway.records import GpsFixType, ImuFlags, NodeId
 from gateway.simulator.flight import SimulatedAircraft
-from gateway.simulator.node import Node, Sent, nodes_of
+from gateway.simulator.node import Sent, gps_payloads, nodes_of, pack_baro
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire import payloads as wire
 from tests.kit.payloads import decode_payload
@@ -17,25 +18,22 @@ SETTINGS = SimulatorSettings()
 SECONDS = 20.0
 
 
-def nodes() -> tuple[Node, Node]:
-    return nodes_of(SimulatedAircraft(SETTINGS), SETTINGS)
-
-
-def sent_by(node: Node, until_s: float = SECONDS) -> list[Sent]:
-    return list(takewhile(lambda sent: sent.time_s < until_s, node.sent()))
+def sent_by(index: int) -> list[Sent]:
+    node = nodes_of(SimulatedAircraft(SETTINGS), SETTINGS)[index]
+    return list(takewhile(lambda sent: sent.time_s < SECONDS, node.sent()))
 
 
 @pytest.fixture(scope="module")
 def imu_sent() -> list[Sent]:
-    return sent_by(nodes()[0])
+    return sent_by(0)
 
 
 @pytest.fixture(scope="module")
 def gps_sent() -> list[Sent]:
-    return sent_by(nodes()[1])
+    return sent_by(1)
 
 
-def of_kind(sent: list[Sent], kind: type) -> list[Sent]:
+def of_kind(sent: list[Sent], kind: Any) -> list[Sent]:
     return [s for s in sent if isinstance(s.payload, kind)]
 
 
@@ -76,14 +74,12 @@ class TestGpsNode:
             assert quality.itow_ms == fix.itow_ms
 
     def test_lack_of_a_fix_is_reported(self, gps_sent: list[Sent]) -> None:
-        fixes = of_kind(gps_sent, wire.GpsFixPayload)
-        for sent in fixes:
+        for sent in of_kind(gps_sent, wire.GpsFixPayload):
             found = sent.time_s > 5.15
             assert sent.payload.fix_ok is found
             assert (sent.payload.fix_type is GpsFixType.FIX_3D) is found
         qualities = [s.payload for s in of_kind(gps_sent, wire.GpsQualityPayload)]
-        assert qualities[0].utc is None
-        assert qualities[0].h_acc_cm == 9999
+        assert (qualities[0].utc, qualities[0].h_acc_cm) == (None, 9999)
         assert qualities[-1].utc is not None
         assert qualities[-1].geoid_separation_cm == 2300
 
@@ -94,16 +90,19 @@ class TestGpsNode:
         assert fix.alt_amsl_mm == pytest.approx(110_000, abs=8000)
 
 
-@pytest.mark.parametrize("index", [0, 1])
-def test_pieces_of_any_size_give_the_same_in_order(
-    index: int, monkeypatch: pytest.MonkeyPatch
+def test_payloads_are_those_of_samples_taken_at_once(
+    imu_sent: list[Sent], gps_sent: list[Sent]
 ) -> None:
-    usual = sent_by(nodes()[index])
-    for size in ("SAMPLES_AT_ONCE", "FIXES_AT_ONCE"):
-        monkeypatch.setattr(f"gateway.simulator.node.{size}", 7)
-    assert sent_by(nodes()[index]) == usual
-    times = [sent.time_s for sent in usual]
-    assert times == sorted(times)
+    aircraft = SimulatedAircraft(SETTINGS)
+    baro, gps = aircraft.baro.take(SECONDS), aircraft.gps.take(SECONDS)
+    columns = (baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc)
+    sent = of_kind(imu_sent, wire.BaroPayload)
+    assert sent == [*pack_baro(columns)][: len(sent)]
+    payloads = gps_payloads(gps, aircraft.gps_clock, SETTINGS.geoid_separation_m)
+    sent = of_kind(gps_sent, wire.GpsFixPayload | wire.GpsQualityPayload)
+    assert sent == [*payloads][: len(sent)]
+    for node in (imu_sent, gps_sent):
+        assert node == sorted(node, key=lambda sent: sent.time_s)
 
 
 def test_every_payload_fits_the_radio(imu_sent: list[Sent], gps_sent: list[Sent]) -> None:

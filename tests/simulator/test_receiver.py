@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import gateway
-from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
-from gateway.simulator.gps import GpsSampler
-from gateway.simulator.receiver import damage, simulate
-from gateway.simulator.sensors import BaroSampler, ImuSampler
+from gateway.records import BaroRaw, GpsFix, ImuRaw, LinkReport, NodeId
+from gateway.simulator.flight import SimulatedAircraft
+from gateway.simulator.node import nodes_of
+from gateway.simulator.receiver import SimulatedReceiver, damage, simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.wire.framing import Fault, FaultKind, FrameDecoder, encode_frame
@@ -36,9 +36,33 @@ def frames(seconds: float = SECONDS, **changes: object) -> list[TimedFrame]:
 
 def decoded(line: list[TimedFrame]) -> list[RadioFrame | ReceiverStatusFrame]:
     events = FrameDecoder().feed(b"".join(frame.data for frame in line))
-    contents = [decode_content(event) for event in events if isinstance(event, bytes)]
-    assert len(contents) == len(line)
-    return [c for c in contents if isinstance(c, RadioFrame | ReceiverStatusFrame)]
+    found = [decode_content(event) for event in events if isinstance(event, bytes)]
+    assert len(found) == len(line)
+    return [c for c in found if isinstance(c, RadioFrame | ReceiverStatusFrame)]
+
+
+def reports_of(contents: list[RadioFrame | ReceiverStatusFrame]) -> list[ReceiverStatusFrame]:
+    return [content for content in contents if isinstance(content, ReceiverStatusFrame)]
+
+
+def feed(line: list[TimedFrame]) -> tuple[list[Any], LinkReport]:
+    """Return the records of frames, and the report of their link."""
+    link = Link()
+    found = [each for f in line for each in link.feed(f.data, round(f.time_s * 1e6))]
+    return found, link.report(round(line[-1].time_s * 1e6), connected=True, port="")
+
+
+class Counted:
+    """A sampler whose pieces are counted."""
+
+    def __init__(self, sampler: Any, made: list[int]) -> None:
+        self.take_samples, self.made = sampler.take, made
+        self.clock = getattr(sampler, "clock", None)
+
+    def take(self, until_s: float) -> Any:
+        samples = self.take_samples(until_s)
+        self.made.append(len(samples.time_s))
+        return samples
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +88,7 @@ class TestLine:
             assert 0.0 < frame.time_s - heard_s < 0.006
 
     def test_receiver_reports_once_a_second(self, line: list[TimedFrame]) -> None:
-        reports = [c for c in decoded(line) if isinstance(c, ReceiverStatusFrame)]
+        reports = reports_of(decoded(line))
         assert len(reports) == 19
         assert reports[-1].pipes[0].received == pytest.approx(19 * 126, rel=0.03)
         assert reports[-1].pipes[1].received == pytest.approx(19 * 11, rel=0.05)
@@ -75,25 +99,16 @@ class TestLine:
         assert same == line[: len(same)]
         assert same != other
 
-    def test_each_frame_needs_at_most_one_piece_of_samples(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_each_frame_needs_at_most_one_piece_of_samples(self) -> None:
         """More would block the event loop that asks for the frame."""
         made: list[int] = []
-
-        def counted(sampler: type[ImuSampler | BaroSampler | GpsSampler]) -> None:
-            take = sampler.take
-
-            def wrapper(self: Any, until_s: float) -> Any:
-                samples = take(self, until_s)
-                made.append(len(samples.time_s))
-                return samples
-
-            monkeypatch.setattr(sampler, "take", wrapper)
-
-        for sampler in (ImuSampler, BaroSampler, GpsSampler):
-            counted(sampler)
-        line = simulate(settings(vehicles=4, radio_loss=0.0)).frames(6.0)
+        four, nodes = settings(vehicles=4, radio_loss=0.0), []
+        for index in range(4):
+            aircraft = SimulatedAircraft(four, index)
+            for name in ("imu", "baro", "gps"):
+                setattr(aircraft, name, Counted(getattr(aircraft, name), made))
+            nodes += nodes_of(aircraft, four)
+        line = SimulatedReceiver(four, nodes).frames(6.0)
         assert next(line).time_s < 0.1
         total = len(made)
         for _ in line:
@@ -104,14 +119,13 @@ class TestLine:
 
     def test_too_slow_line_drops_frames_and_counts_them(self) -> None:
         contents = decoded(frames(10.0, baud=38_400, imu_rate_hz=200))
-        report = [c for c in contents if isinstance(c, ReceiverStatusFrame)][-1]
-        assert report.uart_dropped > 100
+        assert reports_of(contents)[-1].uart_dropped > 100
         radio = [c.frame_seq for c in contents]
         assert any((b - a) % 256 > 1 for a, b in itertools.pairwise(radio)), "the gap shows"
 
     def test_1000_samples_per_second_fit_on_the_line(self) -> None:
         contents = decoded(frames(3.0, imu_rate_hz=1000, radio_loss=0.0))
-        assert [c for c in contents if isinstance(c, ReceiverStatusFrame)][-1].uart_dropped == 0
+        assert reports_of(contents)[-1].uart_dropped == 0
         assert len(contents) == pytest.approx(3 * 1037, rel=0.01)
 
 
@@ -134,32 +148,22 @@ class TestRadio:
             assert gaps[gaps > 0].mean() == pytest.approx(burst, rel=0.35)
 
     def test_duplicates_are_counted_and_not_lost(self) -> None:
-        link = feed(frames(30.0, radio_duplicates=0.05, radio_loss=0.0))
-        report = link.report(30_000_000, connected=True, port="")
+        _, report = feed(frames(30.0, radio_duplicates=0.05, radio_loss=0.0))
         imu = next(node for node in report.nodes if node.node == NodeId(1, 0))
         assert imu.duplicates == pytest.approx(0.05 * imu.received, rel=0.2)
         assert imu.lost == 0
 
 
-def feed(line: list[TimedFrame]) -> Link:
-    link = Link()
-    for frame in line:
-        link.feed(frame.data, round(frame.time_s * 1e6))
-    return link
-
-
 class TestThroughTheWire:
     def test_clock_skew_equals_its_setting(self) -> None:
-        link = feed(frames(60.0, clock_skew_ppm=300.0))
-        nodes = link.report(60_000_000, connected=True, port="").nodes
-        skews = {node.node.node_id: node.clock_skew_ppm for node in nodes}
+        _, report = feed(frames(60.0, clock_skew_ppm=300.0))
+        skews = {node.node.node_id: node.clock_skew_ppm for node in report.nodes}
         assert skews[0] == pytest.approx(300.0, abs=5.0)
         assert skews[1] == pytest.approx(-300.0, abs=15.0)
 
     def test_decoded_records_equal_those_of_the_flight(self) -> None:
         # Without losses, since a fix whose quality payload was lost has no accuracy or time.
-        line, link = frames(radio_loss=0.0), Link()
-        records = [r for f in line for r in link.feed(f.data, round(f.time_s * 1e6))]
+        records, _ = feed(frames(radio_loss=0.0))
         direct = {
             (type(r), r.node_time_us): r for r in fly(settings(), duration_s=SECONDS).records()
         }
@@ -177,24 +181,17 @@ class TestThroughTheWire:
                     )  # fmt: skip
 
     def test_node_restart_is_counted_and_leaves_a_gap(self) -> None:
-        link = Link()
-        imu = [
-            record
-            for frame in frames(30.0, imu_restart_s=12.0)
-            for record in link.feed(frame.data, round(frame.time_s * 1e6))
-            if isinstance(record, ImuRaw)
-        ]
-        restarts = [node.restarts for node in link.report(0, connected=True, port="").nodes]
-        assert restarts == [1, 0]
+        records, report = feed(frames(30.0, imu_restart_s=12.0))
+        imu = [record for record in records if isinstance(record, ImuRaw)]
+        assert [node.restarts for node in report.nodes] == [1, 0]
         silent_us = max(b.time_us - a.time_us for a, b in itertools.pairwise(imu))
         assert 590_000 < silent_us < 640_000
         assert min(r.node_time_us for r in imu) == pytest.approx(600_000, abs=10_000)
         assert imu[-1].time_us == pytest.approx(30e6, abs=30_000)
 
     def test_three_aircraft_share_the_receiver(self) -> None:
-        link = feed(frames(5.0, vehicles=3, vehicle_id=7))
-        nodes = link.report(5_000_000, connected=True, port="").nodes
-        assert {(n.node.vehicle_id, n.node.node_id, n.pipe) for n in nodes} == {
+        _, report = feed(frames(5.0, vehicles=3, vehicle_id=7))
+        assert {(n.node.vehicle_id, n.node.node_id, n.pipe) for n in report.nodes} == {
             (7, 0, 0), (7, 1, 1), (8, 0, 2), (8, 1, 3), (9, 0, 4), (9, 1, 5)
         }  # fmt: skip
 
@@ -207,13 +204,11 @@ def test_impossible_start_time_is_limited_to_range_of_gps(
     start_unix_us: int, years: set[int]
 ) -> None:
     """A clock that was never set gives the year 2000, which is rejected."""
-    line = list(simulate(settings(gps_first_fix_s=0.5), start_unix_us).frames(3.0))
-    link = Link()
-    records = [record for frame in line for record in link.feed(frame.data, 0)]
+    line = simulate(settings(gps_first_fix_s=0.5), start_unix_us).frames(3.0)
+    records, report = feed(list(line))
     reported_us = [r.utc_us for r in records if isinstance(r, GpsFix) and r.utc_us is not None]
     assert {datetime.fromtimestamp(us / 1e6, UTC).year for us in reported_us} == years
-    faults = dict(link.report(3_000_000, connected=True, port="").faults)
-    assert ("gps_date" in faults) == (not years)
+    assert ("gps_date" in dict(report.faults)) == (not years)
 
 
 def test_vehicle_ids_must_fit_the_protocol() -> None:
