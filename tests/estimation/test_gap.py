@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gateway.estimation.columns import NAV_LAT, NAV_LON, NAV_POS_STD
-from gateway.estimation.kernel import SampleLog
-from tools.flights import Flight, north_east_m, simulated_flight
+from tests.estimation.samples import selected
+from tools.flights import Flight, north_east_m
 from tools.score_estimators import estimator_of
 
 GAP_S = 3.0
@@ -16,30 +16,13 @@ LARGEST_ERROR_M = 15.0
 RECOVERED_M = 4.0
 
 
-@pytest.fixture(scope="module")
-def flight() -> Flight:
-    return simulated_flight(21, calibrated=True)
-
-
-def without(log: SampleLog, begin_s: float) -> tuple[SampleLog, np.ndarray]:
-    """Leave out `GAP_S` of all sensors; also return which IMU samples are left."""
-    imu, baro, gps = (
-        np.abs(times_us * 1e-6 - begin_s - GAP_S / 2) > GAP_S / 2
-        for times_us in (log.imu_time_us, log.baro_time_us, log.gps_time_us)
-    )
-    return SampleLog(
-        log.imu_time_us[imu], log.imu[imu],
-        log.baro_time_us[baro], log.baro_alt_m[baro],
-        log.gps_time_us[gps], log.gps[gps],
-    ), imu  # fmt: skip
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("begin_s", [60.0, 90.0, 120.0, 150.0])
 def test_position_after_a_gap_moves_to_the_fixes_without_a_step(
     flight: Flight, begin_s: float
 ) -> None:
-    log, kept = without(flight.log, begin_s)
+    middle_us, half_us = (begin_s + GAP_S / 2) * 1e6, GAP_S / 2 * 1e6
+    log, kept = selected(flight.log, lambda us: np.abs(us - middle_us) > half_us)
     estimator = estimator_of(flight)
     out = estimator.run(log)
     end = int(np.searchsorted(log.imu_time_us, (begin_s + GAP_S) * 1e6))

@@ -5,11 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.flights import Flight, as_increments, read_flight, simulated_flight
+from tools.flights import Flight, as_increments, read_flight
 from tools.score_estimators import attitude_scores, position_errors_m, rms, run_eskf
 
 RATE_HZ = 10.0
 MOST_WORSE = 1.2
+RECORDED = (
+    *("arduplane_testlog2", "arducopter_quad106", "px4_swisslog1", "px4_wing_search"),
+    *("px4_mocap_log008", "phantom_dot1"),
+)
 
 
 def ratios(flight: Flight) -> dict[str, float]:
@@ -27,22 +31,11 @@ def ratios(flight: Flight) -> dict[str, float]:
 
 
 @pytest.mark.slow
-def test_simulated_flight_loses_little_by_increments() -> None:
-    found = ratios(simulated_flight(21, calibrated=True))
-    assert max(found.values()) < MOST_WORSE
+def test_simulated_flight_loses_little_by_increments(flight: Flight) -> None:
+    assert max(ratios(flight).values()) < MOST_WORSE
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "arduplane_testlog2",
-        "arducopter_quad106",
-        "px4_swisslog1",
-        "px4_wing_search",
-        "px4_mocap_log008",
-        "phantom_dot1",
-    ],
-)
+@pytest.mark.parametrize("name", RECORDED)
 def test_attitude_of_recorded_flights_loses_little_by_increments(data_dir: Path, name: str) -> None:
     assert ratios(read_flight(data_dir / f"{name}.csv.gz"))["attitude"] < MOST_WORSE

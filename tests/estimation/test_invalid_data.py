@@ -12,6 +12,7 @@ from gateway.estimation.kernel import SampleLog
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.records import NavFlags
 from gateway.units import STANDARD_GRAVITY_MPS2
+from tests.estimation.samples import ACCELS, GPS_VELS, GYROS, MAGS, NAV_VELS, selected
 from tools.flights import Flight, north_east_m, simulated_flight
 from tools.score_estimators import attitude_scores, run_eskf
 
@@ -26,15 +27,8 @@ def flight() -> Flight:
 
 def part(flight: Flight, begin_s: float, length_s: float) -> SampleLog:
     """Copy a part of a flight."""
-    log, found = flight.log, []
-    for times_us, values in (
-        (log.imu_time_us, log.imu),
-        (log.baro_time_us, log.baro_alt_m),
-        (log.gps_time_us, log.gps),
-    ):
-        within = (times_us > begin_s * 1e6) & (times_us < (begin_s + length_s) * 1e6)
-        found += [times_us[within], values[within]]
-    return SampleLog(*found)
+    end_us = (begin_s + length_s) * 1e6
+    return selected(flight.log, lambda us: (us > begin_s * 1e6) & (us < end_us))[0]
 
 
 def at_rest(length_s: float, speed_mps: float) -> SampleLog:
@@ -45,10 +39,10 @@ def at_rest(length_s: float, speed_mps: float) -> SampleLog:
     gps = np.full((len(gps_us), col.GPS_COLUMNS), np.nan)
     imu[:, col.ACCEL : col.ACCEL + 6] = np.random.default_rng(5).normal(0.0, 1e-3, (len(imu), 6))
     imu[:, col.ACCEL + 2] -= STANDARD_GRAVITY_MPS2
-    imu[:, col.MAG : col.MAG + 3] = 21.0, 0.0, 43.0
+    imu[:, MAGS] = 21.0, 0.0, 43.0
     imu[:, col.CLIPPED] = 0.0
     gps[:, [col.GPS_USABLE, col.GPS_LAT, col.GPS_LON, col.GPS_ALT]] = 1.0, 47.0, 8.0, 500.0
-    gps[:, col.GPS_VEL : col.GPS_VEL + 3] = speed_mps
+    gps[:, GPS_VELS] = speed_mps
     return SampleLog(imu_us, imu, imu_us[:0], np.empty(0), gps_us, gps)
 
 
@@ -60,12 +54,12 @@ def check_sane(flight: Flight, log: SampleLog) -> None:
     out = run(flight, log)
     assert np.isfinite(out[100:, col.NAV_QUAT : col.NAV_QUAT + 4]).all()
     assert np.isfinite(out[:, col.NAV_FLAGS]).all()
-    vel = out[:, col.NAV_VEL : col.NAV_VEL + 3]
+    vel = out[:, NAV_VELS]
     assert np.abs(vel[np.isfinite(vel)]).max(initial=0.0) < FASTEST_MPS
 
 
 def noisy_field(log: SampleLog, rng: np.random.Generator) -> None:
-    log.imu[:, col.MAG : col.MAG + 3] += rng.normal(0.0, 40.0, (len(log.imu), 3))
+    log.imu[:, MAGS] += rng.normal(0.0, 40.0, (len(log.imu), 3))
 
 
 def upright_field(log: SampleLog, rng: np.random.Generator) -> None:
@@ -74,7 +68,7 @@ def upright_field(log: SampleLog, rng: np.random.Generator) -> None:
 
 
 def swapped_field(log: SampleLog, rng: np.random.Generator) -> None:
-    log.imu[:, col.MAG : col.MAG + 3] = log.imu[:, col.MAG + rng.permutation(3)]
+    log.imu[:, MAGS] = log.imu[:, col.MAG + rng.permutation(3)]
 
 
 def fixes_off_africa(log: SampleLog, rng: np.random.Generator) -> None:
@@ -89,9 +83,7 @@ def fixes_with_gaps(log: SampleLog, rng: np.random.Generator) -> None:
 
 
 def fixes_without_velocity(log: SampleLog, rng: np.random.Generator) -> None:
-    log.gps[
-        rng.random() * len(log.gps) < np.arange(len(log.gps)), col.GPS_VEL : col.GPS_VEL + 3
-    ] = np.nan
+    log.gps[int(rng.random() * len(log.gps)) + 1 :, GPS_VELS] = np.nan
 
 
 def wild_fixes(log: SampleLog, rng: np.random.Generator) -> None:
@@ -104,14 +96,12 @@ def samples_with_gaps(log: SampleLog, rng: np.random.Generator) -> None:
 
 
 def shaken(log: SampleLog, rng: np.random.Generator) -> None:
-    log.imu[:, col.ACCEL : col.ACCEL + 3] += rng.normal(0.0, 30.0, (len(log.imu), 3))
-    log.imu[:, col.GYRO : col.GYRO + 3] += rng.normal(0.0, 1.0, (len(log.imu), 3))
+    log.imu[:, ACCELS] += rng.normal(0.0, 30.0, (len(log.imu), 3))
+    log.imu[:, GYROS] += rng.normal(0.0, 1.0, (len(log.imu), 3))
 
 
 def swapped_rates(log: SampleLog, rng: np.random.Generator) -> None:
-    log.imu[:, col.GYRO : col.GYRO + 3] = log.imu[:, col.GYRO + rng.permutation(3)] * rng.choice(
-        [-1, 1], 3
-    )
+    log.imu[:, GYROS] = log.imu[:, col.GYRO + rng.permutation(3)] * rng.choice([-1, 1], 3)
 
 
 def wild_heights(log: SampleLog, rng: np.random.Generator) -> None:
@@ -180,7 +170,7 @@ def test_clock_jump_is_handled_as_outage(flight: Flight, leap_s: int, since_s: f
     out = run(flight, log)
     scores = attitude_scores(late, out[:, :4])
     assert max(scores["heading"], scores["inclination"]) < 3.0
-    assert np.nanmax(np.abs(out[:, col.NAV_VEL : col.NAV_VEL + 3])) < 100.0
+    assert np.nanmax(np.abs(out[:, NAV_VELS])) < 100.0
 
 
 def test_shocks_beyond_accelerometer_range_leave_small_errors(flight: Flight) -> None:
@@ -188,8 +178,8 @@ def test_shocks_beyond_accelerometer_range_leave_small_errors(flight: Flight) ->
     log, rng = part(flight, -1.0, 300.0), np.random.default_rng(11)
     for begin in np.flatnonzero(rng.random(len(log.imu)) < 0.003):
         blow = slice(begin, begin + 4)
-        shape = log.imu[blow, col.ACCEL : col.ACCEL + 3].shape
-        log.imu[blow, col.ACCEL : col.ACCEL + 3] = rng.choice([-156.9, 156.9], shape)
+        shape = log.imu[blow, ACCELS].shape
+        log.imu[blow, ACCELS] = rng.choice([-156.9, 156.9], shape)
         log.imu[blow, col.CLIPPED] = 1.0
     out = run(flight, log)
     off_m = north_east_m(flight, out[:, col.NAV_LAT], out[:, col.NAV_LON]) - flight.pos_ne_m
@@ -202,7 +192,7 @@ def test_shocks_beyond_accelerometer_range_leave_small_errors(flight: Flight) ->
 def test_impossible_jump_of_fixes_gives_no_velocity(flight: Flight) -> None:
     """All later fixes are at the second position, so they are finally accepted."""
     log = part(flight, 30.0, 60.0)
-    log.gps[:, col.GPS_VEL : col.GPS_VEL + 3] = np.nan
+    log.gps[:, GPS_VELS] = np.nan
     log.gps[len(log.gps) // 2 :, col.GPS_LAT : col.GPS_LON + 1] = 0.0
     check_sane(flight, log)
 
@@ -210,7 +200,7 @@ def test_impossible_jump_of_fixes_gives_no_velocity(flight: Flight) -> None:
 def test_zero_velocity_contradicted_by_positions_is_not_used(flight: Flight) -> None:
     """As from a receiver that measures no velocity, or a log without one."""
     log = part(flight, 0.0, 120.0)
-    log.gps[:, col.GPS_VEL : col.GPS_VEL + 3] = 0.0
+    log.gps[:, GPS_VELS] = 0.0
     out, late = run(flight, log), log.imu_time_us > 60_000_000
     counted = replace(flight, counts=late, log=log, q_nb=flight.q_nb[: len(out)])
     scores = attitude_scores(counted, out[:, :4])
@@ -222,7 +212,7 @@ def test_repeated_fix_is_used_once(flight: Flight, has_velocity: bool) -> None:
     """As in a log that holds each fix until the next one."""
     log = part(flight, 30.0, 60.0)
     if not has_velocity:
-        log.gps[:, col.GPS_VEL : col.GPS_VEL + 3] = np.nan
+        log.gps[:, GPS_VELS] = np.nan
     newest = np.arange(len(log.gps)) // 5 * 5
     once = replace(log, gps_time_us=log.gps_time_us[::5], gps=log.gps[::5])
     out = run(flight, replace(log, gps=log.gps[newest]))

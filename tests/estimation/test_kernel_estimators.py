@@ -15,7 +15,7 @@ from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import EstimationSettings, Estimator, make_estimator
 from gateway.geometry.geodesy import displacement_m
 from gateway.records import BaroSample, GpsFix, GpsFixType, ImuSample, NavFlags, NavState
-from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G, fix, imu, times
+from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, NAV_VELS, G, fix, imu, times
 
 Items = list[ImuSample | BaroSample | GpsFix]
 
@@ -285,5 +285,5 @@ def test_unusable_fix_is_ignored(either: Estimator) -> None:
 
 def test_velocity_of_an_aircraft_at_rest_is_zero(estimator: KernelEstimator) -> None:
     rows = as_rows(feed(estimator, [*still(0, 3.0), fix(3_000_000), *still(3_000_000, 8.0)]))
-    assert np.abs(rows[-1, col.NAV_VEL : col.NAV_VEL + 3]).max() < 0.3
+    assert np.abs(rows[-1, NAV_VELS]).max() < 0.3
     assert int(rows[-1, col.NAV_FLAGS]) & NavFlags.AT_REST

@@ -94,17 +94,12 @@ def test_dead_reckoning_between_fixes_removes_gravity() -> None:
     estimator.update_gps(fix(1_000_000))
     # The nose points east: one second of forward acceleration gives a displacement east.
     moving = [imu(1_000_000 + t, (1.0, 0.0, -G), mag=None) for t in times(1.0)]
-    state = run(make_gyro_only(estimator), moving)
+    gyro_only = make(alpha_gyro=1.0)
+    gyro_only.restore(estimator.snapshot())
+    state = run(gyro_only, moving)
     # The low-pass delays the acceleration by some 20 ms.
     assert metres(state) == pytest.approx((0.0, 0.5), abs=0.04)
     assert state.vel_n_mps == pytest.approx((0.0, 1.0, 0.0), abs=0.04)
-
-
-def make_gyro_only(estimator: PaperEstimator) -> PaperEstimator:
-    """Move a state into an estimator whose attitude ignores the accelerometer."""
-    other = make(alpha_gyro=1.0)
-    other.restore(estimator.snapshot())
-    return other
 
 
 def test_latency_moves_fix_forward_by_its_velocity() -> None:

@@ -12,73 +12,55 @@ import pytest
 from gateway.estimation import columns as col
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.geometry.geodesy import radii_m
-from tests.estimation.samples import G, log_of
+from tests.estimation.samples import ACCELS, GPS_VELS, GYROS, MAGS, G, log_of
 from tools.flights import Flight
 from tools.score_estimators import attitude_scores, position_errors_m, rms, run_eskf, share_scores
 from tools.spoil_flight import RECOVERY_S, SPOILS, Spoilt, gps_jump, wrong_latency
 
-Change = Callable[[Flight], Spoilt]
 
-
-def with_imu(flight: Flight, change: Callable[[np.ndarray, np.ndarray], None]) -> Flight:
-    """Change the IMU rows of a flight, given their times in s."""
-    imu = flight.log.imu.copy()
-    change(imu, flight.log.imu_time_us * 1e-6)
-    return replace(flight, log=replace(flight.log, imu=imu))
-
-
-def hard_iron(flight: Flight) -> Spoilt:
+def hard_iron(flight: Flight) -> None:
     """Leave 20 uT of hard iron uncalibrated."""
-
-    def change(imu: np.ndarray, _: np.ndarray) -> None:
-        imu[:, col.MAG : col.MAG + 3] += (15.0, -10.0, 8.0)
-
-    return Spoilt(with_imu(flight, change), 60.0)
+    flight.log.imu[:, MAGS] += (15.0, -10.0, 8.0)
 
 
-def vibration(flight: Flight) -> Spoilt:
+def vibration(flight: Flight) -> None:
     """Shake the sensors like a motor."""
-    rng = np.random.default_rng(7)
-
-    def change(imu: np.ndarray, _: np.ndarray) -> None:
-        imu[:, col.GYRO : col.GYRO + 3] += rng.normal(0.0, 0.3, (len(imu), 3))
-        imu[:, col.ACCEL : col.ACCEL + 3] += rng.normal(0.0, 5.0, (len(imu), 3))
-
-    return Spoilt(with_imu(flight, change), 30.0)
+    rng, shape = np.random.default_rng(7), (len(flight.log.imu), 3)
+    flight.log.imu[:, GYROS] += rng.normal(0.0, 0.3, shape)
+    flight.log.imu[:, ACCELS] += rng.normal(0.0, 5.0, shape)
 
 
-def swapped_compass(flight: Flight) -> Spoilt:
+def swapped_compass(flight: Flight) -> None:
     """Swap two axes of the compass and reverse one."""
-
-    def change(imu: np.ndarray, _: np.ndarray) -> None:
-        imu[:, col.MAG : col.MAG + 3] = imu[:, [col.MAG + 1, col.MAG, col.MAG + 2]] * (
-            1.0,
-            1.0,
-            -1.0,
-        )
-
-    return Spoilt(with_imu(flight, change), 90.0)
+    field = flight.log.imu[:, MAGS]
+    flight.log.imu[:, MAGS] = field[:, [1, 0, 2]] * np.array((1.0, 1.0, -1.0))
 
 
-def clipped_gyro(flight: Flight) -> Spoilt:
+def clipped_gyro(flight: Flight) -> None:
     """Clip the gyroscope at 40 deg/s."""
-    limit = math.radians(40.0)
-
-    def change(imu: np.ndarray, _: np.ndarray) -> None:
-        imu[:, col.CLIPPED] = np.abs(imu[:, col.GYRO : col.GYRO + 3]).max(axis=1) > limit
-        imu[:, col.GYRO : col.GYRO + 3] = imu[:, col.GYRO : col.GYRO + 3].clip(-limit, limit)
-
-    return Spoilt(with_imu(flight, change), 60.0)
+    limit, imu = math.radians(40.0), flight.log.imu
+    imu[:, col.CLIPPED] = np.abs(imu[:, GYROS]).max(axis=1) > limit
+    imu[:, GYROS] = imu[:, GYROS].clip(-limit, limit)
 
 
-def relocated(flight: Flight) -> Spoilt:
+def relocated(flight: Flight) -> None:
     """Move all later fixes by 1 km: the filter relocks on them."""
-    gps, time_s = flight.log.gps.copy(), flight.log.gps_time_us * 1e-6
-    moved = time_s > 80.0
-    gps[moved, col.GPS_LAT] += math.degrees(1000.0 / radii_m(flight.origin_deg[0], 0.0)[0])
-    pos = flight.pos_ne_m.copy()
-    pos[flight.log.imu_time_us > 80e6, 0] += 1000.0
-    return Spoilt(replace(flight, pos_ne_m=pos, log=replace(flight.log, gps=gps)), 95.0)
+    north_deg = math.degrees(1000.0 / radii_m(flight.origin_deg[0], 0.0)[0])
+    flight.log.gps[flight.log.gps_time_us > 80e6, col.GPS_LAT] += north_deg
+    flight.pos_ne_m[flight.log.imu_time_us > 80e6, 0] += 1000.0
+
+
+def zero_velocities(flight: Flight) -> None:
+    """Let the receiver report velocities of exactly zero."""
+    flight.log.gps[:, GPS_VELS] = 0.0
+
+
+def changed(flight: Flight, change: Callable[[Flight], None], ends_s: float) -> Spoilt:
+    """Change a copy of a flight up to a time."""
+    log = replace(flight.log, imu=flight.log.imu.copy(), gps=flight.log.gps.copy())
+    flight = replace(flight, log=log, pos_ne_m=flight.pos_ne_m.copy())
+    change(flight)
+    return Spoilt(flight, ends_s)
 
 
 def held_fixes(flight: Flight) -> Spoilt:
@@ -89,22 +71,17 @@ def held_fixes(flight: Flight) -> Spoilt:
     return Spoilt(replace(flight, log=held), 30.0)
 
 
-def zero_velocities(flight: Flight) -> Spoilt:
-    """Let the receiver report velocities of exactly zero."""
-    gps = flight.log.gps.copy()
-    gps[:, col.GPS_VEL : col.GPS_VEL + 3] = 0.0
-    return Spoilt(replace(flight, log=replace(flight.log, gps=gps)), 60.0)
-
-
-OWN: dict[str, Change] = {
-    change.__name__: change
-    for change in (
-        hard_iron, vibration, swapped_compass, clipped_gyro, relocated, held_fixes,
-        zero_velocities,
-    )
-}  # fmt: skip
-OWN["gps_jump"] = partial(gps_jump, begin_s=80.0)
-OWN["wrong_latency"] = partial(wrong_latency, known_s=100.0)
+OWN: dict[str, Callable[[Flight], Spoilt]] = {
+    "hard_iron": partial(changed, change=hard_iron, ends_s=60.0),
+    "vibration": partial(changed, change=vibration, ends_s=30.0),
+    "swapped_compass": partial(changed, change=swapped_compass, ends_s=90.0),
+    "clipped_gyro": partial(changed, change=clipped_gyro, ends_s=60.0),
+    "relocated": partial(changed, change=relocated, ends_s=95.0),
+    "held_fixes": held_fixes,
+    "zero_velocities": partial(changed, change=zero_velocities, ends_s=60.0),
+    "gps_jump": partial(gps_jump, begin_s=80.0),
+    "wrong_latency": partial(wrong_latency, known_s=100.0),
+}
 LIMITS: dict[str, tuple[float, float, float]] = {
     "hard_iron": (1.0, 3.0, 2.0),
     "field_jump": (1.0, 3.0, 2.0),
@@ -149,7 +126,7 @@ def test_errors_are_small_again_after_a_disturbance(flight: Flight, name: str) -
 
 
 def test_swapped_compass_axes_are_reported(flight: Flight) -> None:
-    flags = run_eskf(swapped_compass(flight).flight)[-1, col.NAV_FLAGS].astype(int)
+    flags = run_eskf(OWN["swapped_compass"](flight).flight)[-1, col.NAV_FLAGS].astype(int)
     assert flags & col.FLAG.MAG_MISPLACED
 
 
@@ -159,9 +136,9 @@ def test_every_imu_rate_levels_at_rest(rate_hz: int) -> None:
     rng = np.random.default_rng(3)
     count = max(rate_hz * 60, 60)
     imu = np.zeros((count, col.IMU_COLUMNS))
-    imu[:, col.ACCEL : col.ACCEL + 3] = rng.normal((0.0, 0.8 * -G, 0.6 * -G), 0.02, (count, 3))
-    imu[:, col.GYRO : col.GYRO + 3] = rng.normal((0.0, 0.0, 0.03), 0.001, (count, 3))
-    imu[:, col.MAG : col.MAG + 3] = math.nan
+    imu[:, ACCELS] = rng.normal((0.0, 0.8 * -G, 0.6 * -G), 0.02, (count, 3))
+    imu[:, GYROS] = rng.normal((0.0, 0.0, 0.03), 0.001, (count, 3))
+    imu[:, MAGS] = math.nan
     estimator: Any = make_estimator(EstimationSettings())
     out = estimator.run(log_of(imu, rate_hz))
     late = out[3 * count // 4 :]
@@ -174,9 +151,9 @@ def test_every_imu_rate_levels_at_rest(rate_hz: int) -> None:
 def test_gyroscope_without_calibration_is_measured_at_rest() -> None:
     rng = np.random.default_rng(4)
     imu = np.zeros((3000, col.IMU_COLUMNS))
-    imu[:, col.ACCEL : col.ACCEL + 3] = rng.normal((0.0, 0.0, -G), 0.02, (3000, 3))
-    imu[:, col.GYRO : col.GYRO + 3] = rng.normal(np.radians((14.0, -9.0, 4.0)), 0.002, (3000, 3))
-    imu[:, col.MAG : col.MAG + 3] = rng.normal((21.0, 0.0, 43.0), 0.3, (3000, 3))
+    imu[:, ACCELS] = rng.normal((0.0, 0.0, -G), 0.02, (3000, 3))
+    imu[:, GYROS] = rng.normal(np.radians((14.0, -9.0, 4.0)), 0.002, (3000, 3))
+    imu[:, MAGS] = rng.normal((21.0, 0.0, 43.0), 0.3, (3000, 3))
     imu[:, [col.GYRO_UNCALIBRATED, col.ACCEL_UNCALIBRATED]] = 1.0
     estimator: Any = make_estimator(EstimationSettings())
     estimator.run(log_of(imu, 100))
@@ -192,11 +169,7 @@ def test_magnetic_heading_without_declination_is_not_valid(flight: Flight) -> No
 @pytest.mark.slow
 def test_estimate_is_invariant_to_a_time_shift(flight: Flight) -> None:
     log = flight.log
-    shifted = replace(
-        log,
-        imu_time_us=log.imu_time_us + 1_000_000_000,
-        baro_time_us=log.baro_time_us + 1_000_000_000,
-        gps_time_us=log.gps_time_us + 1_000_000_000,
-    )
+    times = ("imu_time_us", "baro_time_us", "gps_time_us")
+    shifted = replace(log, **{name: getattr(log, name) + 1_000_000_000 for name in times})
     found = run_eskf(replace(flight, log=shifted))
     np.testing.assert_array_equal(found, run_eskf(flight))
