@@ -3,7 +3,6 @@
 import random
 
 import pytest
-from pymavlink.dialects.v10 import common as dialect_v1
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, MESSAGE_NAMES
@@ -30,16 +29,11 @@ COMMAND = dialect.MAVLink_command_long_message(9, 3, 512, 0, 1, 2, 3, 4, 5, 6, 7
 V2 = packed(HEARTBEAT, 7)
 V2_SIGNED = packed(HEARTBEAT, 7, signing=(KEY, 1, 1))
 V2_COMMAND = packed(COMMAND, 7)
-V1 = bytes(
-    dialect_v1.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3).pack(dialect_v1.MAVLink(None, 7, 1))
-)
+V1 = packed(HEARTBEAT, 7, version=1)
 UNKNOWN = b"\xfd\x02\x00\x00\x05\x07\x01\xff\xff\x7f\x01\x02\xaa\xbb"
 FRAMES = {
-    "version 2": V2,
-    "signed": V2_SIGNED,
-    "command": V2_COMMAND,
-    "version 1": V1,
-    "unknown": UNKNOWN,
+    "version 2": V2, "signed": V2_SIGNED, "command": V2_COMMAND,
+    "version 1": V1, "unknown": UNKNOWN,
 }
 
 
@@ -102,33 +96,35 @@ def test_message_ids_of_two_bytes_are_read(number: int) -> None:
     assert frames_in(frame) == [frame]
 
 
-def test_damaged_frame_is_a_crc_fault() -> None:
-    damaged = V2[:-1] + bytes((V2[-1] ^ 1,))
-    assert split_datagram(damaged) == [SplitFault(SplitFaultKind.CRC, len(V2))]
+CRC = SplitFaultKind.CRC
 
 
-def test_an_unknown_frame_before_garbage_is_dropped() -> None:
-    assert frames_in(UNKNOWN + b"xyz" + V2) == [V2]
-
-
-def test_unknown_incompatibility_flag_is_refused() -> None:
-    flagged = V2[:2] + b"\x02" + V2[3:]
-    assert all(isinstance(event, SplitFault) for event in split_datagram(flagged))
-
-
-def test_empty_datagram_is_nothing() -> None:
-    assert split_datagram(b"") == []
+@pytest.mark.parametrize(
+    ("data", "frames", "faults"),
+    [
+        (b"", [], []),
+        (V2[:-1] + bytes((V2[-1] ^ 1,)), [], [SplitFault(CRC, len(V2))]),
+        # An unknown frame before garbage is dropped.
+        (UNKNOWN + b"xyz" + V2, [V2], [SplitFault(CRC, len(UNKNOWN) + 3)]),
+        # An unknown incompatibility flag.
+        (V2[:2] + b"\x02" + V2[3:], [], [SplitFault(CRC, len(V2))]),
+    ],
+    ids=["empty", "damaged", "unknown", "flagged"],
+)
+def test_bytes_of_no_frame_are_a_fault(
+    data: bytes, frames: list[bytes], faults: list[SplitFault]
+) -> None:
+    events = split_datagram(data)
+    assert frames_of(events) == frames
+    assert [event for event in events if isinstance(event, SplitFault)] == faults
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_noise_gives_only_genuine_frames_and_counts_every_byte(seed: int) -> None:
     rng = random.Random(seed)
-    pieces = [V2, V1, V2_SIGNED, V2_COMMAND]
-    sent, data = [], b""
-    for _ in range(50):
-        frame = rng.choice(pieces)
+    sent, data = rng.choices([V2, V1, V2_SIGNED, V2_COMMAND], k=50), b""
+    for frame in sent:
         data += bytes(rng.choices(range(0xF0), k=rng.randrange(6))) + frame
-        sent.append(frame)
     splitter, events, position = MavlinkSplitter(), [], 0
     while position < len(data):
         size = rng.randrange(1, 40)
@@ -207,13 +203,7 @@ def test_header_has_the_fields_of_the_frame(frame: bytes) -> None:
 
 
 def test_keys_differ_by_system_component_message_and_version() -> None:
-    others = [
-        packed(HEARTBEAT, 8),
-        packed(HEARTBEAT, 7, 2),
-        V2_COMMAND,
-        V1,
-        V2,
-    ]
+    others = [packed(HEARTBEAT, 8), packed(HEARTBEAT, 7, 2), V2_COMMAND, V1, V2]
     assert len({frame_of(frame).key for frame in others}) == len(others)
 
 
@@ -225,12 +215,8 @@ def test_a_heartbeat_cut_short_is_no_station_and_no_error(length: int) -> None:
     # The checksum may look like the type of a station.
     frame = b"\xfd" + body + b"\x06\x06"
     assert frame_of(frame).is_station_heartbeat is (length > 4)
-    assert frame_of(dialect_v1_station()).is_station_heartbeat is True
-
-
-def dialect_v1_station() -> bytes:
-    message = dialect_v1.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
-    return bytes(message.pack(dialect_v1.MAVLink(None, 7, 1)))
+    station = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    assert frame_of(packed(station, 7, version=1)).is_station_heartbeat is True
 
 
 def addressed(name: str) -> dialect.MAVLink_message:
