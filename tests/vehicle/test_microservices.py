@@ -4,6 +4,7 @@ Each row is asked over a sound link and over one that loses a third of all messa
 client asks again as its page says. Pages are those of https://mavlink.io/en/services/.
 """
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,14 +37,8 @@ ACK = "COMMAND_ACK"
 FTP = "FILE_TRANSFER_PROTOCOL"
 
 
-def param_set(name: bytes, value: float) -> Any:
-    return mavlink.MAVLink_param_set_message(*ME, name, value, 9)
-
-
-def param_read(name: bytes, index: int = -1) -> Any:
-    return mavlink.MAVLink_param_request_read_message(*ME, name, index)
-
-
+param_set = partial(mavlink.MAVLink_param_set_message, *ME, param_type=9)
+param_read = partial(mavlink.MAVLink_param_request_read_message, *ME, param_index=-1)
 ACCEPTED = {"result": mavlink.MAV_RESULT_ACCEPTED}
 DENIED = {"result": mavlink.MAV_RESULT_DENIED}
 UNSUPPORTED = {"result": mavlink.MAV_RESULT_UNSUPPORTED}
@@ -99,7 +94,7 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "parameter/read-name": (
         param_read(b"RATE_ATT"), "PARAM_VALUE", {"param_id": "RATE_ATT", "param_value": 50.0},
     ),
-    "parameter/read-index": (param_read(b"", 0), "PARAM_VALUE", {"param_index": 0}),
+    "parameter/read-index": (param_read(b"", param_index=0), "PARAM_VALUE", {"param_index": 0}),
     "parameter/read-unknown": (param_read(b"NOPE"), "PARAM_ERROR", UNKNOWN),
     "parameter/set": (
         param_set(b"RATE_ATT", 5.0), "PARAM_VALUE", {"param_id": "RATE_ATT", "param_value": 5.0},
@@ -297,14 +292,11 @@ def test_software_version_is_encoded_in_four_bytes(text: str, number: int) -> No
     assert encoding.software_version(text) == number
 
 
-MODE = (0, "Tracking")
-
-
 def test_modes_are_decoded_by_the_development_dialect() -> None:
-    parser = development.MAVLink(None)
+    parser, mode = development.MAVLink(None), (0, "Tracking")
     modes, mode = (
         parser.decode(bytearray(Encoder(1).encode(message).frame))
-        for message in (encoding.available_modes(MODE), encoding.current_mode(MODE))
+        for message in (encoding.available_modes(mode), encoding.current_mode(mode))
     )
     assert (modes.number_modes, modes.mode_index, modes.mode_name) == (1, 1, "Tracking")
     assert mode.custom_mode == 0
@@ -321,10 +313,7 @@ def test_modes_are_decoded_by_the_development_dialect() -> None:
             ),
         ),
         (encoding.ComponentMetadata, "uint32_t time_boot_ms/uint32_t file_crc/char uri/\x64"),
-        (
-            encoding.ControlStatus,
-            "uint8_t flags/uint8_t gcs_main/uint8_t gcs_secondary/\x0a",
-        ),
+        (encoding.ControlStatus, "uint8_t flags/uint8_t gcs_main/uint8_t gcs_secondary/\x0a"),
     ],
 )
 def test_crc_extra_follows_from_the_definition(kind: Any, fields: str) -> None:

@@ -34,12 +34,7 @@ def later(_health: Health) -> None:
         # Without a magnetometer it may fly.
         (with_flags(ImuFlags.MAG_ABSENT), NOW_US, MAG, 0),
         (lambda h: h.on_gps(NO_FIX), NOW_US, 0, GPS | PREARM),
-        (
-            lambda health: health.on_node_status(status(sensors_failed=0b010)),
-            NOW_US,
-            0,
-            MAG | PREARM,
-        ),
+        (lambda h: h.on_node_status(status(sensors_failed=0b010)), NOW_US, 0, MAG | PREARM),
     ],
 )
 def test_sys_status_reports_outages_and_faults_of_sensors(
