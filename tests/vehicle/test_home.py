@@ -1,8 +1,8 @@
 """Home as parameters: one number at a time, stored only on request, and cleared."""
 
-import struct
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -18,6 +18,7 @@ NAMES = ("HOME_SOURCE", "HOME_LAT", "HOME_LON", "HOME_ALT")
 NONE, GPS, OPERATOR = 0.0, 1.0, 2.0
 FIELD = Location(47.123_456_7, -8.765_432_1, 520.25)
 """Where the fix of the samples is."""
+FIELD32: list[float] = np.float32([47.123_456_7, -8.765_432_1, 520.25]).tolist()
 
 
 def home(station: GroundStation) -> list[float]:
@@ -30,18 +31,11 @@ def sent_homes(messages: list[Any]) -> list[tuple[int, int, int]]:
     return [(m.latitude, m.longitude, m.altitude) for m in found]
 
 
-def float32(value: float) -> float:
-    return struct.unpack("<f", struct.pack("<f", value))[0]
-
-
 def store(station: GroundStation) -> Location | None:
     """Store the parameters; return the home that is kept then."""
     station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1)
-    return kept(station)[-1]
-
-
-def kept(station: GroundStation) -> list[Location | None]:
-    return [save.plan.home for save in station.of(SavePlan)]
+    plan: StoredPlan = station.of(SavePlan)[-1].plan
+    return plan.home
 
 
 @pytest.fixture
@@ -54,7 +48,7 @@ def test_home_of_the_gps_is_reported_as_parameters(nowhere: GroundStation) -> No
     assert home(nowhere) == [NONE, 0.0, 0.0, 0.0]
     nowhere.receive(nowhere.vehicle.on_gps(FIX, 0))
     assert set(NAMES) <= {m.param_id for m in of_kind(nowhere.inbox, "PARAM_VALUE")}
-    assert home(nowhere) == [GPS, *map(float32, (47.123_456_7, -8.765_432_1, 520.25))]
+    assert home(nowhere) == [GPS, *FIELD32]
     assert nowhere.of(SavePlan) == [], "it is measured again at every start"
 
 
@@ -65,14 +59,14 @@ def test_one_parameter_moves_home_and_leaves_the_others_exact(station: GroundSta
     assert "HOME_POSITION" in station.broadcasts
     assert station.of(SettingsChange) == [], "it is no setting of another stage"
     station.receive(station.vehicle.put_mark(Location(1.0, 2.0, 3.0), 0))
-    assert kept(station) == [None], "it is not stored yet"
+    assert [save.plan.home for save in station.of(SavePlan)] == [None], "it is not stored yet"
     assert store(station) == pytest.approx(Location(47.5, -8.765_432_1, 520.25))
     station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 2)
     assert home(station)[:2] == [OPERATOR, 47.5], "home has no default"
 
 
 def test_longitude_keeps_the_resolution_of_a_float(station: GroundStation) -> None:
-    sent = float32(-122.123_456)
+    sent = float(np.float32(-122.123_456))
     [(_, lon, _)] = sent_homes(station.set_parameter("HOME_LON", sent))
     assert lon / 1e7 == pytest.approx(sent, abs=4e-6)
 
@@ -101,7 +95,7 @@ def test_home_is_set_only_by_its_last_parameter(nowhere: GroundStation, first: s
 def test_fix_replaces_an_incomplete_home(nowhere: GroundStation) -> None:
     nowhere.set_parameter("HOME_LAT", 1.0)
     nowhere.receive(nowhere.vehicle.on_gps(FIX, 0))
-    assert home(nowhere)[:2] == [GPS, float32(47.123_456_7)]
+    assert home(nowhere)[:2] == [GPS, FIELD32[0]]
 
 
 @pytest.mark.parametrize(

@@ -39,17 +39,15 @@ def test_parameter_lists_of_many_clients_share_one_rate_limit(
     assert load_parameters(station)["TUNING_CUTOFF"] == 10.0, "also while others request it"
 
 
-def test_ftp_bursts_of_many_clients_share_one_rate_limit(
-    crowd: list[GroundStation],
-) -> None:
+def test_ftp_bursts_of_many_clients_share_one_rate_limit(crowd: list[GroundStation]) -> None:
     clients = [FtpClient(each) for each in crowd]
     sessions = [client.open(b"/parameter.json.xz").session for client in clients]
     for each in crowd:
         each.frames.clear()
 
     def greedy(n: int) -> None:
-        burst = clients[n].packet(Opcode.BURST_READ_FILE, session=sessions[n], size=1)
-        clients[n].send(burst)
+        client = clients[n]
+        client.send(client.packet(Opcode.BURST_READ_FILE, session=sessions[n], size=1))
 
     kind = mavlink.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL
     assert sent_to(crowd, greedy, kind) <= 2 * FRAMES_A_SECOND + 10

@@ -1,4 +1,5 @@
 import math
+import operator
 import re
 import struct
 from typing import Annotated
@@ -12,7 +13,7 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Settings, fields_of, setting
 from gateway.vehicle.request_reader import NOT_TRUSTED
 from gateway.vehicle.service import SaveSettings, SettingsChange
-from gateway.vehicle.services.parameters import ParameterTable, decode_value, parameter_name
+from gateway.vehicle.services.parameters import ParameterTable, parameter_name
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.kit.ground_station import GroundStation, kinds, load_parameters, of_kind, results, texts
 
@@ -84,10 +85,7 @@ def test_change_takes_effect_and_is_sent_to_every_client_that_requested_paramete
     assert [frame.client_id for frame in station.frames] == [8, 7]
     [change] = station.of(SettingsChange)
     assert change.section == "tuning"
-    changed = change.settings
-    for key in path.split("."):
-        changed = getattr(changed, key)
-    assert changed == stored
+    assert operator.attrgetter(path)(change.settings) == stored
     assert load_parameters(other)[name] == pytest.approx(sent)
 
 
@@ -135,20 +133,14 @@ def test_value_out_of_range_changes_nothing(
     assert load_parameters(station) == before
 
 
-@pytest.mark.parametrize(
-    ("kind", "code"),
-    [
-        (mavlink.MAV_PARAM_TYPE_INT32, "<i"),
-        (mavlink.MAV_PARAM_TYPE_UINT8, "<Bxxx"),
-        (mavlink.MAV_PARAM_TYPE_INT16, "<hxx"),
-    ],
-)
+@pytest.mark.parametrize(("form", "code"), [("INT32", "<i"), ("UINT8", "<Bxxx"), ("INT16", "<hxx")])
 def test_integers_encoded_byte_wise_are_understood(
-    station: GroundStation, kind: int, code: str
+    station: GroundStation, form: str, code: str
 ) -> None:
-    encoded = struct.unpack("<f", struct.pack(code, 5))[0]
-    assert decode_value(encoded, kind) == 5.0
-    station.set_parameter("TUNING_ORDER", encoded, kind)
+    kind = getattr(mavlink, f"MAV_PARAM_TYPE_{form}")
+    [encoded] = struct.unpack("<f", struct.pack(code, 5))
+    [value] = station.set_parameter("TUNING_ORDER", encoded, kind)
+    assert value.param_value == 5.0
     assert load_parameters(station)["TUNING_ORDER"] == 5.0
 
 
@@ -196,8 +188,8 @@ def test_storage_command_restores_the_defaults(station: GroundStation) -> None:
 
 def test_defaults_do_not_change_settings_that_are_no_parameters() -> None:
     settings = VehicleSettings(signing_passphrase="correct horse", node_silent_s=9.0)
-    table = ParameterTable({"vehicle": settings})
-    assert table.reset("vehicle") == VehicleSettings(signing_passphrase="correct horse")
+    found = ParameterTable({"vehicle": settings}).reset("vehicle")
+    assert found == VehicleSettings(signing_passphrase="correct horse")
 
 
 def test_vehicles_share_one_list_of_parameters() -> None:
@@ -225,8 +217,7 @@ def test_every_rate_is_named_as_its_message() -> None:
 
 def test_every_setting_of_the_gateway_has_a_readable_parameter_name() -> None:
     settings = GatewaySettings().default_aircraft
-    sections = {name: getattr(settings, name) for name in settings.__struct_fields__}
-    table = ParameterTable(sections)
+    table = ParameterTable({name: getattr(settings, name) for name in settings.__struct_fields__})
     known = {"PAPER_ALPHA_ACC", "PAPER_BETA_VEL", "PAPER_ACC_CUTOFF", "REF_GPS_LATENCY"}
     assert known <= set(table.parameters)
     for name, parameter in table.parameters.items():
