@@ -36,14 +36,22 @@ async def send_untrusted(world: Any, *frames: bytes) -> None:
         return sum(client.received for client in hub.clients())
 
     before = received()
-    for frame in frames:
-        world.untrusted.send(frame)
+    world.untrusted.send(*frames)
     await world.until(lambda: received() == before + len(frames))
 
 
+async def test_untrusted_requests_reach_our_vehicles_only(world: Any) -> None:
+    foreign, unroutable = len(world.foreign), world.world.counters().unroutable
+    request = world.untrusted.sender.command(1, 1)
+    await send_untrusted(world, request, world.untrusted.sender.command(255, 190))
+    assert [(each.frame, each.trusted) for each in world.incoming[-1:]] == [(request, False)]
+    assert world.world.counters().unroutable == unroutable + 1
+    assert (world.station_.is_empty(), len(world.foreign)) == (True, foreign)
+
+
 async def test_heartbeat_forged_by_an_untrusted_client_does_not_stop_telemetry(world: Any) -> None:
-    forged = world.sender(42, 190)
-    forged.link.srcComponent = 1
+    forged = world.sender(42)
+    forged.is_station = True
     for _ in range(20):
         await send_untrusted(world, forged.heartbeat())
         frame = world.autopilot.sender.attitude()

@@ -6,6 +6,7 @@ import os
 import pty
 import socket
 import tty
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import gettempdir
@@ -32,12 +33,10 @@ pytestmark = pytest.mark.io
 RAW_IMU, ATTITUDE = 27, 30
 
 
-class Far:
+class Far(ABC):
     """The far end of one endpoint: reads without blocking, writes, breaks and returns."""
 
     url = ""
-    transport: type[Client] | None = None
-    """The gateway's end, if it is the gateway that connects."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -48,22 +47,22 @@ class Far:
         self.open()
         rig.closing.append(self.shut)
 
+    @abstractmethod
     def open(self) -> None:
         """Start, or start again at the same address."""
-        raise NotImplementedError
 
-    def arrive(self, hub: Hub) -> None:
+    def arrive(self, hub: Hub) -> None:  # noqa: B027
         """Connect, where it is the far end that connects."""
 
-    def read(self) -> bytes:
-        raise NotImplementedError
+    @abstractmethod
+    def read(self) -> bytes: ...
 
-    def write(self, data: bytes) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def write(self, data: bytes) -> None: ...
 
+    @abstractmethod
     def shut(self) -> None:
         """End so that the gateway can notice."""
-        raise NotImplementedError
 
     def poll(self) -> list[bytes]:
         with contextlib.suppress(BlockingIOError, OSError):
@@ -73,8 +72,6 @@ class Far:
 
 
 class UdpFar(Far):
-    transport: type[Client] | None = UdpClient
-
     def open(self) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.setblocking(False)
@@ -95,8 +92,6 @@ class UdpFar(Far):
 
 
 class UdpCaller(UdpFar):
-    transport = None
-
     def open(self) -> None:
         super().open()
         self.url = "udp-listen:127.0.0.1:0"
@@ -107,15 +102,12 @@ class UdpCaller(UdpFar):
 
 
 class GroupFar(UdpFar):
-    transport = GroupClient
-
     def open(self) -> None:
         super().open()
         self.url = f"udp-broadcast:127.0.0.1:{self.port}"
 
 
 class TcpFar(Far):
-    transport: type[Client] | None = TcpClient
     peer: socket.socket | None = None
 
     def open(self) -> None:
@@ -141,8 +133,6 @@ class TcpFar(Far):
 
 
 class TcpCaller(TcpFar):
-    transport = None
-
     def open(self) -> None:
         self.url, self.peer = "tcp-listen:127.0.0.1:0", None
 
@@ -158,7 +148,6 @@ class TcpCaller(TcpFar):
 class WebFar(TcpFar):
     """A WebSocket server by wsproto."""
 
-    transport = WsClient
     role = ConnectionType.SERVER
 
     def open(self) -> None:
@@ -191,7 +180,6 @@ class WebFar(TcpFar):
 
 
 class WebCaller(WebFar, TcpCaller):
-    transport = None
     role = ConnectionType.CLIENT
 
     def arrive(self, hub: Hub) -> None:
@@ -201,8 +189,6 @@ class WebCaller(WebFar, TcpCaller):
 
 
 class SerialFar(Far):
-    transport = SerialClient
-
     def open(self) -> None:
         self.near, self.far = pty.openpty()
         os.set_blocking(self.near, False)
@@ -225,17 +211,18 @@ class SerialFar(Far):
                 os.close(descriptor)
 
 
-KINDS: dict[str, type[Far]] = {
-    "udp": UdpFar,
-    "udp-listen": UdpCaller,
-    "udp-broadcast": GroupFar,
-    "tcp": TcpFar,
-    "tcp-listen": TcpCaller,
-    "ws": WebFar,
-    "ws-listen": WebCaller,
-    "serial": SerialFar,
+KINDS: dict[str, tuple[type[Far], type[Client] | None]] = {
+    "udp": (UdpFar, UdpClient),
+    "udp-listen": (UdpCaller, None),
+    "udp-broadcast": (GroupFar, GroupClient),
+    "tcp": (TcpFar, TcpClient),
+    "tcp-listen": (TcpCaller, None),
+    "ws": (WebFar, WsClient),
+    "ws-listen": (WebCaller, None),
+    "serial": (SerialFar, SerialClient),
 }
-LISTENING = ("udp-listen", "tcp-listen", "ws-listen")
+"""The far end, and the gateway's if it is the gateway that connects."""
+LISTENING = [kind for kind, (_, transport) in KINDS.items() if transport is None]
 STREAMS = ("tcp", "tcp-listen", "ws", "ws-listen")
 PACKING = ("udp", "udp-listen", "udp-broadcast", "ws", "ws-listen")
 NOTICES_THE_END = set(KINDS) - {"udp-broadcast"}
@@ -246,7 +233,8 @@ class Link:
 
     def __init__(self, rig: Rig, kind: str, options: str = "", **settings: object) -> None:
         self.rig, self.kind = rig, kind
-        self.far = KINDS[kind](rig)
+        far, self.transport = KINDS[kind]
+        self.far = far(rig)
         self.hub = rig.hub(self.far.url + options, ping_interval_s=0.0, **settings)
         rig.publish(self.hub, rig.vehicle.heartbeat())
 
@@ -302,8 +290,8 @@ async def test_frames_pass_in_both_directions_and_garbage_is_counted(link: Link)
 
 async def test_changed_filter_applies_to_the_open_client(link: Link) -> None:
     before = link.hub.clients()[0].client_id
-    changed = (f"{link.far.url}?deny=RAW_IMU",)
-    link.hub.apply(msgspec.structs.replace(link.hub.settings, endpoints=changed))
+    endpoints = (f"{link.far.url}?deny=RAW_IMU",)
+    link.hub.apply(msgspec.structs.replace(link.hub.settings, endpoints=endpoints))
     link.rig.publish(link.hub, link.rig.vehicle.raw_imu(), link.rig.vehicle.attitude())
     await link.until(lambda: bool(link.numbers(ATTITUDE)))
     assert [client.client_id for client in link.hub.clients()] == [before]
@@ -346,9 +334,8 @@ async def test_stalled_peer_loses_only_its_own_oldest_telemetry(rig: Rig, kind: 
     await rig.until_open(link.hub)
     before, frames, got = link.hub.clients()[0], list[bytes](), list[bytes]()
     while link.hub.clients()[0].dropped < 500:
-        for _ in range(50):
-            frames.append(rig.vehicle.raw_imu())
-            rig.publish(link.hub, frames[-1])
+        frames += (batch := [rig.vehicle.raw_imu() for _ in range(50)])
+        rig.publish(link.hub, *batch)
         await asyncio.sleep(0)
         got += lively.received()
     await rig.until(lambda: bool(got.extend(lively.received()) or len(got) >= len(frames)))
@@ -384,13 +371,12 @@ async def test_taken_port_is_reported_once_and_opens_when_it_is_free(
         taken.socket.listen()
     hub = rig.hub(f"{kind}:127.0.0.1:{taken.port}?name=here")
     for _ in range(4):
-        rig.tick(hub)
-        rig.clock.now_us += 2_000_000
+        rig.tick(hub, 2)
     (port,) = hub.listeners()
     assert (port.state, port.reason, port.port) == ("closed", "Address already in use", 0)
     assert caplog.text.count("Address already in use; trying again") == 1
     taken.socket.close()
-    rig.tick(hub)
+    rig.tick(hub, 2)
     (port,) = hub.listeners()
     assert (port.state, port.reason, port.port) == ("open", "", taken.port)
 
@@ -409,10 +395,10 @@ async def test_removed_endpoint_closes_and_nothing_is_sent(link: Link) -> None:
 async def test_unexpected_error_closes_the_client_and_the_next_tick_opens_it(
     link: Link, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    if link.far.transport is None:
+    if link.transport is None:
         pytest.skip("the client leaves, and the port stays open")
     with monkeypatch.context() as patched:
-        patched.setattr(link.far.transport, "tick", lambda *_: 1 // 0)
+        patched.setattr(link.transport, "tick", lambda *_: 1 // 0)
         link.rig.tick(link.hub)
         (client,) = link.hub.clients()
         assert (client.state, client.reason[:16]) == ("unreachable", "integer division")

@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 from collections import defaultdict
 from collections.abc import AsyncIterator, Container
 from pathlib import Path
@@ -366,49 +365,40 @@ class TestFlood:
         assert part_of_turn(size, READ_BYTES) == part
 
 
-class Reader:
-    """A subscription in a session of its own, which has begun to receive from another."""
+class Flood:
+    """A subscription, and messages to it that all arrive before the loop handles any."""
 
-    def __init__(self, site: Site) -> None:
-        self.far, near = site.visit(), site.visit()
+    def __init__(self) -> None:
+        self.session = zenoh.open(session_config("tcp/127.0.0.1:0", "", "router"))
         self.taken: list[tuple[str, bytes]] = []
-        self.all_sent = threading.Event()
         self.reader = Subscription(
-            near.session,
+            self.session,
             "flood/*",
             lambda sample: self.taken.append((str(sample.key_expr), sample.payload.to_bytes())),
         )
-        self.ends = near.session.declare_subscriber("end", lambda _: self.all_sent.set())
-        site.closing.insert(0, self.close)
-
-    def close(self) -> None:
-        self.ends.undeclare()
-        self.reader.close()
-        self.reader.undeclare()
-
-    async def start(self) -> None:
-        def begins() -> bool:
-            self.far.session.put("flood/a", b"begin")
-            return bool(self.taken)
-
-        await until(begins, 0.01)
-        self.far.session.put("flood/a", b"last")
-        await until(lambda: self.taken[-1][1] == b"last", 0.01)
-        self.taken.clear()
 
     def put(self, key: str, data: bytes, priority: zenoh.Priority = zenoh.Priority.DATA) -> None:
-        block = zenoh.CongestionControl.BLOCK
-        self.far.session.put(key, data, priority=priority, congestion_control=block)
+        self.session.put(f"flood/{key}", data, priority=priority)
 
     async def most_in_a_turn(self, count: int) -> int:
-        """Let the loop handle so many messages, all of which have arrived."""
-        self.put("end", b"")
-        assert self.all_sent.wait(START_LIMIT_S), "the loop stands still meanwhile"
+        """Let the loop handle so many messages."""
         counts = [0]
-        while counts[-1] < count:
-            await asyncio.sleep(0)
+
+        def are_handled() -> bool:
             counts.append(len(self.taken))
+            return counts[-1] >= count
+
+        await until(are_handled)
         return max(after - before for before, after in itertools.pairwise(counts))
+
+
+@pytest.fixture
+async def flood() -> AsyncIterator[Flood]:
+    flood = Flood()
+    yield flood
+    flood.reader.close()
+    flood.reader.undeclare()
+    flood.session.close()
 
 
 class TestSubscription:
@@ -416,35 +406,32 @@ class TestSubscription:
         ("size", "count", "expected"),
         [
             pytest.param(MAX_MESSAGE, 40, range(1, 9), id="a few a turn"),
-            pytest.param(MAX_MESSAGE + 1, 90, [90], id="never queued"),
+            pytest.param(MAX_MESSAGE + 1, MAX_WAITING + 1, [MAX_WAITING + 1], id="never queued"),
         ],
     )
     async def test_queue_is_bounded_in_bytes(
-        self, site: Site, size: int, count: int, expected: Container[int]
+        self, flood: Flood, size: int, count: int, expected: Container[int]
     ) -> None:
-        reader = Reader(site)
-        await reader.start()
         for _ in range(count):
-            reader.put("flood/a", bytes(size))
-        assert await reader.most_in_a_turn(count) in expected
-        assert reader.reader.dropped == 0
+            flood.put("a", bytes(size))
+        assert await flood.most_in_a_turn(count) in expected
+        assert flood.reader.dropped == 0
 
     async def test_flood_is_handled_in_turns_and_the_oldest_telemetry_is_dropped(
-        self, site: Site, monkeypatch: pytest.MonkeyPatch
+        self, flood: Flood
     ) -> None:
-        monkeypatch.setattr(zenoh_session, "MAX_WAITING", 100)
-        monkeypatch.setattr(zenoh_session, "AT_ONCE", 10)
-        reader = Reader(site)
-        await reader.start()
-        for number in range(3):
-            reader.put("flood/a", b"%d" % number, zenoh.Priority.INTERACTIVE_HIGH)
-        numbered = [(f"flood/{key}", b"%d" % number) for number in range(80) for key in "ab"]
-        for message in numbered:
-            reader.put(*message)
-        assert await reader.most_in_a_turn(103) <= 3 + 2 * 10
-        assert reader.taken[:3] == [("flood/a", b"%d" % number) for number in range(3)]
-        assert reader.taken[3:] == numbered[60:]
-        assert reader.reader.dropped == 60
+        urgent = [b"%d" % number for number in range(3)]
+        for data in urgent:
+            flood.put("a", data, zenoh.Priority.INTERACTIVE_HIGH)
+        telemetry = [
+            (key, b"%d" % number) for number in range(MAX_WAITING // 2 + 20) for key in "ab"
+        ]
+        for key, data in telemetry:
+            flood.put(key, data)
+        assert await flood.most_in_a_turn(3 + MAX_WAITING) <= 3 + 2 * AT_ONCE
+        expected = [("a", data) for data in urgent] + telemetry[40:]
+        assert flood.taken == [(f"flood/{key}", data) for key, data in expected]
+        assert flood.reader.dropped == 40
 
 
 SITE = """
