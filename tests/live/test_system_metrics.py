@@ -14,8 +14,8 @@ from gateway.recordings.newest import HEARD_US
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.mavlink import packed
+from tests.kit.messages import at, beat, gps
 from tests.live.test_metrics import SNAPSHOT
-from tests.outputs.conftest import at, beat, gps
 
 ROOT = Path(__file__).resolve().parents[2]
 BATTERY = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 12_400, -1, 80, 0, 0, 0, 0, 0, 0)

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.hub.endpoint import parse_endpoint
-from gateway.outputs import extend
 from gateway.outputs.gdl90 import framed
 from gateway.units import US_PER_S
-from tests.kit.hub import Station
-from tests.outputs.conftest import HERE, UNIX_US, OutputRig, at, beat, gps
+from tests.kit.messages import HERE, at, beat, gps
+from tests.outputs.conftest import UNIX_US, OutputRig
 
 ATTITUDE = mavlink.MAVLink_attitude_message(0, math.radians(12.5), math.radians(-7.3), 1, 0, 0, 0)
 PRESSURE = mavlink.MAVLink_scaled_pressure_message(0, 954.61, 0, 2000)
@@ -72,15 +70,9 @@ def report_in(message: bytes) -> dict[str, Any]:
     }  # fmt: skip
 
 
-async def gdl90(outputs: OutputRig, options: str = "") -> tuple[Any, Station]:
-    station = outputs.station()
-    return await outputs.output(f"gdl90:udp:127.0.0.1:{station.port}{options}"), station
-
-
-async def taken(outputs: OutputRig, output: Any, station: Station) -> dict[int, bytes]:
+async def taken(outputs: OutputRig) -> dict[int, bytes]:
     """Return the messages of one turn by their ids, extended ones by 256 plus the second byte."""
-    outputs.turn(output)
-    found = messages_in(await station.receive())
+    found = messages_in(await outputs.sent())
     return {each[0] if each[0] != 0x65 else 256 + each[1]: each for each in found}
 
 
@@ -97,9 +89,9 @@ def test_any_message_survives_framing(rng: np.random.Generator) -> None:
 
 
 async def test_ownship_contains_position_and_motion(outputs: OutputRig) -> None:
-    output, station = await gdl90(outputs, "?callsign=FISH7")
+    await outputs.udp("gdl90", "?callsign=FISH7")
     outputs.hear(beat(), at(), gps(), PRESSURE, ATTITUDE)
-    found = await taken(outputs, output, station)
+    found = await taken(outputs)
     assert sorted(found) == [0, 10, 11, 256, 257]
     own = report_in(found[10])
     assert (own.pop("lat"), own.pop("lon")) == pytest.approx(HERE[:2], abs=2.2e-5)
@@ -115,55 +107,48 @@ async def test_ownship_contains_position_and_motion(outputs: OutputRig) -> None:
 
 
 async def test_heartbeat_contains_validity_and_time_of_day(outputs: OutputRig) -> None:
-    output, station = await gdl90(outputs)
+    await outputs.udp("gdl90")
     outputs.hear(beat(), at())
     for seconds, is_valid in ((0, True), (6, False), (10 * 3600, False)):
         outputs.clock.now_us = seconds * US_PER_S
         outputs.hear(beat())
-        message = (await taken(outputs, output, station))[0]
+        message = (await taken(outputs))[0]
         _, first, second, low, _ = struct.unpack("<BBBHH", message)
         assert (bool(first & 0x80), first & 1, second & 1) == (is_valid, 1, 1)
         assert low | (second >> 7) << 16 == (UNIX_US // US_PER_S + seconds) % 86_400
 
 
 async def test_attitude_is_sent_at_its_rate_and_the_rest_once_a_second(outputs: OutputRig) -> None:
-    output, station = await gdl90(outputs, "?rate=5")
+    await outputs.udp("gdl90", "?rate=5")
     seen: list[int] = []
     for _ in range(10):
         outputs.hear(beat(), at(), ATTITUDE)
-        seen += await taken(outputs, output, station)
+        seen += await taken(outputs)
         outputs.clock.now_us += US_PER_S // 5
     assert (seen.count(257), seen.count(0), seen.count(10)) == (10, 2, 2)
 
 
 async def test_attitude_contains_known_angles_only(outputs: OutputRig) -> None:
-    output, station = await gdl90(outputs)
+    await outputs.udp("gdl90")
     hud = mavlink.MAVLink_vfr_hud_message(20.0, 5.0, 90, 0, 488.0, 1.0)
     outputs.hear(beat(), at(), ATTITUDE, hud)
-    message = (await taken(outputs, output, station))[257]
+    message = (await taken(outputs))[257]
     assert struct.unpack(">BBhhHHH", message) == (0x65, 1, 125, -73, 905, 39, 0xFFFF)
     outputs.clock.now_us = 6 * US_PER_S
     outputs.hear(at(hdg=65535))
-    message = (await taken(outputs, output, station))[257]
+    message = (await taken(outputs))[257]
     assert struct.unpack(">BBhhHHH", message)[2:] == (0x7FFF, 0x7FFF, 0xFFFF, 0xFFFF, 0xFFFF)
 
 
 async def test_other_vehicles_are_traffic(outputs: OutputRig) -> None:
-    output, station = await gdl90(outputs, "?vehicle=2")
+    await outputs.udp("gdl90", "?vehicle=2")
     for system in (1, 2, 3):
         lat = 0.0 if system == 3 else float(system)
         outputs.hear(beat(base_mode=0), at(lat_deg=lat, lon_deg=0.0), system=system)
-    found = await taken(outputs, output, station)
+    found = await taken(outputs)
     assert 11 not in found, "its separation is not known"
     own, other = report_in(found[10]), report_in(found[20])
     assert (own["address"], own["lat"]) == (0xF00002, pytest.approx(2.0, abs=2.2e-5))
     assert (other["address"], other["lat"]) == (0xF00001, pytest.approx(1.0, abs=2.2e-5))
     assert (other["callsign"], other["airborne"], other["nic"]) == ("VEH1    ", 0, 0)
     assert other["feet"] == 0xFFF * 25 - 1000
-
-
-@pytest.mark.parametrize("callsign", ["", "TOOLONG99", "low", "A%26"])
-def test_wrong_callsigns_are_refused(callsign: str) -> None:
-    extend()
-    with pytest.raises(ValueError, match="callsign"):
-        parse_endpoint(f"gdl90:udp:h:4000?callsign={callsign}")

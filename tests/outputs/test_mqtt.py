@@ -14,12 +14,11 @@ from typing import Any
 import aiomqtt
 import pytest
 
-from gateway.hub.endpoint import parse_endpoint
-from gateway.outputs import extend, mqtt
+from gateway.outputs.mqtt import MAX_WAITING
 from gateway.units import US_PER_S
-from tests.hub.web.conftest import certificate as certificate
+from tests.kit.messages import at, beat, gps
 from tests.kit.process import START_LIMIT_S
-from tests.outputs.conftest import OutputRig, at, beat
+from tests.outputs.conftest import OutputRig
 from tests.ports import free_ports
 
 pytestmark = [
@@ -87,8 +86,8 @@ async def test_messages_of_all_systems_have_topics(
 ) -> None:
     client = await broker.subscriber()
     where = f"tls:127.0.0.1:{broker.tls_port}" if is_tls else f"tcp:127.0.0.1:{broker.port}"
-    output = await outputs.output(f"mqtt:{where}?login={broker.login}&authority={certificate}")
-    assert output.carrier.state == "open", output.carrier.reason
+    await outputs.output(f"mqtt:{where}?login={broker.login}&authority={certificate}")
+    assert outputs.shown.state == "open", outputs.shown.reason
     assert await next_of(client) == ("mavgate/status", "online", False)
     for seconds in (0.0, 0.5, 1.0):
         outputs.clock.now_us = round(seconds * US_PER_S)
@@ -101,7 +100,7 @@ async def test_messages_of_all_systems_have_topics(
             assert found["header"]["system_id"] == system
             assert found["message"]["type"] == "GLOBAL_POSITION_INT"
             assert found["message"]["lat"] == 473977420
-    assert output.counters.sent == 4
+    assert outputs.shown.sent == 4
     outputs.close()
     assert await next_of(client) == ("mavgate/status", "offline", False)
     await client.__aexit__(None, None, None)
@@ -120,9 +119,8 @@ async def test_presence_is_retained_and_the_last_will_ends_it(
     # As when the gateway is killed: the socket closes without a farewell.
     output.carrier.client._client.socket().shutdown(socket.SHUT_RDWR)
     assert await next_of(client) == ("field/7/status", "offline", False)
-    await outputs.until(lambda: output.carrier.state == "unreachable")
-    outputs.clock.now_us += 2 * US_PER_S
-    output.tick(outputs.clock.now_us)
+    await outputs.until(lambda: outputs.shown.state == "unreachable")
+    outputs.tick(outputs.of_hub, 2)
     assert await next_of(client) == ("field/7/status", "online", False)
     await client.__aexit__(None, None, None)
 
@@ -133,40 +131,24 @@ async def test_wrong_password_is_reported(
     await (await broker.subscriber()).__aexit__(None, None, None)
     wrong = tmp_path / "wrong"
     wrong.write_text("pilot:guess")
-    output = await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?login={wrong}")
-    assert output.carrier.state == "unreachable"
-    assert "Not authorized" in output.carrier.reason
+    await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?login={wrong}")
+    assert outputs.shown.state == "unreachable"
+    assert "Not authorized" in outputs.shown.reason
 
 
 async def test_messages_are_dropped_while_the_broker_is_slow(
-    outputs: OutputRig, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
+    outputs: OutputRig, broker: Mosquitto
 ) -> None:
-    monkeypatch.setattr(mqtt, "MAX_WAITING", 3)
     await (await broker.subscriber()).__aexit__(None, None, None)
-    output = await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?login={broker.login}")
-    for system in range(1, 9):
-        outputs.hear(at(), system=system)
-    assert (output.counters.sent, output.counters.dropped) == (3, 5)
+    await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?login={broker.login}")
+    for system in range(1, 255):
+        outputs.hear(beat(), at(), gps(), system=system)
+    assert (outputs.shown.sent, outputs.shown.dropped) == (MAX_WAITING, 3 * 254 - MAX_WAITING)
 
 
 async def test_missing_extra_is_reported(
     outputs: OutputRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "aiomqtt", None)
-    output = await outputs.output("mqtt:tcp:127.0.0.1:1")
-    assert "needs the extra mqtt" in output.carrier.reason
-
-
-@pytest.mark.parametrize(
-    ("url", "reason"),
-    [
-        ("mqtt:127.0.0.1:1883", "not carried by"),
-        ("mqtt:tcp:h:1883?topic=a/%23", "topic"),
-        ("mqtt:tcp:h:1883?topic=", "topic"),
-        ("mqtt:tcp:h:1883?password=x", "option"),
-    ],
-)
-def test_wrong_urls_are_refused_with_the_reason(url: str, reason: str) -> None:
-    extend()
-    with pytest.raises(ValueError, match=reason):
-        parse_endpoint(url)
+    await outputs.output("mqtt:tcp:127.0.0.1:1")
+    assert "needs the extra mqtt" in outputs.shown.reason

@@ -14,13 +14,12 @@ from pymavlink.dialects.v20 import all as mavlink
 from pynmeagps import NMEAReader
 
 from gateway.hub.endpoint import parse_endpoint
-from gateway.hub.settings import HubSettings
-from gateway.outputs import extend
 from gateway.recordings.newest import POSITION_OLD_US
 from gateway.units import US_PER_S
-from tests.kit.hub import Station
+from tests.kit.hub import receive
+from tests.kit.messages import HERE, at, beat, estimator, gps
 from tests.kit.process import START_LIMIT_S
-from tests.outputs.conftest import HERE, OutputRig, at, beat, estimator, gps
+from tests.outputs.conftest import OutputRig
 from tests.ports import free_port
 
 ABSOLUTE = mavlink.ESTIMATOR_POS_HORIZ_ABS
@@ -33,21 +32,15 @@ def read(data: bytes) -> dict[str, Any]:
     return {message.msgID: message for message in parsed}
 
 
-async def sentences(outputs: OutputRig, output: Any, station: Station) -> dict[str, Any]:
-    outputs.turn(output)
-    return read(await station.receive())
-
-
-async def udp_output(outputs: OutputRig, options: str = "") -> tuple[Any, Station]:
-    station = outputs.station()
-    return await outputs.output(f"nmea:udp:127.0.0.1:{station.port}{options}"), station
+async def sentences(outputs: OutputRig) -> dict[str, Any]:
+    return read(await outputs.sent())
 
 
 async def test_sentences_contain_position_motion_and_heading(outputs: OutputRig) -> None:
-    output, station = await udp_output(outputs)
+    output = await outputs.udp("nmea")
     outputs.hear(beat(), at(), gps())
     outputs.clock.now_us = US_PER_S // 2
-    found = await sentences(outputs, output, station)
+    found = await sentences(outputs)
     assert list(found) == ["GGA", "RMC", "VTG", "HDT"]
     gga, rmc, vtg, hdt = found.values()
     assert (gga.lat, gga.lon) == pytest.approx(HERE[:2], abs=2e-7)
@@ -81,10 +74,10 @@ async def test_sentences_contain_position_motion_and_heading(outputs: OutputRig)
 async def test_position_is_void_unless_valid_and_new(
     outputs: OutputRig, messages: list[Any], age_us: int, is_valid: bool
 ) -> None:
-    output, station = await udp_output(outputs)
+    await outputs.udp("nmea")
     outputs.hear(beat(), *messages)
     outputs.clock.now_us = age_us
-    found = await sentences(outputs, output, station)
+    found = await sentences(outputs)
     gga, rmc = found["GGA"], found["RMC"]
     assert (gga.quality > 0, rmc.status == "A", "VTG" in found) == (is_valid,) * 3
     assert (gga.lat == "") == (rmc.lat == "") == (not is_valid)
@@ -100,10 +93,9 @@ async def test_position_is_void_unless_valid_and_new(
 async def test_minutes_are_carried_and_hemispheres_are_right(
     outputs: OutputRig, lat_deg: float, lon_deg: float, written: str
 ) -> None:
-    output, station = await udp_output(outputs)
+    await outputs.udp("nmea")
     outputs.hear(beat(), at(lat_deg, lon_deg))
-    outputs.turn(output)
-    assert written in (await station.receive()).decode()
+    assert written in (await outputs.sent()).decode()
 
 
 @pytest.mark.parametrize(
@@ -112,79 +104,82 @@ async def test_minutes_are_carried_and_hemispheres_are_right(
 async def test_quality_follows_the_type_of_the_fix(
     outputs: OutputRig, kind: int, quality: int
 ) -> None:
-    output, station = await udp_output(outputs)
+    await outputs.udp("nmea")
     outputs.hear(beat(), at(), gps(kind=kind))
-    assert (await sentences(outputs, output, station))["GGA"].quality == quality
+    assert (await sentences(outputs))["GGA"].quality == quality
 
 
 async def test_one_vehicle_of_several_is_sent(outputs: OutputRig) -> None:
-    output, station = await udp_output(outputs)
+    output = await outputs.udp("nmea")
     for system in (9, 7):
         outputs.hear(beat(), at(lat_deg=float(system)), system=system)
     outputs.hear(at(lat_deg=3.0), system=7, component=154)
     outputs.hear(at(lat_deg=1.0), system=255)
-    assert (await sentences(outputs, output, station))["GGA"].lat == 7.0
+    assert (await sentences(outputs))["GGA"].lat == 7.0
     output.reconfigure(parse_endpoint(f"{output.endpoint.url}?vehicle=9&rate=4"))
     assert output.interval_s == 0.25
-    assert (await sentences(outputs, output, station))["GGA"].lat == 9.0
+    assert (await sentences(outputs))["GGA"].lat == 9.0
 
 
 async def test_filters_of_the_endpoint_apply(outputs: OutputRig) -> None:
-    output, station = await udp_output(outputs, "?deny=GLOBAL_POSITION_INT&allow=GPS_RAW_INT")
+    await outputs.udp("nmea", "?deny=GLOBAL_POSITION_INT&allow=GPS_RAW_INT")
     outputs.hear(beat(), at(lat_deg=3.0), gps())
-    found = await sentences(outputs, output, station)
+    found = await sentences(outputs)
     assert found["GGA"].lat == pytest.approx(HERE[0], abs=2e-7)
     assert "HDT" not in found
 
 
-async def test_listening_port_serves_several_clients(outputs: OutputRig) -> None:
+async def listening(outputs: OutputRig) -> tuple[Any, int]:
+    """Open an output that waits for its clients; return its figures of the port, and the port."""
     output = await outputs.output("nmea:tcp-listen:127.0.0.1:0")
-    await outputs.until(lambda: output.carrier.link.port)
-    clients = [await outputs.connect(output.carrier.link.port) for _ in range(2)]
-    await outputs.until(lambda: len(output.carrier._peers) == 2)
     outputs.hear(beat(), at())
-    outputs.turn(output)
-    loop = asyncio.get_running_loop()
+    return output.carrier.link.stats, output.carrier.link.port
+
+
+async def test_listening_port_serves_several_clients(outputs: OutputRig) -> None:
+    figures, port = await listening(outputs)
+    clients = [await outputs.connect(port) for _ in range(2)]
+    await outputs.until(lambda: figures().clients == 2)
+    outputs.turn()
     for client in clients:
-        data = await asyncio.wait_for(loop.sock_recv(client, 4096), START_LIMIT_S)
-        assert read(data)["RMC"].status == "A"
+        assert read(await receive(client))["RMC"].status == "A"
     clients[0].close()
-    await outputs.until(lambda: len(output.carrier._peers) == 1)
-    assert output.carrier.state == "open"
+    await outputs.until(lambda: figures().clients == 1)
+    assert outputs.shown.state == "open"
 
 
 async def test_stalled_client_loses_whole_messages(outputs: OutputRig) -> None:
-    output = await outputs.output("nmea:tcp-listen:127.0.0.1:0")
-    await outputs.until(lambda: output.carrier.link.port)
-    await outputs.connect(output.carrier.link.port, room_bytes=2048)
-    await outputs.until(lambda: output.carrier._peers)
-    outputs.hear(beat(), at())
-    (peer,) = output.carrier._peers.values()
-    while not output.counters.dropped:
-        outputs.turn(output)
-    assert peer.queued
+    figures, port = await listening(outputs)
+    client = await outputs.connect(port, room_bytes=2048)
+    await outputs.until(lambda: figures().clients == 1)
+    while not outputs.shown.dropped:
+        outputs.turn()
+    data = b""
+    while data.count(b"$GPGGA") < outputs.shown.sent:
+        data += await receive(client)
+    while not data.endswith(b"\n"):
+        data += await receive(client)
+    assert list(read(data)) == ["GGA", "RMC", "VTG", "HDT"]
 
 
 async def test_broken_connection_is_made_again(outputs: OutputRig) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.setblocking(False)
-        loop = asyncio.get_running_loop()
-        output = await outputs.output(f"nmea:tcp:127.0.0.1:{server.getsockname()[1]}")
+        await outputs.output(f"nmea:tcp:127.0.0.1:{server.getsockname()[1]}")
         for _ in range(2):
-            connection, _ = await asyncio.wait_for(loop.sock_accept(server), START_LIMIT_S)
-            await outputs.until(lambda: output.carrier.state == "open")
+            async with asyncio.timeout(START_LIMIT_S):
+                connection, _ = await asyncio.get_running_loop().sock_accept(server)
+            await outputs.until(lambda: outputs.shown.state == "open")
             connection.close()
-            await outputs.until(lambda: output.carrier.state == "connecting")
-            outputs.clock.now_us += 2 * US_PER_S
-            output.tick(outputs.clock.now_us)
-        output._timer.cancel()
+            await outputs.until(lambda: outputs.shown.state == "connecting")
+            outputs.tick(outputs.of_hub, 2)
 
 
 async def test_sentences_are_written_to_a_serial_port(outputs: OutputRig) -> None:
     main, line = pty.openpty()
-    output = await outputs.output(f"nmea:serial:{os.ttyname(line)}:4800")
+    await outputs.output(f"nmea:serial:{os.ttyname(line)}:4800")
     outputs.hear(beat(), at(), gps())
-    outputs.turn(output)
+    outputs.turn()
     data = b""
     while data.count(b"\n") < 4:
         data += os.read(main, 4096)
@@ -193,46 +188,16 @@ async def test_sentences_are_written_to_a_serial_port(outputs: OutputRig) -> Non
         os.close(end)
 
 
-@pytest.mark.parametrize(
-    ("url", "reason"),
-    [
-        ("nmea:ws:127.0.0.1:1", "not carried by"),
-        ("nmea:udp:127.0.0.1:0", "0 cannot be sent to"),
-        ("nmea:tcp-listen:host:1", "not an address"),
-        ("nmea:udp:h:1?rate=fast", "'fast' is not a number"),
-        ("nmea:udp:h:1?rate=1000", "is not 0.01 to 50"),
-        ("nmea:udp:h:1?rate=nan", "is not 0.01 to 50"),
-        ("nmea:udp:h:1?vehicle=255", "vehicle 255 is not 1 to 249"),
-        ("nmea:udp:h:1?callsign=x", "option"),
-    ],
-)
-def test_wrong_urls_are_refused_with_the_reason(url: str, reason: str) -> None:
-    extend()
-    with pytest.raises(ValueError, match=reason):
-        parse_endpoint(url)
-
-
-def test_outputs_of_two_vehicles_to_one_address_are_distinguished_by_name() -> None:
-    extend()
-    urls = tuple(f"nmea:udp:h:1?vehicle={vehicle}&rate=2" for vehicle in (1, 2))
-    assert HubSettings(endpoints=urls).endpoints == urls
-    assert [parse_endpoint(url).name for url in urls] == [
-        "nmea:udp:h:1?vehicle=1",
-        "nmea:udp:h:1?vehicle=2",
-    ]
-
-
 @pytest.mark.io
 @pytest.mark.skipif(shutil.which("gpsd") is None, reason="needs gpsd")
 async def test_gpsd_reports_the_position(outputs: OutputRig) -> None:
-    output = await outputs.output("nmea:tcp-listen:127.0.0.1:0?rate=20")
-    await outputs.until(lambda: output.carrier.link.port)
-    port = free_port()
-    source = f"tcp://127.0.0.1:{output.carrier.link.port}"
-    daemon = subprocess.Popen(["gpsd", "-N", "-n", "-b", "-S", str(port), source])
+    (_, source), port = await listening(outputs), free_port()
+    daemon = subprocess.Popen(
+        ["gpsd", "-N", "-n", "-b", "-S", str(port), f"tcp://127.0.0.1:{source}"]
+    )
     try:
         async with asyncio.timeout(START_LIMIT_S):
-            report = await first_fix(outputs, output, port)
+            report = await first_fix(outputs, port)
     finally:
         daemon.kill()
         daemon.wait()
@@ -243,7 +208,7 @@ async def test_gpsd_reports_the_position(outputs: OutputRig) -> None:
     assert report["track"] == pytest.approx(306.9)
 
 
-async def first_fix(outputs: OutputRig, output: Any, port: int) -> Any:
+async def first_fix(outputs: OutputRig, port: int) -> Any:
     """Return the first report of gpsd with a position and a speed."""
     while True:
         try:
@@ -257,7 +222,7 @@ async def first_fix(outputs: OutputRig, output: Any, port: int) -> Any:
         while True:
             outputs.clock.now_us += US_PER_S
             outputs.hear(beat(), at(), gps())
-            outputs.turn(output)
+            outputs.turn()
             done, _ = await asyncio.wait([reading], timeout=0.05)
             if not done:
                 continue

@@ -1,0 +1,43 @@
+"""Messages of a vehicle in flight at one position."""
+
+import math
+from typing import Any
+
+from pymavlink.dialects.v20 import all as mavlink
+
+HERE = (47.397_742_0, -8.545_594_1, 488.13)
+"""Latitude, longitude and height AMSL in m."""
+
+
+def beat(kind: int = 2, autopilot: int = 3, mode: int = 5, base_mode: int = 0x81) -> Any:
+    return mavlink.MAVLink_heartbeat_message(kind, autopilot, base_mode, mode, 4, 3)
+
+
+def at(
+    lat_deg: float = HERE[0], lon_deg: float = HERE[1], alt_m: float = HERE[2], hdg: int = 9050
+) -> Any:
+    """Return GLOBAL_POSITION_INT: north 3 m/s, east -4 m/s, climb 1 m/s."""
+    return mavlink.MAVLink_global_position_int_message(
+        0, round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3), 20_000,
+        300, -400, -100, hdg,
+    )  # fmt: skip
+
+
+def gps(kind: int = 3, satellites: int = 11, ellipsoid_m: float = HERE[2] + 47.5) -> Any:
+    return mavlink.MAVLink_gps_raw_int_message(
+        0, kind, round(HERE[0] * 1e7), round(HERE[1] * 1e7), round(HERE[2] * 1e3), 120, 150, 500,
+        30_687, satellites, alt_ellipsoid=round(ellipsoid_m * 1e3), h_acc=1500,
+    )  # fmt: skip
+
+
+def home(lat_deg: float, lon_deg: float, alt_m: float) -> Any:
+    return mavlink.MAVLink_home_position_message(
+        round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3),
+        0, 0, 0, [1, 0, 0, 0], 0, 0, 0,
+    )  # fmt: skip
+
+
+def estimator(flags: int) -> Any:
+    return mavlink.MAVLink_estimator_status_message(
+        0, flags, *[math.nan] * 6, pos_horiz_accuracy=1, pos_vert_accuracy=1
+    )
