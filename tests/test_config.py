@@ -80,8 +80,9 @@ def errors_in(folder: Path, text: str) -> list[str]:
     return [line.removeprefix(f"{folder / 'gateway.toml'}: ") for line in lines]
 
 
-def test_empty_file_gives_defaults(tmp_path: Path) -> None:
-    assert load_text(tmp_path, "") == GatewaySettings()
+@pytest.mark.parametrize("text", ["", "\ufeff[serial]\n"], ids=["empty", "byte order mark"])
+def test_empty_file_gives_defaults(tmp_path: Path, text: str) -> None:
+    assert load_text(tmp_path, text) == GatewaySettings()
 
 
 def test_changed_settings_survive_the_round_trip(tmp_path: Path) -> None:
@@ -96,25 +97,22 @@ def test_changed_settings_survive_the_round_trip(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (
-            "[serial]\nbaud = 300",
-            "serial.baud = 300: must be 9600 to 2000000 baud (speed of",
-        ),
+        ("[serial]\nbaud = 300", "serial.baud = 300: must be 9600 to 2000000 baud (speed of"),
         ('[serial]\nbaud = "fast"', 'serial.baud = "fast": must be 9600 to 2000000 baud'),
         ("[serial]\nbauds = 9600", "serial.bauds: no such setting; did you mean 'baud'?"),
         ("[serial]\nzzz = 1", "serial.zzz: no such setting; known here: port, baud"),
         ("[serail]", "serail: no such setting; did you mean 'serial'?"),
         ("serial = 3", "serial = 3: must be"),
         ('[serial]\nport = "ttyUSB0"', 'serial.port = "ttyUSB0": must be as described'),
-        (
-            "[vehicle.rates]\nattitude_hz = -1",
-            "attitude_hz = -1: must be 0 to 1000 Hz (ATTITUDE",
-        ),
+        ("[vehicle.rates]\nattitude_hz = -1", "attitude_hz = -1: must be 0 to 1000 Hz (ATTITUDE"),
         ('[vehicle]\ntype = "ufo"', 'vehicle.type = "ufo": must be one of the choices'),
         ('[hub]\nendpoints = ["udp:"]', "hub: endpoint 'udp:'"),
-        ("[serial\n", "is not valid TOML"),
+        ('[hub]\nendpoints = ["udp:127.0.0.1:0"]', "port must be 1 to 65535"),
+        ('[hub]\nendpoints = ["serial::57600"]', "write serial:DEVICE:BAUD"),
+        ('[hub]\nendpoints = ["udp-multicast:127.0.0.1:14550"]', "is not a multicast group"),
+        ('[recording]\nfolder = "~no-such-user/x"', "no user has the home ~no-such-user"),
+        ('aircraft_folder = "~no-such-user"', "write the whole path"),
         (f"[serial]\nbaud = {'9' * 5000}", "is not valid TOML: Exceeds the limit"),
-        (f"[serial]\nbaud = {'[' * 5000}", "is nested in more than 8 levels"),
         (r'aircraft_folder = "/tmp/\u0000"', r"aircraft_folder = '/tmp/\x00': no path"),
     ],
 )
@@ -147,13 +145,9 @@ def test_error_of_a_choice_lists_the_allowed_values(tmp_path: Path) -> None:
     assert "quadrotor" in vehicle
 
 
-def test_missing_or_undecodable_file_is_an_error(tmp_path: Path) -> None:
+def test_missing_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         load(tmp_path / "missing.toml")
-    file = tmp_path / "latin.toml"
-    file.write_bytes(b'# speed\nport = "\xff"')
-    with pytest.raises(ConfigError, match="line 2: is not UTF-8"):
-        load(file)
 
 
 @pytest.fixture

@@ -27,11 +27,14 @@ DEEP = 50_000
         pytest.param('x = """\n"""\ny = ' + "[" * DEEP, "line 3: is nested", id="after a text"),
         pytest.param("# " + "x" * MAX_BYTES, "more than 1 MB", id="large"),
         pytest.param("x = " + "1" * 100_000, "not valid TOML", id="long number"),
+        pytest.param("[columns", "not valid TOML", id="cut"),
+        pytest.param("\x80", "line 1: is not UTF-8 text; save it as UTF-8", id="not UTF-8"),
+        pytest.param('x = "t"\n\xe4 = 1\n', "line 2: is not UTF-8 text", id="not UTF-8 below"),
     ],
 )
 def test_hostile_text_is_refused_in_a_moment(tmp_path: Path, text: str, why: str) -> None:
     file = tmp_path / "file.toml"
-    file.write_text(text)
+    file.write_text(text, encoding="latin-1")
     begin_s = time.process_time()
     with pytest.raises(TomlError, match=why):
         read_toml(file)

@@ -175,6 +175,8 @@ def test_small_commands_import_nothing_large(words: list[str], tmp_path: Path) -
         ("play x --skip-gaps -1", "'-1': must be at least 0"),
         ("fuse x -o y.csv --fuse-with old", "'old' is not one of 'recorded', 'current'"),
         ("mark north 8", "'north': write a number"),
+        *((f"mark {words}", "write a number") for words in ("nan nan", "inf 0", "47 8 --alt nan")),
+        ("runn", "Did you mean 'run'"),
     ],
 )
 def test_invalid_value_is_named_with_what_is_allowed(words: str, text: str) -> None:

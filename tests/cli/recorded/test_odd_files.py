@@ -6,6 +6,7 @@ import struct
 import tempfile
 import time
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -17,7 +18,7 @@ from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import FORMAT_LINE, encode_head
 from gateway.records import NavFlags
 from tests.kit.cli import run
-from tests.kit.recordings import make_frames
+from tests.recordings.frames import make_frames
 
 pytestmark = pytest.mark.io
 
@@ -46,32 +47,23 @@ def table(path: Path, **head: object) -> Path:
 
 
 @pytest.mark.parametrize(
-    "odd",
+    ("column", "cell", "left_out"),
     [
-        {"time_s": "inf"},
-        {"time_s": "1e300"},
-        {"gps_lat": "inf"},
-        {"ax": "1" * 140_000},
-        {"time_s": ""},
+        *(("time_s", cell, "lines") for cell in ("inf", "1e300", "")),
+        ("ax", "1" * 140_000, "lines"),
+        ("gps_lat", "inf", "cells"),
+        *(("baro_alt_m", cell, "") for cell in ("44331", "99999", "1e308", "inf")),
     ],
-    ids=lambda odd: next(iter(odd)) + next(iter(odd.values()))[:5],
+    ids=lambda value: value[:9],
 )
-def test_lines_with_impossible_values_are_left_out(tmp_path: Path, odd: dict[str, str]) -> None:
-    out = tmp_path / "out.csv"
-    printed = run("fuse", log(tmp_path / "log.csv", **odd), "-o", out)
-    assert "fused by eskf" in printed
-    # Of a line with an impossible fix only that is left out.
-    unit, kept = ("cells", 100) if "gps_lat" in odd else ("lines", 90)
-    assert f"left out 10 {unit} that cannot be read (line 7: " in printed
-    assert f"; {kept} samples at" in printed
-
-
-@pytest.mark.parametrize("height", ["44331", "99999", "1e308", "inf"])
-def test_height_beyond_the_atmosphere_gives_no_barometer_sample(
-    tmp_path: Path, height: str
+def test_impossible_values_are_left_out_with_their_line_or_alone(
+    tmp_path: Path, column: str, cell: str, left_out: str
 ) -> None:
-    printed = run("fuse", log(tmp_path / "log.csv", baro_alt_m=height), "-o", tmp_path / "out.csv")
-    assert "100 samples at 100 Hz fused" in printed
+    printed = run("fuse", log(tmp_path / "log.csv", **{column: cell}), "-o", tmp_path / "out.csv")
+    assert f"{90 if left_out == 'lines' else 100} samples at" in printed
+    assert "fused by eskf" in printed
+    remark = f"left out 10 {left_out} that cannot be read (line 7: "
+    assert (remark in printed) == bool(left_out)
 
 
 @pytest.mark.parametrize(
@@ -92,32 +84,57 @@ def test_comments_before_a_log_are_read_or_refused_with_their_line(
     assert words in printed
 
 
-@pytest.mark.parametrize("command", ["info", "fuse", "recover", "play"])
-@pytest.mark.parametrize("kind", ["pipe", "zeros", "link"])
-def test_pipe_or_device_is_refused(tmp_path: Path, command: str, kind: str) -> None:
-    path = Path("/dev/zero") if kind == "zeros" else tmp_path / "log.csv"
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "link":
-        path.symlink_to("/dev/zero")
-    words = ["-o", tmp_path / "out.csv"] if command in ("fuse", "recover") else []
-    printed = run(command, path, *words, code=2)
-    assert f"{path}: is a pipe or a device; save its bytes as a file" in printed
-    assert not (tmp_path / "out.csv").exists()
+Make = Callable[[Path], None]
 
 
-@pytest.mark.parametrize("command", ["info", "fuse", "recover"])
-@pytest.mark.parametrize("how", ["cut", "checksum"])
-def test_damaged_gzip_file_is_refused(tmp_path: Path, command: str, how: str) -> None:
-    whole = gzip.compress(log(tmp_path / "log.csv").read_bytes())
-    path = tmp_path / "log.csv.gz"
-    damaged = {"cut": whole[:-100], "checksum": whole[:-8] + bytes(8)}
-    path.write_bytes(damaged[how])
-    words = ["-o", tmp_path / "out.csv"] if command != "info" else []
-    printed = run(command, path, *words, code=2)
-    assert "log.csv.gz: is a damaged gzip file" in printed
-    assert "gzip -dc" in printed
-    assert not (tmp_path / "out.csv").exists()
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def link(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(gzip.compress(log(path).read_bytes())[:-100])
+
+
+def damage(path: Path) -> None:
+    path.write_bytes(gzip.compress(log(path).read_bytes())[:-8] + bytes(8))
+
+
+def bomb(path: Path) -> None:
+    """Pack comment lines without end."""
+    with gzip.open(path, "wb") as file:
+        file.write(NAMES.encode() + b"\n")
+        for _ in range(17):
+            file.write(b"#\n" * (1 << 20))
+
+
+DEVICE, BOMB = "is a pipe or a device; save its bytes as a file", "has a compression ratio above 100"
+REFUSED: list[tuple[Make | None, str, tuple[str, ...]]] = [
+    *((make, DEVICE, ("info", "fuse", "recover", "play")) for make in (pipe, link, None)),
+    *((make, "is a damaged gzip file", ("info", "fuse", "recover")) for make in (cut, damage)),
+    (bomb, BOMB, ("info", "fuse", "play")),
+]
+
+
+@pytest.mark.parametrize(
+    ("make", "words", "command"),
+    [(make, words, command) for make, words, commands in REFUSED for command in commands],
+)
+def test_unreadable_file_is_refused_in_a_moment(
+    tmp_path: Path, make: Make | None, words: str, command: str
+) -> None:
+    path, out = Path("/dev/zero"), tmp_path / "out.csv"
+    if make is not None:
+        make(path := tmp_path / "log.csv.gz")
+    begin_s = time.process_time()
+    printed = run(command, path, *(["-o", out] if command in ("fuse", "recover") else []), code=2)
+    assert time.process_time() - begin_s < 20.0
+    assert f"{path}: {words}" in printed
+    assert ("gzip -dc" in printed) == ("damaged" in words)
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -128,20 +145,6 @@ def test_packed_file_is_recognised_by_its_first_bytes_not_its_name(
     path = tmp_path / ("log.csv" if packed else "log.csv.gz")
     path.write_bytes(gzip.compress(data) if packed else data)
     assert "100 records in 0:00.990" in run("info", path)
-
-
-@pytest.mark.parametrize("command", ["info", "fuse", "play"])
-def test_comment_lines_of_a_bomb_are_refused_in_a_moment(tmp_path: Path, command: str) -> None:
-    path = tmp_path / "bomb.csv.gz"
-    with gzip.open(path, "wb") as file:
-        file.write(NAMES.encode() + b"\n")
-        for _ in range(20):
-            file.write(b"#\n" * (1 << 20))
-    words = ["-o", tmp_path / "out.csv"] if command == "fuse" else []
-    begin_s = time.process_time()
-    printed = run(command, path, *words, code=2)
-    assert "bomb.csv.gz: has a compression ratio above 100" in printed
-    assert time.process_time() - begin_s < 20.0
 
 
 def test_overlong_line_is_refused_within_bounded_memory(tmp_path: Path) -> None:
@@ -184,12 +187,10 @@ def test_packed_log_beyond_the_unpacked_limit_is_refused_and_fills_neither_memor
     printed = run(command, path, *words, "--config", config, code=2)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    if command == "play":
-        # All of it is read to find its format.
-        assert "bomb.gz: has a compression ratio above 100" in printed
-    else:
-        assert "bomb.gz: unpacks to more than 8 MB" in printed
-        assert "unpacked_limit_mb" in printed
+    # To play it, all of it is read to find its format.
+    unpacks, packed = "unpacks to more than 8 MB", "has a compression ratio above 100"
+    assert f"bomb.gz: {packed if command == 'play' else unpacks}" in printed
+    assert ("unpacked_limit_mb" in printed) == (command != "play")
     assert peak < 48 << 20
     assert not list(temporary.iterdir())
 
@@ -205,91 +206,62 @@ def test_times_beyond_the_calendar_are_written_and_reported(
     assert ("no day of the calendar" in printed) == (zero_us != 0)
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        (FORMAT_LINE, "# mavgate table 2", "line 1: table version '2'; this mavgate reads version 1"),
+        *(
+            ('"vehicle_id":1', f'"vehicle_id":{number}', "line 2: Expected `int`")
+            for number in (-5, 0, 300)
+        ),
+    ],
+    ids=["newer version", "negative id", "id zero", "large id"],
+)
+def test_unusable_head_of_a_table_is_refused_with_its_line(
+    tmp_path: Path, before: str, after: str, words: str
+) -> None:
+    path = table(tmp_path / "table.csv")
+    path.write_text(path.read_text().replace(before, after))
+    printed = run("convert", path, "-o", tmp_path / "out.tlog", code=2)
+    assert f"table.csv: {words}" in printed
+    assert "mavgate recover" in printed or before == FORMAT_LINE
+
+
+def test_table_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
+    path = table(tmp_path / "table.csv")
+    path.write_text("\ufeff" + path.read_text())
+    assert "vehicle 1" in run("info", path)
+
+
 def test_tlog_of_the_far_future_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "future.tlog"
     path.write_bytes(b"".join(struct.pack(">Q", 10**18) + frame for frame in make_frames(20)))
     assert "unknown file format" in run("info", path, code=2)
 
 
-def test_table_of_a_newer_version_is_refused(tmp_path: Path) -> None:
-    path = table(tmp_path / "table.csv")
-    path.write_text(path.read_text().replace(FORMAT_LINE, "# mavgate table 2"))
-    printed = run("fuse", path, "-o", tmp_path / "out.csv", code=2)
-    assert "table.csv: line 1: table version '2'; this mavgate reads version 1" in printed
-
-
-@pytest.mark.parametrize("vehicle_id", [-5, 0, 300])
-def test_table_with_an_invalid_vehicle_id_is_refused(tmp_path: Path, vehicle_id: int) -> None:
-    path = table(tmp_path / "table.csv", vehicle_id=vehicle_id)
-    printed = run("convert", path, "-o", tmp_path / "out.tlog", code=2)
-    assert "table.csv: line 2: Expected `int`" in printed
-    assert "mavgate recover" in printed
-
-
-def test_table_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
-    path = table(tmp_path / "table.csv")
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert "vehicle 1" in run("info", path)
+def test_invalid_column_map_is_refused(tmp_path: Path) -> None:
+    (columns := tmp_path / "map.toml").write_text("[columns]\nfoo = 3\n")
+    printed = run("fuse", log(tmp_path / "log.csv"), "--columns", columns, "-o", "o.csv", code=2)
+    assert "map.toml: is not a column map" in printed
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("endpoint", "code", "words"),
     [
-        (bytes(range(128, 200)), "map.toml: line 1: is not UTF-8 text; save it as UTF-8"),
-        (b'[columns]\ntime_us = "t"\n\xe4 = "x"\n', "map.toml: line 3: is not UTF-8"),
-        (b"[columns]\nfoo = 3\n", "map.toml: is not a column map"),
-        (b"[columns", "map.toml: is not valid TOML"),
-        (b"x = " + b"[" * 10_000, "map.toml: line 1: is nested in more than 8 levels"),
+        ("udp-listen:127.0.0.1:0", 2, "takes any free port"),
+        ("udp-listen:127.0.0.1:14550", 0, "all settings are right"),
     ],
 )
-def test_invalid_column_map_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
-    columns = tmp_path / "map.toml"
-    columns.write_bytes(content)
-    path = log(tmp_path / "log.csv")
-    assert words in run("fuse", path, "--columns", columns, "-o", tmp_path / "o.csv", code=2)
-
-
-@pytest.mark.parametrize("moment", ["9" * 400, "inf", "nan", "1e400", "9999-99-99T00:00:00Z", ""])
-def test_invalid_moment_is_refused(tmp_path: Path, moment: str) -> None:
-    path = table(tmp_path / "table.csv")
-    printed = run("convert", path, "--from", moment, "-o", tmp_path / "o.csv", code=2)
-    assert "use 80, 1:20 or 2026-06-11T14:25:30Z" in printed
-
-
-@pytest.mark.parametrize("words", [("nan", "nan"), ("inf", "0"), ("47", "8", "--alt", "nan")])
-def test_mark_at_invalid_coordinates_is_refused(words: tuple[str, ...]) -> None:
-    assert "write a number" in run("mark", *words, code=2)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ('[hub]\nendpoints = ["udp:127.0.0.1:0"]', "port must be 1 to 65535"),
-        ('[hub]\nendpoints = ["udp-listen:127.0.0.1:0"]', "takes any free port"),
-        ('[hub]\nendpoints = ["serial::57600"]', "write serial:DEVICE:BAUD"),
-        ('[hub]\nendpoints = ["udp-multicast:127.0.0.1:14550"]', "is not a multicast group"),
-        ('[recording]\nfolder = "~no-such-user/x"', "no user has the home ~no-such-user"),
-        ('aircraft_folder = "~no-such-user"', "write the whole path"),
-        ('[recording]\nmode = "sometimes"', "allowed: manual, in_flight, armed, always"),
-    ],
-)
-def test_unusable_settings_are_refused(tmp_path: Path, text: str, words: str) -> None:
-    file = tmp_path / "gateway.toml"
-    file.write_text(text + "\n")
-    assert words in run("check-config", file, code=2)
-
-
-def test_settings_with_a_byte_order_mark_are_read(tmp_path: Path) -> None:
-    file = tmp_path / "gateway.toml"
-    file.write_bytes(b"\xef\xbb\xbf[recording]\nmode = 'always'\n")
-    assert "all settings are right" in run("check-config", file)
+def test_settings_are_checked(tmp_path: Path, endpoint: str, code: int, words: str) -> None:
+    (file := tmp_path / "gateway.toml").write_text(f'[hub]\nendpoints = ["{endpoint}"]\n')
+    assert words in run("check-config", file, code=code)
 
 
 def test_times_increase_across_a_restart_of_the_logs_clock(tmp_path: Path) -> None:
     path = log(tmp_path / "log.csv")
     head, *rows = path.read_text().splitlines()
     path.write_text("\n".join([head, *rows, *rows[:50], *rows, ""]))
-    once, printed = tmp_path / "once.csv", run("info", path)
+    printed = run("info", path)
     assert "250 records in 0:02.480" not in printed
     assert "its clock went back" not in printed
     late = [f"{float(row.partition(',')[0]) + 60:.2f},{row.partition(',')[2]}" for row in rows]
@@ -297,12 +269,9 @@ def test_times_increase_across_a_restart_of_the_logs_clock(tmp_path: Path) -> No
     printed = run("info", path)
     assert "300 records in 1:01.980" in printed
     assert "its clock went back 1 time;" in printed
-    run("convert", path, "-o", once)
-    times_us = [
-        int(line.partition(",")[0])
-        for line in once.read_text().splitlines()[2:]
-        if line[:1].isdigit()
-    ]
+    run("convert", path, "-o", tmp_path / "once.csv")
+    lines = (tmp_path / "once.csv").read_text().splitlines()
+    times_us = [int(line.partition(",")[0]) for line in lines if line[:1].isdigit()]
     assert times_us == sorted(times_us)
 
 
