@@ -72,6 +72,8 @@ class ImuChip:
     degc_at_zero: float = 36.53
     keeps_ranges: bool = True
     """False: a broken chip, which ignores writes to its range registers."""
+    measures: bool = True
+    """False: a broken chip, whose data never change."""
 
 
 IMU_CHIPS: Final = {
@@ -84,7 +86,8 @@ IMU_CHIPS: Final = {
     "MPU6886": ImuChip(0x19, True, 0x41, 326.8, 25.0),
     "clone 0x72": ImuChip(0x72),
     "clone 0x00": ImuChip(0x00),
-    "broken": ImuChip(0x68, keeps_ranges=False),
+    "ignores its ranges": ImuChip(0x68, keeps_ranges=False),
+    "constant data": ImuChip(0x68, measures=False),
 }
 """By the names that the node report is shown with."""
 
@@ -113,7 +116,7 @@ class Imu(RegisterDevice):
         self._bench, self._world, self._rng, self._pulse_irq = bench, world, rng, pulse_irq
         self._chip = chip
         self._noise = _NOISE_COUNTS if noise else 0.0
-        self.self_test_works = True
+        self.self_test_works = self.interrupt_works = True
         self.sampled_ps: list[int] = []
         """When the samples were taken: the start of every latency."""
         self._generation = 0
@@ -189,10 +192,12 @@ class Imu(RegisterDevice):
         now_ps = self._bench.now_ps
         moment = self._world.moment(now_ps / PS_PER_S)
         values = self._low_pass([*moment.accel_mps2, *moment.gyro_radps])
-        self._store(values, moment.temperature_degc)
+        if self._chip.measures:
+            self._store(values, moment.temperature_degc)
         if self._registers.get(INT_ENABLE, 0) & 1:
             self.sampled_ps.append(now_ps)
-            self._pulse_irq(_INT_PULSE_US)
+            if self.interrupt_works:
+                self._pulse_irq(_INT_PULSE_US)
 
     def _low_pass(self, values: list[float]) -> list[float]:
         """Filter as the chip's DLPF would, to first order."""

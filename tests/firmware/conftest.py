@@ -12,7 +12,10 @@ sys.path.insert(0, str(ROOT))
 
 from firmware.rig import build as builder  # noqa: E402 - the checkout is no installed package
 from firmware.rig.boards import Setup  # noqa: E402
-from tests.firmware.harness import Bench  # noqa: E402
+from tests.firmware.harness import Bench, MakeRig  # noqa: E402
+
+NODE_OPTIONS = {"clock_ppm", "program", "noise"}
+"""Options of a node; others are those of the bench."""
 
 
 @pytest.fixture(scope="session")
@@ -39,3 +42,25 @@ def bench(programs: Path) -> Iterator[Callable[..., Bench]]:
     yield make
     for one in made:
         one.close()
+
+
+@pytest.fixture
+def imu_rig(bench: Callable[..., Bench]) -> MakeRig:
+    """Make benches with an IMU node that have run for some seconds."""
+    return lambda seconds=0.0, **options: _with_node(bench, "imu_node", seconds, options)
+
+
+@pytest.fixture
+def gps_rig(bench: Callable[..., Bench]) -> MakeRig:
+    """Make benches with a GPS node that have run for some seconds."""
+    return lambda seconds=0.0, **options: _with_node(bench, "gps_node", seconds, options)
+
+
+def _with_node(
+    bench: Callable[..., Bench], kind: str, seconds: float, options: dict[str, Any]
+) -> tuple[Bench, Any]:
+    of_node = {name: options.pop(name) for name in NODE_OPTIONS & options.keys()}
+    rig = bench(**options)
+    node = getattr(rig, kind)(**of_node)
+    rig.run(seconds)
+    return rig, node

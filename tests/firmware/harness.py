@@ -1,11 +1,12 @@
 """A bench whose receiver's bytes come out decoded."""
 
 import itertools
-from collections import Counter
-from typing import TypeVar
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 from firmware.rig.bench import PS_PER_S
 from firmware.rig.boards import Board, GpsNode, ImuNode, Receiver, Setup
+from firmware.rig.world import Moment, Solution, World
 from gateway.wire.framing import Fault, FrameDecoder
 from gateway.wire.payloads import (
     ForeignFrame,
@@ -14,10 +15,28 @@ from gateway.wire.payloads import (
     Payload,
     RadioFrame,
     ReceiverStatusFrame,
+    chip_names,
     decode_content,
 )
 
 P = TypeVar("P", bound=Payload)
+
+IMU, MAG, BARO, GPS = 1, 2, 4, 8
+"""Bits of the sensors in a node's status."""
+START_S = 0.45
+"""Reset, self-test and set-up of an IMU node."""
+
+
+def still(**values: Any) -> World:
+    """Return a world whose quantities do not change."""
+    moment = Moment(**values)
+    return World(moment=lambda _time_s: moment)
+
+
+def always(**values: Any) -> World:
+    """Return a world with one solution of the GPS."""
+    solution = Solution(**values)
+    return World(solution=lambda _time_s: solution)
 
 
 class Bench:
@@ -84,6 +103,19 @@ class Bench:
         ]
         return found[-1]
 
+    @property
+    def sensors(self) -> tuple[int, int]:
+        """Sensors that are present, and those that failed, by the newest report."""
+        status = self.last(NodeStatusPayload)
+        return status.sensors_present, status.sensors_failed
+
+    @property
+    def chips(self) -> tuple[str, ...]:
+        """Chips by the newest report."""
+        status = self.last(NodeStatusPayload)
+        assert status.chips is not None
+        return chip_names(status.chips, status.sensors_present)
+
     def lost(self, node_id: int, since_s: float = 0.0) -> int:
         """Count the gaps in a node's sequence."""
         seqs = [
@@ -105,5 +137,6 @@ class Bench:
             self.frames.append((time_s, content))
 
 
-def kinds(bench: Bench) -> Counter[str]:
-    return Counter(type(frame.payload).__name__ for _, frame in bench.frames)
+MakeBench = Callable[..., Bench]
+MakeRig = Callable[..., tuple[Bench, Any]]
+"""Makes a bench with one node that has run for some seconds; returns both."""

@@ -1,7 +1,6 @@
 """Resets, hangs and the clocks' wrap, in flight."""
 
 import itertools
-from collections.abc import Callable
 
 import pytest
 
@@ -10,11 +9,10 @@ from firmware.rig.mcu import BROWN_OUT, WATCHDOG
 from gateway.records import ImuFlags
 from gateway.wire.link import Link
 from gateway.wire.payloads import ImuPayload, NodeStatusPayload
-from tests.firmware.harness import Bench
+from tests.firmware.harness import Bench, MakeBench, MakeRig
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
-MakeBench = Callable[..., Bench]
 MAG_NEW = ImuFlags.MAG_NEW
 OVERFLOWS_16_MHZ = 1 << 17
 """Of timer 1 in 2**32 us: 65536 ticks of half a microsecond each."""
@@ -24,11 +22,9 @@ OVERFLOWS_16_MHZ = 1 << 17
     ("cause", "through_bootloader"), [(BROWN_OUT, False), (WATCHDOG, False), (WATCHDOG, True)]
 )
 def test_reset_in_flight_costs_little_and_is_reported(
-    bench: MakeBench, cause: int, through_bootloader: bool
+    imu_rig: MakeRig, cause: int, through_bootloader: bool
 ) -> None:
-    rig = bench()
-    node = rig.imu_node()
-    rig.run(1.2)
+    rig, node = imu_rig(1.2)
     reset_s = rig.now_s
     node.reset(cause, through_bootloader)
     rig.run(1.2)
@@ -60,10 +56,8 @@ def test_program_that_hangs_is_restarted_by_its_watchdog(bench: MakeBench, which
     assert len(rig.payloads(ImuPayload, since_s=rig.now_s - 0.5)) == pytest.approx(50, abs=3)
 
 
-def test_time_wraps_after_71_minutes_without_a_gap(bench: MakeBench) -> None:
-    rig = bench()
-    node = rig.imu_node()
-    rig.run(0.6)
+def test_time_wraps_after_71_minutes_without_a_gap(imu_rig: MakeRig) -> None:
+    rig, node = imu_rig(0.6)
     for board in (node, rig.receiver):
         board.mcu.write_variable("clock_overflows", OVERFLOWS_16_MHZ - 10, 4)
     since_s = rig.now_s + 0.02
@@ -91,19 +85,16 @@ def pass_forty_minutes(rig: Bench, board: Board) -> None:
         rig.run(1.5)  # the reports that fell due meanwhile
 
 
-def test_receiver_that_loses_its_radio_late_sets_it_up_at_once(bench: MakeBench) -> None:
-    rig = bench()
-    rig.imu_node()
-    rig.run(0.6)
+def test_receiver_that_loses_its_radio_late_sets_it_up_at_once(imu_rig: MakeRig) -> None:
+    rig, _ = imu_rig(0.6)
     pass_forty_minutes(rig, rig.receiver)
     rig.receiver.radio.power_cycle()
     rig.run(1.6)
     assert len(rig.payloads(ImuPayload, since_s=rig.now_s - 0.4)) == pytest.approx(40, abs=3)
 
 
-def test_magnetometer_that_comes_late_is_read(bench: MakeBench) -> None:
-    rig = bench()
-    node = rig.imu_node()
+def test_magnetometer_that_comes_late_is_read(imu_rig: MakeRig) -> None:
+    rig, node = imu_rig()
     node.compass.absent = True
     rig.run(0.6)
     pass_forty_minutes(rig, node)
@@ -113,10 +104,8 @@ def test_magnetometer_that_comes_late_is_read(bench: MakeBench) -> None:
     assert len(new) > 10
 
 
-def test_gateways_link_sees_every_sample_and_a_restart(bench: MakeBench) -> None:
-    rig = bench(loss=0.1)
-    node = rig.imu_node(clock_ppm=40.0)
-    rig.run(2.2)
+def test_gateways_link_sees_every_sample_and_a_restart(imu_rig: MakeRig) -> None:
+    rig, node = imu_rig(2.2, loss=0.1, clock_ppm=40.0)
     node.reset(BROWN_OUT)
     rig.run(1.3)
     link = Link()

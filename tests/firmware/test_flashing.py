@@ -16,13 +16,12 @@ from firmware.rig.mcu import WATCHDOG
 from firmware.rig.usb_serial import BOOTLOADERS, NEW_BOOTLOADER, OLD_BOOTLOADER, UsbSerial
 from gateway.flashing.boards import BoardSettings, find_block, with_settings
 from gateway.wire.payloads import ImuPayload, NodeStatusPayload
-from tests.firmware.harness import Bench
+from tests.firmware.harness import MakeBench, MakeRig
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 LIMIT_S = 240.0
 SPI_CLOCK = 1 << 5
-MakeBench = Callable[..., Bench]
 
 
 @pytest.fixture(scope="session")
@@ -66,7 +65,7 @@ def flash(usb: UsbSerial, *words: str) -> str:
 def test_boards_flashed_through_optiboot_fly_with_their_settings(
     tools: None,
     programs: Path,
-    bench: MakeBench,
+    imu_rig: MakeRig,
     plugged: Callable[[Board], UsbSerial],
     tmp_path: Path,
 ) -> None:
@@ -74,8 +73,7 @@ def test_boards_flashed_through_optiboot_fly_with_their_settings(
     image = with_settings(IntelHex(str(programs / "receiver.hex")), settings)
     flashed = tmp_path / "receiver.hex"
     flashed.write_bytes(NEW_BOOTLOADER.with_suffix(".hex").read_bytes() + b"\n" + image)
-    rig = bench(receiver=str(flashed.with_suffix("")))
-    node = rig.imu_node(program=str(NEW_BOOTLOADER))
+    rig, node = imu_rig(receiver=str(flashed.with_suffix("")), program=str(NEW_BOOTLOADER))
     usb = plugged(node)
     flash(usb, "imu", "--vehicle", "2", "--channel", "80", "--rate", "250", "--send-rate", "60")
     shown = flash(usb, "--show")
@@ -126,11 +124,9 @@ def patched(programs: Path, tmp_path: Path) -> Callable[[BoardSettings], Path]:
 
 
 def test_hang_on_a_board_with_an_old_bootloader_restarts_it_without_a_reset(
-    bench: MakeBench, patched: Callable[[BoardSettings], Path]
+    imu_rig: MakeRig, patched: Callable[[BoardSettings], Path]
 ) -> None:
-    rig = bench()
-    node = rig.imu_node(program=str(patched(BoardSettings(soft_restart=True))))
-    rig.run(1.2)
+    rig, node = imu_rig(1.2, program=str(patched(BoardSettings(soft_restart=True))))
     release = node.mcu.hang("events_wait()")
     rig.run(0.3)
     release()
@@ -141,14 +137,13 @@ def test_hang_on_a_board_with_an_old_bootloader_restarts_it_without_a_reset(
 
 
 def test_damaged_settings_keep_the_board_off_the_air_and_blink(
-    bench: MakeBench, programs: Path, tmp_path: Path
+    imu_rig: MakeRig, programs: Path, tmp_path: Path
 ) -> None:
     image = IntelHex(str(programs / "imu_node.hex"))
     offset = find_block(image.tobinstr(start=0)).offset
     image[offset + 12] ^= 1
     image.write_hex_file(str(tmp_path / "imu_node.hex"))
-    rig = bench()
-    node = rig.imu_node(program=str(tmp_path / "imu_node"))
+    rig, node = imu_rig(program=str(tmp_path / "imu_node"))
     flashes = led_of(node)
     rig.run(4.2)
     assert rig.frames == []
@@ -175,9 +170,8 @@ def led_of(node: Board) -> list[float]:
 @pytest.mark.parametrize(
     ("absent", "per_cycle"), [("receiver", 1), ("sensor", 2), ("radio", 3)], ids=str
 )
-def test_led_flashes_count_the_fault(bench: MakeBench, absent: str, per_cycle: int) -> None:
-    rig = bench()
-    node = rig.imu_node()
+def test_led_flashes_count_the_fault(imu_rig: MakeRig, absent: str, per_cycle: int) -> None:
+    rig, node = imu_rig()
     flashes = led_of(node)
     rig.run(2.2)
     assert flashes == []

@@ -19,6 +19,7 @@ from tests.kit.payloads import decode_payload
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
+TALKERS = ("GP", "GL", "GN")
 Parse = Callable[[bytes], list[tuple[GpsFixPayload, GpsQualityPayload]]]
 CAPACITY: Final = 2000
 RANGE_ERROR_M: Final = 4.0
@@ -66,9 +67,9 @@ class TestUbx:
             assert fix.lat_dege7 == round(read.lat * 1e7)
             assert fix.lon_dege7 == round(read.lon * 1e7)
             assert fix.alt_amsl_mm == read.hMSL
-            velocity = (read.velN, read.velE, read.velD)
             assert fix.vel_n_cmps == tuple(
-                max(-32_767, min(32_767, math.trunc(v / 10))) for v in velocity
+                max(-32_767, min(32_767, math.trunc(v / 10)))
+                for v in (read.velN, read.velE, read.velD)
             )
             assert fix.fix_type == GpsFixType(read.fixType)
             assert (fix.fix_ok, fix.satellites) == (bool(read.gnssFixOk), read.numSV)
@@ -77,10 +78,9 @@ class TestUbx:
             assert quality.speed_acc_cmps == held(read.sAcc / 10)
             assert quality.course_acc_cdeg == held(round(read.headAcc * 1e5) / 1000)
             assert quality.pdop_centi == round(read.pDOP * 100)
-            utc = quality.utc
-            assert utc is not None
-            assert (utc.year, utc.month, utc.day) == (read.year, read.month, read.day)
-            assert (utc.hour, utc.minute, utc.second) == (read.hour, read.min, read.second)
+            date, time = (read.year, read.month, read.day), (read.hour, read.min, read.second)
+            assert quality.utc is not None
+            assert quality.utc.timetuple()[:6] == (*date, *time)
 
     @staticmethod
     def random_pvt(rng: np.random.Generator) -> UBXMessage:
@@ -127,22 +127,14 @@ class TestUbx:
         assert len(solutions) == 2
         fix, quality = solutions[0]
         assert solutions[1] == solutions[0]
-        assert (fix.lat_dege7, fix.lon_dege7, fix.alt_amsl_mm) == (
-            -77_123_456,
-            1_103_654_321,
-            153_250,
-        )
+        assert (fix.lat_dege7, fix.lon_dege7) == (-77_123_456, 1_103_654_321)
+        assert fix.alt_amsl_mm == 153_250
         assert fix.vel_n_cmps == (1234, -567, -89)
         assert (fix.fix_type, fix.fix_ok, fix.satellites) == (GpsFixType.FIX_3D, True, 9)
         assert (quality.h_acc_cm, quality.v_acc_cm, quality.speed_acc_cmps) == (180, 310, 42)
         assert (quality.course_acc_cdeg, quality.pdop_centi) == (275, 161)
         assert quality.geoid_separation_cm == 2345
         assert quality.utc == datetime(2026, 11, 19, 0, 0, 2, 200_000, tzinfo=UTC)
-
-
-def degrees(text: float, minutes_decimals: int) -> str:
-    whole = int(abs(text))
-    return f"{(abs(text) - whole) * 60:0{3 + minutes_decimals}.{minutes_decimals}f}"
 
 
 class Epoch:
@@ -211,13 +203,8 @@ class TestNmea:
     def test_several_talkers_give_one_fix_each_second(self, parse: Parse, order: str) -> None:
         rng = np.random.default_rng(5)
         epochs = [Epoch(rng) for _ in range(5)]
-        data = b"".join(
-            getattr(epoch, sentence)(talker)
-            for epoch in epochs
-            for sentence in order.split()
-            for talker in ("GP", "GL", "GN")
-        )
-        solutions = parse(data)
+        sentences = [(e, each) for e in epochs for each in order.split()]
+        solutions = parse(b"".join(getattr(e, s)(t) for e, s in sentences for t in TALKERS))
         assert [fix.itow_ms for fix, _ in solutions] == [itow_ms(e.utc) for e in epochs]
 
     @pytest.mark.parametrize(

@@ -14,39 +14,32 @@ from firmware.rig.bench import PS_PER_S, PS_PER_US
 from firmware.rig.bench import Bench as TimeLine
 from firmware.rig.boards import LORA_PARTS, Parts, Setup
 from gateway.wire.payloads import ImuPayload
-from tests.firmware.harness import Bench
+from tests.firmware.harness import Bench, MakeBench, MakeRig
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
-MakeBench = Callable[..., Bench]
 RUNNING_S = 1.0
 """By then every board has started."""
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.3])
-def test_nothing_is_lost_up_to_30_percent_on_the_air(bench: MakeBench, loss: float) -> None:
-    rig = bench(loss=loss, seed=3)
-    rig.imu_node(clock_ppm=40.0)
+def test_nothing_is_lost_up_to_30_percent_on_the_air(imu_rig: MakeRig, loss: float) -> None:
+    rig, _ = imu_rig(loss=loss, seed=3, clock_ppm=40.0)
     rig.gps_node(clock_ppm=-30.0)
     rig.run(RUNNING_S + 5.0)
-    imu = rig.payloads(ImuPayload, since_s=RUNNING_S)
-    assert len(imu) == pytest.approx(500, abs=3)
+    assert len(rig.payloads(ImuPayload, since_s=RUNNING_S)) == pytest.approx(500, abs=3)
     assert rig.lost(0) == rig.lost(1) == 0
     assert rig.node_status(0).radio_failed == rig.node_status(1).radio_failed == 0
     retries = rig.node_status(0).radio_retries
     # A packet is repeated if it or its acknowledgement is lost.
     expected = 130 * 4.5 * ((1 - loss) ** -2 - 1)
     assert 0.6 * expected <= retries <= 1.5 * expected + 40
-    last = rig.statuses[-1]
-    assert [p.lost for p in last.pipes] == [0] * 6
-    assert last.uart_dropped == 0
-    assert not rig.faults
+    assert [p.lost for p in rig.statuses[-1].pipes] == [0] * 6
+    assert (rig.statuses[-1].uart_dropped, rig.faults) == (0, [])
 
 
-def test_half_of_the_samples_reach_the_line_within_5_ms(bench: MakeBench) -> None:
-    rig = bench(loss=0.1)
-    node = rig.imu_node()
-    rig.run(RUNNING_S + 1.0)
+def test_half_of_the_samples_reach_the_line_within_5_ms(imu_rig: MakeRig) -> None:
+    rig, node = imu_rig(RUNNING_S + 1.0, loss=0.1)
     late_s = []
     for end_s, frame in rig.frames:
         if isinstance(frame.payload, ImuPayload):
@@ -57,28 +50,21 @@ def test_half_of_the_samples_reach_the_line_within_5_ms(bench: MakeBench) -> Non
     assert 0.002 < np.median(late_s) < 0.005
 
 
-def test_receiver_counts_received_and_lost_packets(bench: MakeBench) -> None:
-    rig = bench()
-    rig.imu_node()
-    rig.run(1.2)
+def test_receiver_counts_received_and_lost_packets(imu_rig: MakeRig) -> None:
+    rig, _ = imu_rig(1.2)
     rig.setup.air.loss = 1.0
     rig.run(0.5)
     rig.setup.air.loss = 0.0
     rig.run(1.4)
-    gaps = rig.lost(0)
+    gaps, last = rig.lost(0), rig.statuses[-1]
     assert gaps > 20
     assert rig.node_status(0).radio_failed == pytest.approx(gaps, abs=9)
-    assert rig.statuses[-1].pipes[0].lost == gaps
-    received = sum(
-        1 for _, f in rig.frames if f.receiver_time_us <= rig.statuses[-1].receiver_time_us
-    )
-    assert rig.statuses[-1].pipes[0].received == received
+    received = sum(f.receiver_time_us <= last.receiver_time_us for _, f in rig.frames)
+    assert (last.pipes[0].lost, last.pipes[0].received) == (gaps, received)
 
 
-def test_payloads_come_in_order_and_once(bench: MakeBench) -> None:
-    rig = bench(loss=0.3, seed=8)
-    rig.imu_node()
-    rig.run(2.5)
+def test_payloads_come_in_order_and_once(imu_rig: MakeRig) -> None:
+    rig, _ = imu_rig(2.5, loss=0.3, seed=8)
     seqs = [header.seq for header in rig.headers(0)]
     assert all(b - a == 1 for a, b in pairwise(seqs))
     frame_seqs = [frame.frame_seq for _, frame in rig.frames]
@@ -88,28 +74,18 @@ def test_payloads_come_in_order_and_once(bench: MakeBench) -> None:
 def test_nodes_that_start_in_step_get_through(bench: MakeBench, build: Callable[..., Path]) -> None:
     """Three nodes that sample at the same instants, again and again: the worst for an air."""
     rig = bench(seed=5)
-    for vehicle in (1, 2, 3):
-        folder = (
-            build(f"-DVEHICLE_ID={vehicle}", programs=("imu_node",))
-            if vehicle > 1
-            else rig.setup.build
-        )
-        default, rig.setup.build = rig.setup.build, folder
+    for settings in ("", "-DVEHICLE_ID=2", "-DVEHICLE_ID=3"):
+        rig.setup.build = build(settings, programs=("imu_node",)) if settings else rig.setup.build
         rig.imu_node()
-        rig.setup.build = default
     rig.run(RUNNING_S + 2.0)
     assert rig.setup.air.collisions > 50
-    vehicles = {f.header.node.vehicle_id for _, f in rig.frames}
-    assert vehicles == {1, 2, 3}
-    imu = rig.payloads(ImuPayload, since_s=RUNNING_S)
-    assert len(imu) == pytest.approx(600, abs=6)
+    assert {f.header.node.vehicle_id for _, f in rig.frames} == {1, 2, 3}
+    assert len(rig.payloads(ImuPayload, since_s=RUNNING_S)) == pytest.approx(600, abs=6)
     assert rig.node_status(0).radio_failed <= 2
 
 
-def test_noise_on_the_channel_is_reported_and_own_packets_are_not(bench: MakeBench) -> None:
-    rig = bench(seed=2)
-    rig.imu_node()
-    rig.run(2.2)
+def test_noise_on_the_channel_is_reported_and_own_packets_are_not(imu_rig: MakeRig) -> None:
+    rig, _ = imu_rig(2.2, seed=2)
     assert rig.statuses[-1].noise_percent == 0
     rig.setup.air.noise = 0.5
     rig.run(2.0)
