@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.recordings.tlog import encode_record
 from tests.kit.cli import run
 from tests.kit.mavlink import packed
-from tests.recordings.frames import read_tlog
+from tests.kit.recordings import read_tlog
 
 pytestmark = pytest.mark.io
 

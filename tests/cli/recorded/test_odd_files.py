@@ -18,7 +18,7 @@ from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import FORMAT_LINE, encode_head
 from gateway.records import NavFlags
 from tests.kit.cli import run
-from tests.recordings.frames import make_frames
+from tests.kit.recordings import make_frames
 
 pytestmark = pytest.mark.io
 
@@ -111,7 +111,10 @@ def bomb(path: Path) -> None:
             file.write(b"#\n" * (1 << 20))
 
 
-DEVICE, BOMB = "is a pipe or a device; save its bytes as a file", "has a compression ratio above 100"
+DEVICE, BOMB = (
+    "is a pipe or a device; save its bytes as a file",
+    "has a compression ratio above 100",
+)
 REFUSED: list[tuple[Make | None, str, tuple[str, ...]]] = [
     *((make, DEVICE, ("info", "fuse", "recover", "play")) for make in (pipe, link, None)),
     *((make, "is a damaged gzip file", ("info", "fuse", "recover")) for make in (cut, damage)),
@@ -209,7 +212,11 @@ def test_times_beyond_the_calendar_are_written_and_reported(
 @pytest.mark.parametrize(
     ("before", "after", "words"),
     [
-        (FORMAT_LINE, "# mavgate table 2", "line 1: table version '2'; this mavgate reads version 1"),
+        (
+            FORMAT_LINE,
+            "# mavgate table 2",
+            "line 1: table version '2'; this mavgate reads version 1",
+        ),
         *(
             ('"vehicle_id":1', f'"vehicle_id":{number}', "line 2: Expected `int`")
             for number in (-5, 0, 300)
