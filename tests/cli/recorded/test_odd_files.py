@@ -111,14 +111,12 @@ def bomb(path: Path) -> None:
             file.write(b"#\n" * (1 << 20))
 
 
-DEVICE, BOMB = (
-    "is a pipe or a device; save its bytes as a file",
-    "has a compression ratio above 100",
-)
+DEVICE = "is a pipe or a device; save its bytes as a file"
+RATIO = "has a compression ratio above 100"
 REFUSED: list[tuple[Make | None, str, tuple[str, ...]]] = [
     *((make, DEVICE, ("info", "fuse", "recover", "play")) for make in (pipe, link, None)),
     *((make, "is a damaged gzip file", ("info", "fuse", "recover")) for make in (cut, damage)),
-    (bomb, BOMB, ("info", "fuse", "play")),
+    (bomb, RATIO, ("info", "fuse", "play")),
 ]
 
 
@@ -191,8 +189,8 @@ def test_packed_log_beyond_the_unpacked_limit_is_refused_and_fills_neither_memor
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     # To play it, all of it is read to find its format.
-    unpacks, packed = "unpacks to more than 8 MB", "has a compression ratio above 100"
-    assert f"bomb.gz: {packed if command == 'play' else unpacks}" in printed
+    reason = RATIO if command == "play" else "unpacks to more than 8 MB"
+    assert f"bomb.gz: {reason}" in printed
     assert ("unpacked_limit_mb" in printed) == (command != "play")
     assert peak < 48 << 20
     assert not list(temporary.iterdir())
@@ -215,7 +213,7 @@ def test_times_beyond_the_calendar_are_written_and_reported(
         (
             FORMAT_LINE,
             "# mavgate table 2",
-            "line 1: table version '2'; this mavgate reads version 1",
+            "line 1: table version '2'; this mavgate reads",
         ),
         *(
             ('"vehicle_id":1', f'"vehicle_id":{number}', "line 2: Expected `int`")
