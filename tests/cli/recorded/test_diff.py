@@ -12,10 +12,9 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.aircraft import Aircraft, AircraftSettings
 from gateway.live.control_socket import ControlServer, socket_path
 from gateway.live.control_verbs import introduction_verb
-from gateway.recordings.tlog import TlogRecord
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender
-from tests.kit.recordings import START_US, make_tlog
+from tests.kit.recordings import records_of, write_tlog
 
 pytestmark = pytest.mark.io
 
@@ -26,9 +25,7 @@ def written(path: Path, messages: list[Any], lost: int = 0) -> Path:
     for _ in range(lost):
         sender.heartbeat()
     frames += [sender.pack(message) for message in messages]
-    records = [TlogRecord(START_US + k * 500_000, frame) for k, frame in enumerate(frames)]
-    path.write_bytes(make_tlog(records))
-    return path
+    return write_tlog(path, records_of(frames, 500_000))
 
 
 def param(name: bytes, value: float) -> Any:
@@ -54,16 +51,9 @@ def flights(tmp_path: Path) -> tuple[Path, Path]:
         mavlink.MAVLink_battery_status_message(0, 0, 0, 0, [1] * 10, 0, used, 0, 90)
         for used in (100, 350)
     ]
-    one = [
-        param(b"A", 0.1),
-        param(b"B", 2),
-        *mission(50),
-        version(1),
-        text(3, b"Bad gyro"),
-        *battery,
-    ]
+    one = [param(b"A", 0.1), param(b"B", 2), *mission(50), version(1), text(3, b"Bad gyro")]
     two = [param(b"A", 0.2), param(b"C", 3), *mission(60), version(2), text(6, b"Ready")]
-    return written(tmp_path / "a.tlog", one), written(tmp_path / "b.tlog", two, lost=3)
+    return written(tmp_path / "a.tlog", [*one, *battery]), written(tmp_path / "b.tlog", two, lost=3)
 
 
 def test_recordings_are_compared_by_section(flights: tuple[Path, Path]) -> None:

@@ -3,18 +3,19 @@
 import csv
 import json
 import re
+import struct
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink import mavparm, mavwp
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.extracts import RecordedParameter
-from gateway.recordings.tlog import TlogRecord
-from tests.kit.cli import invoke, run
+from tests.kit.cli import run
 from tests.kit.mavlink import Sender
-from tests.kit.recordings import START_US, make_tlog
+from tests.kit.recordings import START_US, records_of, write_tlog
 
 pytestmark = pytest.mark.io
 
@@ -59,12 +60,12 @@ def flight(autopilot: int = 3) -> list[Any]:
             1, START_US, 1, *E7, 550_000, 50_000, [1, 0, 0, 0], 8, 1, b"DCIM/8.jpg"),
         mavlink.MAVLink_mission_item_reached_message(2),
     ]  # fmt: skip
-    for k in range(40):
-        at = (E7[0] + 1000 * k, E7[1])
-        found.append(
-            mavlink.MAVLink_global_position_int_message(k, *at, 550_000, 50_000, 300, 400, 0, 0)
-        )
-    return [*found, disarmed]
+    positions = [
+        mavlink.MAVLink_global_position_int_message(
+            k, E7[0] + 1000 * k, E7[1], 550_000, 50_000, 300, 400, 0, 0)
+        for k in range(40)
+    ]  # fmt: skip
+    return [*found, *positions, disarmed]
 
 
 @pytest.fixture
@@ -73,12 +74,8 @@ def tlog(tmp_path: Path) -> Path:
 
 
 def written(folder: Path, messages: list[Any]) -> Path:
-    sender, path = Sender(), folder / "flight.tlog"
-    frames = [sender.pack(message) for message in messages]
-    path.write_bytes(
-        make_tlog([TlogRecord(START_US + k * 100_000, frame) for k, frame in enumerate(frames)])
-    )
-    return path
+    frames = map(Sender().pack, messages)
+    return write_tlog(folder / "flight.tlog", records_of(frames, 100_000))
 
 
 def test_parameters_are_read_by_pymavlink(tlog: Path, tmp_path: Path) -> None:
@@ -101,9 +98,7 @@ def test_parameters_of_qgroundcontrol_have_five_columns(tlog: Path, tmp_path: Pa
 
 
 def test_integers_that_px4_sends_bytewise_are_read_as_integers(tmp_path: Path) -> None:
-    import struct
-
-    value = struct.unpack("<f", struct.pack("<i", 123_456))[0]
+    (value,) = struct.unpack("<f", struct.pack("<i", 123_456))
     messages = [
         mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3),
         mavlink.MAVLink_param_value_message(b"COM_X", value, 6, 1, 0),
@@ -116,10 +111,7 @@ def test_integers_that_px4_sends_bytewise_are_read_as_integers(tmp_path: Path) -
     ("value", "text"), [(0.1, "0.1"), (1e-7, "1e-07"), (3.0, "3"), (16777217.5, "16777218")]
 )
 def test_parameter_is_written_with_the_digits_of_a_float(value: float, text: str) -> None:
-    import struct
-
-    single = struct.unpack("<f", struct.pack("<f", value))[0]
-    assert RecordedParameter("X", single, 9).text == text
+    assert RecordedParameter("X", float(np.float32(value)), 9).text == text
 
 
 @pytest.mark.parametrize(("option", "count"), [("--mission", 3), ("--fence", 4), ("--rally", 1)])
@@ -176,11 +168,8 @@ def parsed_srt(text: str) -> list[tuple[float, float, str]]:
     for number, block in enumerate(text.strip().split("\n\n"), 1):
         head, times, *lines = block.split("\n")
         assert int(head) == number
-        match = re.fullmatch(
-            r"(\d\d):(\d\d):(\d\d),(\d{3}) --> (\d\d):(\d\d):(\d\d),(\d{3})", times
-        )
-        assert match is not None
-        values = [int(one) for one in match.groups()]
+        assert re.fullmatch(r"\d\d:\d\d:\d\d,\d{3} --> \d\d:\d\d:\d\d,\d{3}", times)
+        values = [int(one) for one in re.findall(r"\d+", times)]
         begin, end = (h * 3600 + m * 60 + s + ms / 1000 for h, m, s, ms in (values[:4], values[4:]))
         found.append((begin, end, "\n".join(lines)))
     return found
@@ -206,18 +195,8 @@ def test_subtitles_of_chosen_fields_as_ass(tlog: Path, tmp_path: Path) -> None:
     out = tmp_path / "flight.ass"
     video = tmp_path / "DJI_20251009-085321.mp4"
     video.touch()
-    text = run(
-        "extract",
-        tlog,
-        "--subtitles",
-        out,
-        "--fields",
-        "height,mode",
-        "--rate",
-        30,
-        "--video",
-        video,
-    )
+    words = ("--fields", "height,mode", "--rate", 30, "--video", video)
+    text = run("extract", tlog, "--subtitles", out, *words)
     assert "begins at 2025-10-09T08:53:21.000Z" in text
     lines = [line for line in out.read_text().splitlines() if line.startswith("Dialogue")]
     assert lines[-1].endswith("Default,50.0 m  LOITER")
@@ -232,31 +211,22 @@ def test_subtitles_of_chosen_fields_as_ass(tlog: Path, tmp_path: Path) -> None:
         (("--params", "a.param", "--system", "9"), "no vehicle 9"),
         (("--subtitles", "a.srt", "--fields", "x"), "choose mode"),
         (("--subtitles", "a.srt", "--offset", "x"), "--offset"),
+        (("--params", "a.param"), "no parameters"),
+        (("--mission", "a.plan"), "no mission of this vehicle; a.plan is not written"),
     ],
 )
-def test_invalid_options_are_refused(
-    tlog: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], text: str
+def test_invalid_options_or_missing_content_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], text: str
 ) -> None:
+    tlog = written(tmp_path, flight()[:1])
     monkeypatch.chdir(tmp_path)
     assert text in run("extract", tlog, *options, code=2)
     assert [path.name for path in tmp_path.iterdir()] == ["flight.tlog"]
 
 
-def test_recording_without_the_wanted_content_is_refused(tmp_path: Path) -> None:
-    path = written(tmp_path, [mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)])
-    assert "no parameters" in run("extract", path, "--params", tmp_path / "a.param", code=2)
-    assert "no mission" in run("extract", path, "--mission", tmp_path / "a.plan", code=2)
-    assert not (tmp_path / "a.plan").exists()
-
-
-@pytest.mark.parametrize(("others", "code"), [(("--params", "a.param"), 1), ((), 2)])
-def test_missing_mission_is_reported_and_other_files_are_written(
-    others: tuple[str, ...], code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    written(tmp_path, flight()[:2])
-    done = invoke("extract", "flight.tlog", "--mission", "a.plan", *others)
-    assert done.exit_code == code
-    assert "no mission of this vehicle; a.plan is not written" in done.output
-    assert Path("a.param").exists() == bool(others)
-    assert not Path("a.plan").exists()
+def test_missing_mission_is_reported_and_other_files_are_written(tmp_path: Path) -> None:
+    plan, parameters = tmp_path / "a.plan", tmp_path / "a.param"
+    path = written(tmp_path, flight()[:2])
+    text = run("extract", path, "--mission", plan, "--params", parameters, code=1)
+    assert f"no mission of this vehicle; {plan} is not written" in text
+    assert (plan.exists(), parameters.exists()) == (False, True)
