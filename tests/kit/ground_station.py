@@ -223,6 +223,11 @@ class GroundStation:
         return self.of(ClientInterval)
 
 
+def to_vehicle(name: str, *fields: Any, target: tuple[int, int] = (1, 1)) -> Any:
+    """Return a message to a vehicle, such as MISSION_COUNT."""
+    return getattr(mavlink, f"MAVLink_{name.lower()}_message")(*target, *fields)
+
+
 def command(number: int, *params: float, target: tuple[int, int] = (1, 1)) -> Any:
     padded = [*params, *[0.0] * (7 - len(params))]
     return mavlink.MAVLink_command_long_message(*target, number, 0, *padded)
@@ -230,7 +235,7 @@ def command(number: int, *params: float, target: tuple[int, int] = (1, 1)) -> An
 
 def command_int(number: int, x: int, y: int, z: float, frame: int = 5) -> Any:
     """Return a COMMAND_INT; frame 5 is the global one with integers."""
-    return mavlink.MAVLink_command_int_message(1, 1, frame, number, 0, 0, 0, 0, 0, 0, x, y, z)
+    return to_vehicle("COMMAND_INT", frame, number, 0, 0, 0, 0, 0, 0, x, y, z)
 
 
 def qgroundcontrol(station: Any) -> None:
@@ -245,10 +250,10 @@ def qgroundcontrol(station: Any) -> None:
         _request(station, message_id, kind)
     load_parameters(station)
     for mission_type in (0, 1, 2) if station.version == 2 else (0,):
-        message = mavlink.MAVLink_mission_request_list_message(1, 1, mission_type)
+        message = to_vehicle("MISSION_REQUEST_LIST", mission_type)
         [count] = station.ask(message, "MISSION_COUNT", timeout_s=0.05)[:1]
         assert count.count == 0
-        station.send(mavlink.MAVLink_mission_ack_message(1, 1, 0, mission_type))
+        station.send(to_vehicle("MISSION_ACK", 0, mission_type))
 
 
 def _request(station: Any, message_id: int, kind: str) -> None:
@@ -280,7 +285,7 @@ def load_parameters(station: Any) -> dict[str, float]:
         # What comes next may be another one: still of the list, or asked for before.
         if not (missing := set(range(count)) - set(had())):
             break
-        read = mavlink.MAVLink_param_request_read_message(1, 1, b"", min(missing))
+        read = to_vehicle("PARAM_REQUEST_READ", b"", min(missing))
         station.ask(read, "PARAM_VALUE", retries=20, timeout_s=0.01)
     assert set(had()) == set(range(count))
     return {m.param_id: m.param_value for m in had().values()}
@@ -313,11 +318,11 @@ def item(seq: int, kind: int = MISSION, **changes: Any) -> Any:
 
 
 def count(number: int, kind: int = MISSION) -> Any:
-    return mavlink.MAVLink_mission_count_message(1, 1, number, kind)
+    return to_vehicle("MISSION_COUNT", number, kind)
 
 
 def request_item(seq: int, kind: int = MISSION) -> Any:
-    return mavlink.MAVLink_mission_request_int_message(1, 1, seq, kind)
+    return to_vehicle("MISSION_REQUEST_INT", seq, kind)
 
 
 def upload(station: Any, items: list[Any], kind: int = MISSION) -> int | None:
@@ -333,7 +338,7 @@ def upload(station: Any, items: list[Any], kind: int = MISSION) -> int | None:
 
 
 def download(station: Any, kind: int = MISSION) -> list[Any]:
-    listing = mavlink.MAVLink_mission_request_list_message(1, 1, kind)
+    listing = to_vehicle("MISSION_REQUEST_LIST", kind)
     [first, *_] = station.ask(listing, "MISSION_COUNT", retries=20)
     assert first.mission_type == kind
     items: dict[int, Any] = {}
@@ -346,7 +351,7 @@ def download(station: Any, kind: int = MISSION) -> list[Any]:
             if m.seq == seq:
                 items[seq] = m
     assert list(items) == list(range(first.count))
-    station.send(mavlink.MAVLink_mission_ack_message(1, 1, mavlink.MAV_MISSION_ACCEPTED, kind))
+    station.send(to_vehicle("MISSION_ACK", mavlink.MAV_MISSION_ACCEPTED, kind))
     return list(items.values())
 
 

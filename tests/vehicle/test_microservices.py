@@ -30,6 +30,7 @@ from tests.kit.ground_station import (
     qgroundcontrol,
     request_item,
     results,
+    to_vehicle,
 )
 
 ME = (1, 1)
@@ -39,11 +40,17 @@ FTP = "FILE_TRANSFER_PROTOCOL"
 
 param_set = partial(mavlink.MAVLink_param_set_message, *ME, param_type=9)
 param_read = partial(mavlink.MAVLink_param_request_read_message, *ME, param_index=-1)
+
+
+def valued(name: str, value: float) -> dict[str, Any]:
+    return {"param_id": name, "param_value": value}
+
+
 ACCEPTED = {"result": mavlink.MAV_RESULT_ACCEPTED}
 DENIED = {"result": mavlink.MAV_RESULT_DENIED}
 UNSUPPORTED = {"result": mavlink.MAV_RESULT_UNSUPPORTED}
 IN_PROGRESS = {"result": mavlink.MAV_RESULT_IN_PROGRESS}
-MISSION_UNSUPPORTED = {"type": mavlink.MAV_MISSION_UNSUPPORTED}
+REFUSED = {"type": mavlink.MAV_MISSION_UNSUPPORTED}
 UNKNOWN = {"error": mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST}
 HOME = (475_000_000, 85_000_000, 500.0)
 
@@ -63,9 +70,7 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "command/protocol-version": (command(519, 1), "PROTOCOL_VERSION", {}),
     "command/set-roi": (command_int(195, *HOME), ACK, ACCEPTED),
     "command/no-such-mission-item": (command(224, 7), ACK, DENIED),
-    "command/set-mode": (
-        mavlink.MAVLink_set_mode_message(1, 1, 4), ACK, DENIED | {"command": 176},
-    ),
+    "command/set-mode": (mavlink.MAVLink_set_mode_message(1, 1, 4), ACK, DENIED | {"command": 176}),
     "command/store": (command(245, 1), ACK, IN_PROGRESS),
     "command/start-recording": (command(2510), ACK, IN_PROGRESS),
     "command/stop-recording": (command(2511), ACK, ACCEPTED),
@@ -90,26 +95,22 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "modes/available": (command(512, 435, 0), "AVAILABLE_MODES", {}),
     "modes/current": (command(512, 436), "CURRENT_MODE", {}),
     # parameter.html: read by name or index, set and reported, unknown ones refused.
-    "parameter/list": (mavlink.MAVLink_param_request_list_message(*ME), "PARAM_VALUE", {}),
-    "parameter/read-name": (
-        param_read(b"RATE_ATT"), "PARAM_VALUE", {"param_id": "RATE_ATT", "param_value": 50.0},
-    ),
+    "parameter/list": (to_vehicle("PARAM_REQUEST_LIST"), "PARAM_VALUE", {}),
+    "parameter/read-name": (param_read(b"RATE_ATT"), "PARAM_VALUE", valued("RATE_ATT", 50.0)),
     "parameter/read-index": (param_read(b"", param_index=0), "PARAM_VALUE", {"param_index": 0}),
     "parameter/read-unknown": (param_read(b"NOPE"), "PARAM_ERROR", UNKNOWN),
-    "parameter/set": (
-        param_set(b"RATE_ATT", 5.0), "PARAM_VALUE", {"param_id": "RATE_ATT", "param_value": 5.0},
-    ),
+    "parameter/set": (param_set(b"RATE_ATT", 5.0), "PARAM_VALUE", valued("RATE_ATT", 5.0)),
     "parameter/set-out-of-range": (
-        param_set(b"RATE_ATT", -5.0), "PARAM_VALUE", {"param_id": "RATE_ATT", "param_value": 50.0},
+        param_set(b"RATE_ATT", -5.0), "PARAM_VALUE", valued("RATE_ATT", 50.0),
     ),
     "parameter/set-unknown": (param_set(b"NOPE", 1.0), "PARAM_ERROR", UNKNOWN),
     "parameter/set-of-home": (
-        param_set(b"HOME_ALT", 12.5), "PARAM_VALUE", {"param_id": "HOME_ALT", "param_value": 12.5},
+        param_set(b"HOME_ALT", 12.5), "PARAM_VALUE", valued("HOME_ALT", 12.5),
     ),
     # mission.html: the same for the three types.
     **{
         f"mission/list-{kind}": (
-            mavlink.MAVLink_mission_request_list_message(*ME, kind),
+            to_vehicle("MISSION_REQUEST_LIST", kind),
             "MISSION_COUNT", {"count": 0, "mission_type": kind},
         )
         for kind in (0, 1, 2)
@@ -119,32 +120,28 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "mission/no-such-item": (
         request_item(9), "MISSION_ACK", {"type": mavlink.MAV_MISSION_INVALID_SEQUENCE},
     ),
-    "mission/no-such-type": (
-        mavlink.MAVLink_mission_request_list_message(*ME, 7), "MISSION_ACK", MISSION_UNSUPPORTED,
-    ),
+    "mission/no-such-type": (to_vehicle("MISSION_REQUEST_LIST", 7), "MISSION_ACK", REFUSED),
     "mission/partial-download": (
-        mavlink.MAVLink_mission_request_partial_list_message(*ME, 0, 3, 0),
-        "MISSION_ACK", MISSION_UNSUPPORTED,
+        to_vehicle("MISSION_REQUEST_PARTIAL_LIST", 0, 3, 0),
+        "MISSION_ACK", REFUSED,
     ),
     "mission/partial-upload": (
-        mavlink.MAVLink_mission_write_partial_list_message(*ME, 0, 3, 0),
-        "MISSION_ACK", MISSION_UNSUPPORTED,
+        to_vehicle("MISSION_WRITE_PARTIAL_LIST", 0, 3, 0),
+        "MISSION_ACK", REFUSED,
     ),
     "mission/stray-item": (item(3), "MISSION_ACK", {"type": mavlink.MAV_MISSION_ERROR}),
     "mission/empty-upload": (
         count(0, 1), "MISSION_ACK", {"type": mavlink.MAV_MISSION_ACCEPTED, "mission_type": 1},
     ),
     "mission/older-request": (
-        mavlink.MAVLink_mission_request_message(*ME, 2, 0),
+        to_vehicle("MISSION_REQUEST", 2, 0),
         "MISSION_ACK", {"type": mavlink.MAV_MISSION_INVALID_SEQUENCE},
     ),
     "mission/clear": (
-        mavlink.MAVLink_mission_clear_all_message(*ME, 255),
+        to_vehicle("MISSION_CLEAR_ALL", 255),
         "MISSION_ACK", {"type": mavlink.MAV_MISSION_ACCEPTED},
     ),
-    "mission/set-current-none": (
-        mavlink.MAVLink_mission_set_current_message(*ME, 4), "STATUSTEXT", {},
-    ),
+    "mission/set-current-none": (to_vehicle("MISSION_SET_CURRENT", 4), "STATUSTEXT", {}),
     # ftp.html: an answer to every opcode, with the request's opcode in it.
     "ftp/open": (ftp_request(4, b"/general.json"), FTP, {"opcode": (128, 4)}),
     "ftp/packed-parameters": (
@@ -161,20 +158,17 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
     ),
     "timesync": (mavlink.MAVLink_timesync_message(0, 7), "TIMESYNC", {"ts1": 7}),
     # log.html
-    "log/list": (
-        mavlink.MAVLink_log_request_list_message(*ME, 0, 0xFFFF),
-        "LOG_ENTRY", {"id": 0, "num_logs": 0},
-    ),
+    "log/list": (to_vehicle("LOG_REQUEST_LIST", 0, 0xFFFF), "LOG_ENTRY", {"id": 0, "num_logs": 0}),
     "log/data": (
-        mavlink.MAVLink_log_request_data_message(*ME, 3, 90, 90),
+        to_vehicle("LOG_REQUEST_DATA", 3, 90, 90),
         "LOG_DATA", {"id": 3, "ofs": 90, "count": 0},
     ),
     # parameter_ext.html: there are none.
     "parameter-ext/list": (
-        mavlink.MAVLink_param_ext_request_list_message(*ME), "PARAM_EXT_VALUE", {"param_count": 0},
+        to_vehicle("PARAM_EXT_REQUEST_LIST"), "PARAM_EXT_VALUE", {"param_count": 0},
     ),
     "parameter-ext/set": (
-        mavlink.MAVLink_param_ext_set_message(*ME, b"X", b"1", 1),
+        to_vehicle("PARAM_EXT_SET", b"X", b"1", 1),
         "PARAM_EXT_ACK", {"param_result": mavlink.PARAM_ACK_FAILED},
     ),
     # terrain.html: spacing 0 is "not available here".
@@ -182,7 +176,7 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
         mavlink.MAVLink_terrain_check_message(471_234_567, -87_654_321),
         "TERRAIN_REPORT", {"lat": 471_234_567, "lon": -87_654_321, "spacing": 0, "pending": 0},
     ),
-    "signing/setup": (mavlink.MAVLink_setup_signing_message(*ME, [7] * 32, 0), "STATUSTEXT", {}),
+    "signing/setup": (to_vehicle("SETUP_SIGNING", [7] * 32, 0), "STATUSTEXT", {}),
     "origin/set": (
         mavlink.MAVLink_set_gps_global_origin_message(1, 0, 0, 0),
         "GPS_GLOBAL_ORIGIN", {"latitude": 471_234_567},
@@ -240,8 +234,8 @@ def test_messages_for_other_systems_are_ignored(
     station: GroundStation, target: tuple[int, int]
 ) -> None:
     assert station.command(31_999, target=target) == []
-    assert station.send(mavlink.MAVLink_param_request_list_message(*target)) == []
-    assert station.send(mavlink.MAVLink_mission_request_list_message(*target, 0)) == []
+    assert station.send(to_vehicle("PARAM_REQUEST_LIST", target=target)) == []
+    assert station.send(to_vehicle("MISSION_REQUEST_LIST", 0, target=target)) == []
 
 
 @pytest.mark.parametrize("target", [(0, 0), (1, 0), (0, 1), (1, 1)])

@@ -25,6 +25,7 @@ from tests.kit.ground_station import (
     of_kind,
     results,
     texts,
+    to_vehicle,
 )
 from tests.kit.records import STATE
 
@@ -45,7 +46,7 @@ def test_companion_that_shares_the_system_id_is_answered(
     assert version.get_type() == "AUTOPILOT_VERSION"
     station.mav.srcComponent = 1
     assert station.request(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == []
-    assert station.send(mavlink.MAVLink_param_request_list_message(1, 1)) == []
+    assert station.send(to_vehicle("PARAM_REQUEST_LIST")) == []
     assert station.vehicle.faults["own id"] == 2
 
 
@@ -178,30 +179,23 @@ SET_HOME_POSITION = mavlink.MAVLink_set_home_position_message(
 )
 FTP = "FILE_TRANSFER_PROTOCOL"
 REQUESTS: dict[str, tuple[Any, tuple[str, str] | None]] = {
-    "message": (
-        command(512, 12_345), ("COMMAND_LONG REQUEST_MESSAGE 12345", "UNSUPPORTED"),
-    ),
+    "message": (command(512, 12_345), ("COMMAND_LONG REQUEST_MESSAGE 12345", "UNSUPPORTED")),
     "name": (
-        mavlink.MAVLink_param_request_read_message(1, 1, b"[red]\x1b\n", -1),
+        to_vehicle("PARAM_REQUEST_READ", b"[red]\x1b\n", -1),
         ("PARAM_REQUEST_READ ?red??", "DOES_NOT_EXIST"),
     ),
-    "list": (
-        mavlink.MAVLink_mission_request_list_message(1, 1, 7),
-        ("MISSION_REQUEST_LIST", "UNSUPPORTED"),
-    ),
-    "no such file": (
-        ftp_request(4, b"/nothing"), (f"{FTP} OPENFILERO /nothing", "FILENOTFOUND"),
-    ),
+    "list": (to_vehicle("MISSION_REQUEST_LIST", 7), ("MISSION_REQUEST_LIST", "UNSUPPORTED")),
+    "no such file": (ftp_request(4, b"/nothing"), (f"{FTP} OPENFILERO /nothing", "FILENOTFOUND")),
     "home": (SET_HOME_POSITION, ("SET_HOME_POSITION", "no answer")),
     "arm": (command(400, 1), ("COMMAND_LONG COMPONENT_ARM_DISARM", "DENIED")),
     "joystick": (
-        mavlink.MAVLink_rc_channels_override_message(1, 1, *[1500] * 8),
+        to_vehicle("RC_CHANNELS_OVERRIDE", *[1500] * 8),
         ("RC_CHANNELS_OVERRIDE", "no answer"),
     ),
     # The normal end of a protocol is no failure.
     "end of list": (ftp_request(mavlink.MAV_FTP_OPCODE_LISTDIRECTORY, b"/", offset=1000), None),
     "end of session": (ftp_request(mavlink.MAV_FTP_OPCODE_TERMINATESESSION), None),
-    "end of logs": (mavlink.MAVLink_log_request_end_message(1, 1), None),
+    "end of logs": (to_vehicle("LOG_REQUEST_END"), None),
     "answer": (mavlink.MAVLink_command_ack_message(32100, 0, 0, 0, 1, 1), None),
 }  # fmt: skip
 
@@ -223,7 +217,7 @@ def test_failed_request_is_logged_once_with_a_count(station: GroundStation, name
 def test_only_failed_requests_are_logged(station: GroundStation) -> None:
     station.request(148)
     station.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
-    station.send(mavlink.MAVLink_param_request_read_message(1, 1, b"RATE_ATT", -1))
+    station.send(to_vehicle("PARAM_REQUEST_READ", b"RATE_ATT", -1))
     assert station.vehicle.requests.entries == ()
     station.trusted = False
     station.set_parameter("RATE_ATT", 7.0)

@@ -23,6 +23,7 @@ from tests.kit.ground_station import (
     item,
     kinds,
     of_kind,
+    to_vehicle,
     upload,
 )
 from tests.kit.records import FIX, STATE
@@ -34,11 +35,11 @@ REQUESTS = ("MISSION_REQUEST_INT", "MISSION_REQUEST")
 
 
 def ack(result: int) -> Any:
-    return mavlink.MAVLink_mission_ack_message(1, 1, result, MISSION)
+    return to_vehicle("MISSION_ACK", result, MISSION)
 
 
 def old_request(seq: int) -> Any:
-    return mavlink.MAVLink_mission_request_message(1, 1, seq, MISSION)
+    return to_vehicle("MISSION_REQUEST", seq, MISSION)
 
 
 def old_item(lat: float, seq: int = 0, lon: float = -8.7) -> Any:
@@ -48,11 +49,11 @@ def old_item(lat: float, seq: int = 0, lon: float = -8.7) -> Any:
 
 
 def clear(kind: int = MISSION) -> Any:
-    return mavlink.MAVLink_mission_clear_all_message(1, 1, kind)
+    return to_vehicle("MISSION_CLEAR_ALL", kind)
 
 
 def set_current(seq: int) -> Any:
-    return mavlink.MAVLink_mission_set_current_message(1, 1, seq)
+    return to_vehicle("MISSION_SET_CURRENT", seq)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -100,7 +101,7 @@ def test_client_that_refuses_the_older_form_is_asked_in_the_int_form_again(
 
 def test_items_of_mavlink_1_are_stored_and_returned_as_floats(station: GroundStation) -> None:
     station.version = 1
-    station.send(mavlink.MAVLink_mission_count_message(1, 1, 1))
+    station.send(to_vehicle("MISSION_COUNT", 1))
     assert station.send(old_item(47.1))[0].type == ACCEPTED
     [found] = station.send(old_request(0))
     assert found.get_type() == "MISSION_ITEM"
