@@ -18,9 +18,7 @@ RECOVERED_M = 4.0
 
 @pytest.mark.slow
 @pytest.mark.parametrize("begin_s", [60.0, 90.0, 120.0, 150.0])
-def test_position_after_a_gap_moves_to_the_fixes_without_a_step(
-    flight: Flight, begin_s: float
-) -> None:
+def test_position_after_a_gap_moves_to_fixes_without_a_step(flight: Flight, begin_s: float) -> None:
     middle_us, half_us = (begin_s + GAP_S / 2) * 1e6, GAP_S / 2 * 1e6
     log, kept = selected(flight.log, lambda us: np.abs(us - middle_us) > half_us)
     estimator = estimator_of(flight)

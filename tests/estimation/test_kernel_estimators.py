@@ -228,9 +228,7 @@ class TestInvalidData:
         assert states[-1].q_nb[0] > 0.99
         assert NavFlags.USING_GPS | NavFlags.POSITION_VALID in states[100].flags
 
-    def test_stuck_gyroscope_is_reported_until_it_recovers(
-        self, estimator: KernelEstimator
-    ) -> None:
+    def test_stuck_gyroscope_is_reported_until_recovery(self, estimator: KernelEstimator) -> None:
         feed(estimator, still(0, 3.0))
         stuck = [replace(s, gyro_b_radps=(0.3, 0.0, 0.0)) for s in still(3_000_000, 6.0)]
         states = feed(estimator, stuck)

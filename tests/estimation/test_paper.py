@@ -52,9 +52,7 @@ class TestGainEnds:
         assert to_euler(state.q_nb)[:2] == pytest.approx((0.3, 0.1), abs=1e-9)
 
     @pytest.mark.parametrize(("gain", "north_m"), [(0.0, 7.0), (1.0, 0.0)])
-    def test_position_gain_selects_fix_or_integrated_position(
-        self, gain: float, north_m: float
-    ) -> None:
+    def test_position_gain_selects_fix_or_integration(self, gain: float, north_m: float) -> None:
         estimator = make(alpha_accel=0.0, beta_velocity=gain)
         run(estimator, [imu(t) for t in times(0.5)])
         estimator.update_gps(fix(500_000))
@@ -62,9 +60,7 @@ class TestGainEnds:
         assert metres(run(estimator, [imu(510_000)]))[0] == pytest.approx(north_m, abs=0.02)
 
     @pytest.mark.parametrize(("gain", "north_mps"), [(0.0, 4.0), (1.0, 0.0)])
-    def test_velocity_gain_selects_gps_or_integrated_velocity(
-        self, gain: float, north_mps: float
-    ) -> None:
+    def test_velocity_gain_selects_gps_or_integration(self, gain: float, north_mps: float) -> None:
         estimator = make(alpha_accel=gain)
         run(estimator, [imu(t) for t in times(0.5)])
         estimator.update_gps(fix(500_000))

@@ -48,9 +48,7 @@ def test_sensors_without_a_calibration_are_marked(chain: SensorChain) -> None:
     ],
     ids=["old", "absent", "overflow", "blank"],
 )
-def test_sample_without_a_new_field_has_no_magnetometer_value(
-    chain: SensorChain, raw: ImuRaw
-) -> None:
+def test_sample_without_a_new_field_has_no_magnetic_value(chain: SensorChain, raw: ImuRaw) -> None:
     assert chain.imu(raw).mag_b_ut is None
 
 
@@ -62,9 +60,7 @@ def test_payload_after_a_sensor_reset_has_no_values(chain: SensorChain) -> None:
 @pytest.mark.parametrize(
     ("pressure_pa", "alt_m"), [(101_325.0, 0.0), (89_874.6, 1000.0), (54_019.9, 5000.0)]
 )
-def test_pressure_altitude_is_that_of_the_standard_atmosphere(
-    pressure_pa: float, alt_m: float
-) -> None:
+def test_pressure_altitude_is_that_of_standard_atmosphere(pressure_pa: float, alt_m: float) -> None:
     assert pressure_altitude_m(pressure_pa) == pytest.approx(alt_m, abs=0.5)
 
 

@@ -200,9 +200,7 @@ class TestThroughTheWire:
     ("start_unix_us", "years"),
     [(0, set()), (-(10**15), set()), (10**18, {2254}), (8 * 10**15, {2223})],
 )
-def test_impossible_start_time_is_limited_to_range_of_gps(
-    start_unix_us: int, years: set[int]
-) -> None:
+def test_impossible_start_time_is_limited_to_gps_range(start_unix_us: int, years: set[int]) -> None:
     """A clock that was never set gives the year 2000, which is rejected."""
     line = simulate(settings(gps_first_fix_s=0.5), start_unix_us).frames(3.0)
     records, report = feed(list(line))

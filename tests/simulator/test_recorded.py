@@ -77,9 +77,7 @@ class TestThroughTheWire:
         half_count = np.radians(0.51 / lsb_per_dps)
         np.testing.assert_allclose(gyro, flight.gyro_b_radps, atol=half_count)
 
-    def test_magnetometer_is_held_until_new(
-        self, flight: RecordedFlight, records: list[RawRecord]
-    ) -> None:
+    def test_magnetometer_is_held(self, flight: RecordedFlight, records: list[RawRecord]) -> None:
         imu = [r for r in records if isinstance(r, ImuRaw)]
         new = np.array([bool(r.flags & ImuFlags.MAG_NEW) for r in imu])
         np.testing.assert_array_equal(new, np.isfinite(flight.mag_b_ut[:, 0]))
@@ -96,9 +94,7 @@ class TestThroughTheWire:
         recorded = flight.baro_alt_m[np.isfinite(flight.baro_alt_m)]
         np.testing.assert_allclose(heights, recorded, atol=0.002)
 
-    def test_fixes_agree_with_the_recording(
-        self, flight: RecordedFlight, records: list[RawRecord]
-    ) -> None:
+    def test_fixes_equal_recording(self, flight: RecordedFlight, records: list[RawRecord]) -> None:
         fixes = [r for r in records if isinstance(r, GpsFix)]
         lat = [r.lat_dege7 * 1e-7 for r in fixes]
         np.testing.assert_allclose(lat, flight.gps_lat_deg, atol=1e-7)
@@ -129,9 +125,7 @@ class TestRanges:
     @pytest.mark.parametrize(
         ("peak_mps2", "range_g"), [(15.0, 2), (25.0, 4), (60.0, 8), (150.0, 16), (900.0, 16)]
     )
-    def test_finest_range_that_holds_the_peak_is_chosen(
-        self, peak_mps2: float, range_g: int
-    ) -> None:
+    def test_finest_range_that_holds_a_peak_is_chosen(self, peak_mps2: float, range_g: int) -> None:
         calm = np.zeros(ROWS)
         ax = calm.copy()
         ax[10] = -peak_mps2

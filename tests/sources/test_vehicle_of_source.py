@@ -201,9 +201,7 @@ def test_faults_are_counted_with_the_newest_explained(flight: Flight) -> None:
         ("lines:file:/tmp/a:b", "file", "/tmp/a:b", 0),
     ],
 )
-def test_url_has_kind_transport_and_address(
-    url: str, transport: str, address: str, port: int
-) -> None:
+def test_url_has_transport_and_address(url: str, transport: str, address: str, port: int) -> None:
     found = parse_source(url)
     parts = (found.kind, found.transport, found.address, found.port)
     assert parts == ("lines", transport, address, port)

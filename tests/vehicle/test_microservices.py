@@ -192,9 +192,7 @@ def answers(message: Any, field: str) -> Any:
 
 @pytest.mark.parametrize("loss", [0.0, 0.33])
 @pytest.mark.parametrize("row", TABLE)
-def test_every_request_gets_the_answer_of_its_page(
-    station: GroundStation, row: str, loss: float
-) -> None:
+def test_each_request_gets_its_answer(station: GroundStation, row: str, loss: float) -> None:
     request, kind, fields = TABLE[row]
     rng = np.random.default_rng([*row.encode()])
     station.loses = lambda *_: rng.random() < loss
@@ -215,9 +213,7 @@ SENT_TO_ALL = {
 
 
 @pytest.mark.parametrize("row", TABLE)
-def test_answer_is_sent_once_and_to_the_requesting_client_only(
-    station: GroundStation, row: str
-) -> None:
+def test_answer_is_sent_once_and_to_its_client_only(station: GroundStation, row: str) -> None:
     request, kind, _ = TABLE[row]
     found = station.send(request)
     # A list comes in tens; with home's height goes who set it.
@@ -251,9 +247,7 @@ def test_answers_to_ping_and_timesync_are_not_answered(station: GroundStation) -
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_qgroundcontrol_connects_in_less_than_a_second(
-    station: GroundStation, version: int
-) -> None:
+def test_qgroundcontrol_connects_within_a_second(station: GroundStation, version: int) -> None:
     station.version = version
     began_us = station.clock.now_us
     qgroundcontrol(station)

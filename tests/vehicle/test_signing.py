@@ -115,9 +115,7 @@ def test_forged_frame_does_not_lock_out_the_true_sender(station: GroundStation) 
 
 
 @pytest.mark.parametrize("position", [3, 5, 10, 20, -1, -7, -13])
-def test_signed_frame_with_a_changed_byte_is_rejected(
-    station: GroundStation, position: int
-) -> None:
+def test_signed_frame_with_changed_byte_is_rejected(station: GroundStation, position: int) -> None:
     sign(station)
     frame = bytearray(station.frame(SET))
     frame[position] ^= 0x01

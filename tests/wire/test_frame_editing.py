@@ -107,9 +107,7 @@ def test_bytes_of_other_fields_are_preserved() -> None:
         ({"lat": [1, 2]}, r"GLOBAL_POSITION_INT.lat: \[1, 2\]"),
     ],
 )
-def test_field_that_does_not_exist_or_fit_raises_value_error(
-    fields: dict[str, Any], error: str
-) -> None:
+def test_field_that_is_absent_or_too_large_is_an_error(fields: dict[str, Any], error: str) -> None:
     with pytest.raises(ValueError, match=error):
         edit_frame(frame(POSITION), fields=fields)
 

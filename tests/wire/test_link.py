@@ -175,9 +175,7 @@ def test_node_restart_is_counted_and_loses_no_payload() -> None:
 
 
 @pytest.mark.parametrize(("next_seq", "restarts"), [(200, 0), (0, 1)], ids=["halted", "restarted"])
-def test_halted_clock_is_a_restart_only_if_the_sequence_starts_again(
-    next_seq: int, restarts: int
-) -> None:
+def test_halted_clock_is_a_restart_only_if_sequence_restarts(next_seq: int, restarts: int) -> None:
     line, link = Line(), Link()
     line.send(link, range(200), 100_000_000)
     line.seq = next_seq

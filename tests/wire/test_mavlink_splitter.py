@@ -32,8 +32,11 @@ V2_COMMAND = packed(COMMAND, 7)
 V1 = packed(HEARTBEAT, 7, version=1)
 UNKNOWN = b"\xfd\x02\x00\x00\x05\x07\x01\xff\xff\x7f\x01\x02\xaa\xbb"
 FRAMES = {
-    "version 2": V2, "signed": V2_SIGNED, "command": V2_COMMAND,
-    "version 1": V1, "unknown": UNKNOWN,
+    "version 2": V2,
+    "signed": V2_SIGNED,
+    "command": V2_COMMAND,
+    "version 1": V1,
+    "unknown": UNKNOWN,
 }
 
 

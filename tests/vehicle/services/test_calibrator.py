@@ -237,9 +237,7 @@ def test_second_calibration_is_temporarily_rejected(station: GroundStation) -> N
 @pytest.mark.parametrize(
     "params", [(1, 1), (2,), (0, 0, 1), (0, 0, 0, 1), (0,) * 6 + (1,), (1, 0, 0, 0, 2)]
 )
-def test_unknown_calibration_is_unsupported(
-    station: GroundStation, params: tuple[int, ...]
-) -> None:
+def test_unknown_calibration_is_refused(station: GroundStation, params: tuple[int, ...]) -> None:
     assert results(station.command(CALIBRATE, *params)) == [UNSUPPORTED]
 
 

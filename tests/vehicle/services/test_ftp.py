@@ -146,9 +146,7 @@ def test_crc_of_a_file_is_that_of_mavlink_ftp(ftp: FtpClient) -> None:
 @pytest.mark.parametrize(
     "path", [b"@SYS/threads.txt", b"@PARAM", b"/../general.json", b"/general.json/x", b"/general"]
 )
-def test_missing_path_is_refused_with_session_and_opcode_echoed(
-    ftp: FtpClient, path: bytes
-) -> None:
+def test_missing_path_is_refused_with_session_and_opcode(ftp: FtpClient, path: bytes) -> None:
     """A client without an answer repeats its request for a quarter of a minute."""
     request = ftp.packet(Opcode.OPEN_FILE_RO, path, session=5)
     [answer] = ftp.send(request)
@@ -169,9 +167,7 @@ def test_missing_path_is_refused_with_session_and_opcode_echoed(
         (128, FtpError.UNKNOWN_COMMAND),
     ],
 )
-def test_unsupported_request_is_refused_with_its_error(
-    ftp: FtpClient, opcode: int, error: FtpError
-) -> None:
+def test_unsupported_request_has_its_error(ftp: FtpClient, opcode: int, error: FtpError) -> None:
     answer = ftp.ask(opcode, b"/x", session=3)
     assert (refusal(answer), answer.request_opcode, answer.session) == (error, opcode, 3)
 

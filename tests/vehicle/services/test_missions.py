@@ -57,9 +57,7 @@ def set_current(seq: int) -> Any:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_items_are_uploaded_and_downloaded_over_a_lossy_link(
-    station: GroundStation, seed: int
-) -> None:
+def test_items_are_uploaded_and_read_over_a_lossy_link(station: GroundStation, seed: int) -> None:
     rng = np.random.default_rng(seed)
     station.loses = lambda *_: rng.random() < 0.15
     items = [item(seq) for seq in range(20)]
@@ -67,9 +65,7 @@ def test_items_are_uploaded_and_downloaded_over_a_lossy_link(
     assert [content(m) for m in download(station)] == [content(m) for m in items]
 
 
-def test_client_without_the_int_form_is_asked_and_answered_in_the_older_one(
-    station: GroundStation,
-) -> None:
+def test_client_without_the_int_form_is_served_in_the_older_one(station: GroundStation) -> None:
     """DroneKit ignores MISSION_REQUEST_INT, and reads MISSION_ITEM only."""
     station.send(count(2))
     station.wait(0.9)
@@ -89,9 +85,7 @@ def test_client_of_the_int_form_is_never_answered_in_the_older_one(station: Grou
     assert kinds(station.other(9).send(old_request(0))) == ["MISSION_ITEM"]
 
 
-def test_client_that_refuses_the_older_form_is_asked_in_the_int_form_again(
-    station: GroundStation,
-) -> None:
+def test_client_that_refuses_the_older_form_gets_the_int_form(station: GroundStation) -> None:
     """MAVSDK answers MISSION_REQUEST by MISSION_ACK unsupported."""
     station.send(count(1))
     station.wait(0.9)
@@ -274,9 +268,7 @@ def mark(station: GroundStation, *location: float) -> Any:
     return to_mark(station)
 
 
-def test_distance_and_bearing_to_the_mark_are_those_on_the_ellipsoid(
-    station: GroundStation,
-) -> None:
+def test_distance_and_bearing_to_the_mark_are_ellipsoidal(station: GroundStation) -> None:
     """A tenth of a degree north of 47.1 is 11118 m by the ellipsoid."""
     assert to_mark(station) is None
     found = mark(station, STATE.lat_deg + 0.1, STATE.lon_deg, 623.456)

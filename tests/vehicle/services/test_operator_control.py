@@ -52,9 +52,7 @@ def statuses(station: GroundStation, since: int = 0) -> list[tuple[int, int]]:
     return [(frame[10], frame[11] if frame[1] > 1 else 0) for frame in frames]
 
 
-def test_station_without_control_changes_nothing(
-    first: GroundStation, second: GroundStation
-) -> None:
+def test_station_without_control_is_refused(first: GroundStation, second: GroundStation) -> None:
     assert not changes(first)
     assert control(first) == ACCEPTED
     assert changes(first)
@@ -197,9 +195,7 @@ def test_release_of_either_definition_is_understood(
     assert not changes(first)
 
 
-def test_request_that_both_definitions_allow_is_read_by_the_present_one(
-    first: GroundStation,
-) -> None:
+def test_ambiguous_request_is_read_by_the_present_definition(first: GroundStation) -> None:
     """System 10 releases control; formerly this was a request with a timeout of 10 s."""
     tenth = first.other(system_id=10)
     control(tenth)

@@ -38,9 +38,7 @@ def read(name: str, index: int = -1) -> mavlink.MAVLink_param_request_read_messa
         ("compass", "norm_tolerance", "", "COMPASS_NORM_TOL"),
     ],
 )
-def test_parameter_name_is_abbreviated_from_the_keys(
-    section: str, key: str, axis: str, name: str
-) -> None:
+def test_parameter_name_is_abbreviated_keys(section: str, key: str, axis: str, name: str) -> None:
     assert parameter_name(section, key, axis) == name
 
 
@@ -53,9 +51,7 @@ def test_list_contains_numbers_switches_and_choices_but_no_texts(station: Ground
     assert not any("SHAPE" in name or "PASS" in name for name in found), "texts are none"
 
 
-def test_parameter_list_is_paced_and_sent_to_the_requesting_client_only(
-    station: GroundStation,
-) -> None:
+def test_parameter_list_is_paced_and_sent_to_its_client_only(station: GroundStation) -> None:
     first = station.send(mavlink.MAVLink_param_request_list_message(1, 1))
     assert len(first) == 10
     assert station.vehicle.next_due_us() <= station.clock.now_us + 10_000
@@ -89,9 +85,7 @@ def test_change_takes_effect_and_is_sent_to_every_client_that_requested_paramete
     assert load_parameters(other)[name] == pytest.approx(sent)
 
 
-def test_change_is_only_recorded_while_no_client_has_requested_parameters(
-    station: GroundStation,
-) -> None:
+def test_change_is_only_recorded_before_a_client_asks_for_any(station: GroundStation) -> None:
     """QGroundControl takes any PARAM_VALUE for the beginning of the list that it requested."""
     found = station.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 47.5, 8.5, 500.0)
     assert "PARAM_VALUE" not in kinds(found)
@@ -121,9 +115,7 @@ def test_changed_rate_takes_effect_at_once(station: GroundStation) -> None:
         *(("TUNING_ORDER", 9.0), ("VEH_TYPE", 99.0), ("VEH_TYPE", -1.0)),
     ],
 )
-def test_value_out_of_range_changes_nothing(
-    station: GroundStation, name: str, value: float
-) -> None:
+def test_value_out_of_range_is_refused(station: GroundStation, name: str, value: float) -> None:
     before = load_parameters(station)
     error, answer = station.set_parameter(name, value)
     assert (answer.param_id, answer.param_value) == (name, pytest.approx(before[name]))
@@ -134,9 +126,7 @@ def test_value_out_of_range_changes_nothing(
 
 
 @pytest.mark.parametrize(("form", "code"), [("INT32", "<i"), ("UINT8", "<Bxxx"), ("INT16", "<hxx")])
-def test_integers_encoded_byte_wise_are_understood(
-    station: GroundStation, form: str, code: str
-) -> None:
+def test_integers_encoded_bytewise_are_read(station: GroundStation, form: str, code: str) -> None:
     kind = getattr(mavlink, f"MAV_PARAM_TYPE_{form}")
     [encoded] = struct.unpack("<f", struct.pack(code, 5))
     [value] = station.set_parameter("TUNING_ORDER", encoded, kind)

@@ -55,9 +55,7 @@ def test_recording_that_waits_for_arming_is_not_shown_as_switched_off(health: He
     assert all(bits & LOGGING for bits in health.sensors(NOW_US))
 
 
-def test_radio_status_has_the_weakest_signal_and_none_without_a_measurement(
-    health: Health,
-) -> None:
+def test_radio_status_has_the_weakest_measured_signal_if_any(health: Health) -> None:
     health.on_link(report(link(IMU_NODE), link(GPS_NODE)))
     assert health.radio_status(0) is None
     strong, weak = RadioSignal(-60, 10.0), RadioSignal(-121, -7.25)

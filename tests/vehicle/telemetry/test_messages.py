@@ -245,13 +245,7 @@ def test_heading_of_vfr_hud_is_in_whole_degrees() -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        {"pdop": NAN},
-        {"h_acc_m": NAN},
-        {"h_acc_m": 0.0, "v_acc_m": 0.0},
-        {"fix_ok": False},
-    ],
+    "change", [{"pdop": NAN}, {"h_acc_m": NAN}, {"h_acc_m": 0.0, "v_acc_m": 0.0}, {"fix_ok": False}]
 )
 def test_dilutions_are_unknown_without_a_fix_or_its_accuracy(change: dict[str, Any]) -> None:
     found = through_the_wire(messages.gps_raw_int(replace(FIX, **change)))

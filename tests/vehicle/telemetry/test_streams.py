@@ -24,14 +24,9 @@ def sample_times(
 
 @pytest.mark.parametrize(
     ("sample_hz", "wanted_hz"),
-    [
-        *((hz, 50) for hz in (200, 100, 60, 1000, 71.3, 50, 40, 5)),
-        *((333, 10), (60, 10), (60, 40)),
-    ],
+    [*((hz, 50) for hz in (200, 100, 60, 1000, 71.3, 50, 40, 5)), *((333, 10), (60, 10), (60, 40))],
 )
-def test_rate_is_the_lower_of_the_requested_and_the_sample_rate(
-    sample_hz: float, wanted_hz: float
-) -> None:
+def test_rate_is_the_lower_of_requested_and_sample_rate(sample_hz: float, wanted_hz: float) -> None:
     times = sample_times(sample_hz, 60.0, jitter_us=0.05e6 / sample_hz)
     found = sent(Stream(interval_us(wanted_hz)), times)
     assert found.size / 60.0 == pytest.approx(min(sample_hz, wanted_hz), rel=0.01)
@@ -39,9 +34,7 @@ def test_rate_is_the_lower_of_the_requested_and_the_sample_rate(
 
 @pytest.mark.parametrize("skew_ppm", [-300.0, 0.0, 300.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_every_fourth_sample_is_sent_despite_clock_skew_and_jitter(
-    skew_ppm: float, seed: int
-) -> None:
+def test_every_fourth_sample_is_sent_despite_skew_and_jitter(skew_ppm: float, seed: int) -> None:
     times = sample_times(200.0 * (1.0 + skew_ppm * 1e-6), 120.0, jitter_us=1000.0, seed=seed)
     found = np.searchsorted(times, sent(Stream(20_000), times))
     assert set(np.diff(found[50:])) == {4}
