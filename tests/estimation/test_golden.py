@@ -23,6 +23,5 @@ def test_golden_flight(estimator: str) -> None:
     found_names, found = table(fused(GOLDEN / "take_off.csv.gz", estimator))
     assert found_names == names
     for column, name in enumerate(names):
-        np.testing.assert_allclose(
-            found[:, column], expected[:, column], rtol=0, atol=1e-6, err_msg=name
-        )
+        both = found[:, column], expected[:, column]
+        np.testing.assert_allclose(*both, rtol=0, atol=1e-6, err_msg=name)

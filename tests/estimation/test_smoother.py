@@ -56,10 +56,8 @@ def test_backward_pass_equals_joint_least_squares() -> None:
 def test_smoothing_halves_the_error_of_outages(flight: Flight) -> None:
     filtered, smoothed = run_eskf(flight), run_smoothed(flight)
     assert smoothed.shape == (len(flight.log.imu), col.NAV_COLUMNS)
-    assert (
-        attitude_scores(flight, smoothed[:, :4])["yaw"]
-        < attitude_scores(flight, filtered[:, :4])["yaw"]
-    )
+    yaws = [attitude_scores(flight, out[:, :4])["yaw"] for out in (smoothed, filtered)]
+    assert yaws[0] < yaws[1]
     assert outage_score(flight, run_smoothed, 10.0) < 2.0
     assert outage_score(flight, run_smoothed, 10.0) < 0.5 * outage_score(flight, run_eskf, 10.0)
     std = slice(col.NAV_ATTITUDE_STD, col.NAV_ATTITUDE_STD + 3)
@@ -77,16 +75,13 @@ def test_wrong_latency_is_replaced_for_the_whole_flight(
     flight: Flight, set_s: float, used_s: float
 ) -> None:
     """The filter finds it on the way; the smoother knows it from the beginning."""
-    set_so = replace(
-        flight, reference=msgspec.structs.replace(flight.reference, gps_latency_s=set_s)
-    )
+    reference = msgspec.structs.replace(flight.reference, gps_latency_s=set_s)
+    set_so = replace(flight, reference=reference)
     found, latency_s = smooth(estimator_of(set_so), flight.log)
     assert latency_s == pytest.approx(used_s, abs=0.0 if set_s == used_s else 0.015)
     right = run_smoothed(flight)
     early = replace(flight, counts=flight.counts & (flight.log.imu_time_us < 80e6))
-    off_m, right_off_m = (
-        rms(position_errors_m(early, out)[early.counts]) for out in (found, right)
-    )
+    off_m, right_off_m = (rms(position_errors_m(early, o)[early.counts]) for o in (found, right))
     assert off_m < right_off_m + 0.3
     off_deg, right_deg = (attitude_scores(early, out[:, :4])["total"] for out in (found, right))
     assert off_deg < right_deg + 0.3
@@ -123,10 +118,8 @@ def test_position_restart_keeps_the_attitude_smoothed(flight: Flight) -> None:
     filtered, smoothed = run_eskf(moved), run_smoothed(moved)
     relock = int(np.nanargmax(np.diff(filtered[:, col.NAV_LAT])))
     assert np.degrees(500.0 / 6.4e6) < np.diff(smoothed[:, col.NAV_LAT])[relock]
-    before, std = (
-        slice(relock - 100, relock - 20),
-        slice(col.NAV_ATTITUDE_STD, col.NAV_ATTITUDE_STD + 3),
-    )
+    before = slice(relock - 100, relock - 20)
+    std = slice(col.NAV_ATTITUDE_STD, col.NAV_ATTITUDE_STD + 3)
     assert (smoothed[before, std] < np.array([1.1, 1.1, 1.0]) * filtered[before, std]).all()
     assert (filtered[before, std][:, :2] < math.radians(0.6)).all()
 
@@ -163,17 +156,14 @@ def test_smoothed_real_fixed_wing_flight_has_small_errors(data_dir) -> None:
 def test_smoothing_reduces_errors_of_real_car(data_dir) -> None:
     """Long parked without a heading; then GPS velocities 0.12 s behind the positions."""
     flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
-    live, smoothed = (
-        rms(position_errors_m(flight, run(flight))) for run in (run_eskf, run_smoothed)
-    )
+    live, smoothed = (rms(position_errors_m(flight, f(flight))) for f in (run_eskf, run_smoothed))
     assert smoothed < live
     assert outage_score(flight, run_smoothed, 10.0) < outage_score(flight, run_eskf, 10.0)
     fixes_s = flight.log.gps_time_us * 1e-6
     gap = flight.with_gps(np.abs(fixes_s - fixes_s.mean()) > 40.0)
     live, smoothed = run_eskf(gap), run_smoothed(gap)
-    valid = [
-        out[:, col.NAV_FLAGS].astype(int) & col.FLAG.HEADING_VALID != 0 for out in (live, smoothed)
-    ]
+    flags = [out[:, col.NAV_FLAGS].astype(int) for out in (live, smoothed)]
+    valid = [each & col.FLAG.HEADING_VALID != 0 for each in flags]
     assert valid[1].sum() > valid[0].sum()
     sure = smoothed[:, col.NAV_ATTITUDE_STD + 2] < col.HEADING_VALID_RAD
     np.testing.assert_array_equal(valid[1], sure)

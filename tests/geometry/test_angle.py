@@ -7,13 +7,8 @@ from gateway.geometry.angle import wrap_180, wrap_pi
 
 
 def test_angles_wrap_the_short_way_round() -> None:
-    assert [wrap_180(a) for a in (180.0, -180.0, 359.0, -181.0, 541.0)] == [
-        -180,
-        -180,
-        -1,
-        179,
-        -179,
-    ]
+    found = [wrap_180(a) for a in (180.0, -180.0, 359.0, -181.0, 541.0)]
+    assert found == [-180, -180, -1, 179, -179]
     assert wrap_pi(math.radians(359.0)) == pytest.approx(math.radians(-1.0))
 
 

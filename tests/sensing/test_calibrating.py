@@ -421,9 +421,8 @@ def test_known_heading_gives_the_hard_iron(yaw_deg: float) -> None:
     samples = pose(np.array(rotate_inverse(q_nb, (0.0, 0.0, -G))) - ACCEL_BIAS)
     offset = np.array([9.0, 8.0, 7.0])
     samples = replace(samples, mag_time_s=samples.time_s, mag=np.tile(field_b, (500, 1)) + offset)
-    found = solver.calibrate_magnetometer_by_yaw(
-        samples, solver.IN_BODY_AXES, math.radians(yaw_deg), field
-    )
+    yaw_rad, axes = math.radians(yaw_deg), solver.IN_BODY_AXES
+    found = solver.calibrate_magnetometer_by_yaw(samples, axes, yaw_rad, field)
     assert found.mag_hard_iron_ut == pytest.approx((9.0, 8.0, 7.0), abs=0.05)
 
 

@@ -125,9 +125,7 @@ class TestRecords:
         records = list(flight.records())
         times = [record.time_us for record in records]
         assert times == sorted(times)
-        kinds = {
-            kind: [r for r in records if isinstance(r, kind)] for kind in (ImuRaw, BaroRaw, GpsFix)
-        }
+        kinds = {k: [r for r in records if isinstance(r, k)] for k in (ImuRaw, BaroRaw, GpsFix)}
         assert [len(found) for found in kinds.values()] == [
             len(flight.imu.time_s), len(flight.baro.time_s), len(flight.gps.time_s)
         ]  # fmt: skip

@@ -65,9 +65,8 @@ class TestImuNode:
 
 class TestGpsNode:
     def test_quality_is_sent_before_its_fix(self, gps_sent: list[Sent]) -> None:
-        messages = [
-            s.payload for s in gps_sent if not isinstance(s.payload, wire.NodeStatusPayload)
-        ]
+        sent = of_kind(gps_sent, wire.GpsFixPayload | wire.GpsQualityPayload)
+        messages = [each.payload for each in sent]
         for quality, fix in zip(messages[::2], messages[1::2], strict=True):
             assert isinstance(quality, wire.GpsQualityPayload)
             assert isinstance(fix, wire.GpsFixPayload)

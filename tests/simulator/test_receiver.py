@@ -132,9 +132,8 @@ class TestLine:
 class TestRadio:
     @pytest.mark.parametrize(("loss", "burst"), [(0.0, 1.0), (0.01, 1.0), (0.1, 1.0), (0.1, 20.0)])
     def test_loss_equals_its_setting(self, loss: float, burst: float) -> None:
-        line = frames(
-            60.0, baro_rate_hz=1, radio_loss=loss, radio_burst=burst, radio_duplicates=0.0
-        )
+        rates = {"baro_rate_hz": 1, "radio_duplicates": 0.0}
+        line = frames(60.0, radio_loss=loss, radio_burst=burst, **rates)
         seqs = [
             c.header.seq for c in decoded(line)
             if isinstance(c, RadioFrame) and c.header.node == NodeId(1, 0)
@@ -164,9 +163,8 @@ class TestThroughTheWire:
     def test_decoded_records_equal_those_of_the_flight(self) -> None:
         # Without losses, since a fix whose quality payload was lost has no accuracy or time.
         records, _ = feed(frames(radio_loss=0.0))
-        direct = {
-            (type(r), r.node_time_us): r for r in fly(settings(), duration_s=SECONDS).records()
-        }
+        flown = fly(settings(), duration_s=SECONDS)
+        direct = {(type(r), r.node_time_us): r for r in flown.records()}
         for record in records:
             if isinstance(record, ImuRaw | BaroRaw | GpsFix):
                 original = direct[type(record), record.node_time_us]

@@ -39,9 +39,7 @@ def columns(**changes: np.ndarray | None) -> dict[str, np.ndarray]:
         **{f"gps_v{axis}": only(new_gps, rng.normal(0.0, 9.0, ROWS)) for axis in "ned"},
     }
     table |= {name: values for name, values in changes.items() if values is not None}
-    return {
-        name: v for name, v in table.items() if name not in changes or changes[name] is not None
-    }
+    return {name: v for name, v in table.items() if changes.get(name, v) is not None}
 
 
 def fly(flight: RecordedFlight, settings: SimulatorSettings = QUIET) -> list[RawRecord]:

@@ -36,9 +36,8 @@ class TestMpu6050:
         errors = sensors.errors_of(imu, sensors.Hmc5883l(SETTINGS, rng))
         counts = imu.sample(still(2000))
         accel_s = counts.accel * (8 * 9.80665 / 32768)
-        accel_b = (
-            (accel_s - errors.accel_bias_mps2) @ np.transpose(errors.accel_matrix) * sensors.FACE_UP
-        )
+        corrected = (accel_s - errors.accel_bias_mps2) @ np.transpose(errors.accel_matrix)
+        accel_b = corrected * sensors.FACE_UP
         np.testing.assert_allclose(accel_b.mean(axis=0), [0.0, 0.0, -9.80665], atol=0.01)
         gyro_s = np.radians(counts.gyro / 32.8)
         np.testing.assert_allclose(gyro_s.mean(axis=0), errors.gyro_bias_radps, atol=3e-3)
@@ -98,15 +97,10 @@ class TestBmp180:
         assert (pressure_pa == np.rint(pressure_pa)).all()
         assert temperature_degc[0] == 29.0
 
-    @pytest.mark.parametrize(
-        ("alt_m", "pressure_pa"), [(0, 101325), (1000, 89874.6), (5000, 54019.9)]
-    )
-    def test_pressure_is_that_of_the_standard_atmosphere(
-        self, alt_m: float, pressure_pa: float
-    ) -> None:
-        assert sensors.pressure_at(np.array([alt_m]), 101325.0)[0] == pytest.approx(
-            pressure_pa, rel=2e-5
-        )
+    @pytest.mark.parametrize(("alt_m", "pascal"), [(0, 101325), (1000, 89874.6), (5000, 54019.9)])
+    def test_pressure_is_that_of_the_standard_atmosphere(self, alt_m: float, pascal: float) -> None:
+        found = sensors.pressure_at(np.array([alt_m]), 101325.0)[0]
+        assert found == pytest.approx(pascal, rel=2e-5)
 
 
 def test_words() -> None:
@@ -125,10 +119,8 @@ class TestNoise:
         assert memory == pytest.approx(np.exp(-1.0), abs=0.05)
 
     def test_walk_grows_with_the_root_of_time(self) -> None:
-        ends = [
-            sensors.Walk(np.random.default_rng(seed), 0.5, 0.01).draw(400)[-1]
-            for seed in range(300)
-        ]
+        walks = (sensors.Walk(np.random.default_rng(seed), 0.5, 0.01) for seed in range(300))
+        ends = [walk.draw(400)[-1] for walk in walks]
         assert np.std(ends) == pytest.approx(0.5 * 2.0, rel=0.1)
 
     @pytest.mark.parametrize(

@@ -127,9 +127,8 @@ class TestFlight:
     @pytest.mark.parametrize("wind_from_deg", [0.0, 100.0, 250.0])
     @pytest.mark.parametrize("wind_mps", [0.0, 5.0])
     def test_flight_ends_at_home_in_any_wind(self, wind_mps: float, wind_from_deg: float) -> None:
-        windy = fly(
-            int(wind_from_deg), wind_mps=wind_mps, wind_from_deg=wind_from_deg, gust_mps=1.5
-        )
+        wind = {"wind_mps": wind_mps, "wind_from_deg": wind_from_deg, "gust_mps": 1.5}
+        windy = fly(int(wind_from_deg), **wind)
         end = windy.truth_at(np.array([FLIGHT_S - 1e-6]))
         np.testing.assert_allclose(end.pos_n_m, 0.0, atol=1e-3)
 

@@ -34,7 +34,8 @@ from tests.kit.ground_station import (
 )
 
 ME = (1, 1)
-ACK = "COMMAND_ACK"
+ACK, ENDED = "COMMAND_ACK", "MISSION_ACK"
+VALUE = "PARAM_VALUE"
 FTP = "FILE_TRANSFER_PROTOCOL"
 
 
@@ -51,6 +52,8 @@ DENIED = {"result": mavlink.MAV_RESULT_DENIED}
 UNSUPPORTED = {"result": mavlink.MAV_RESULT_UNSUPPORTED}
 IN_PROGRESS = {"result": mavlink.MAV_RESULT_IN_PROGRESS}
 REFUSED = {"type": mavlink.MAV_MISSION_UNSUPPORTED}
+NO_ITEM = {"type": mavlink.MAV_MISSION_INVALID_SEQUENCE}
+STORED = {"type": mavlink.MAV_MISSION_ACCEPTED}
 UNKNOWN = {"error": mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST}
 HOME = (475_000_000, 85_000_000, 500.0)
 
@@ -95,18 +98,14 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "modes/available": (command(512, 435, 0), "AVAILABLE_MODES", {}),
     "modes/current": (command(512, 436), "CURRENT_MODE", {}),
     # parameter.html: read by name or index, set and reported, unknown ones refused.
-    "parameter/list": (to_vehicle("PARAM_REQUEST_LIST"), "PARAM_VALUE", {}),
-    "parameter/read-name": (param_read(b"RATE_ATT"), "PARAM_VALUE", valued("RATE_ATT", 50.0)),
-    "parameter/read-index": (param_read(b"", param_index=0), "PARAM_VALUE", {"param_index": 0}),
+    "parameter/list": (to_vehicle("PARAM_REQUEST_LIST"), VALUE, {}),
+    "parameter/read-name": (param_read(b"RATE_ATT"), VALUE, valued("RATE_ATT", 50.0)),
+    "parameter/read-index": (param_read(b"", param_index=0), VALUE, {"param_index": 0}),
     "parameter/read-unknown": (param_read(b"NOPE"), "PARAM_ERROR", UNKNOWN),
-    "parameter/set": (param_set(b"RATE_ATT", 5.0), "PARAM_VALUE", valued("RATE_ATT", 5.0)),
-    "parameter/set-out-of-range": (
-        param_set(b"RATE_ATT", -5.0), "PARAM_VALUE", valued("RATE_ATT", 50.0),
-    ),
+    "parameter/set": (param_set(b"RATE_ATT", 5.0), VALUE, valued("RATE_ATT", 5.0)),
+    "parameter/set-out-of-range": (param_set(b"RATE_ATT", -5.0), VALUE, valued("RATE_ATT", 50.0)),
     "parameter/set-unknown": (param_set(b"NOPE", 1.0), "PARAM_ERROR", UNKNOWN),
-    "parameter/set-of-home": (
-        param_set(b"HOME_ALT", 12.5), "PARAM_VALUE", valued("HOME_ALT", 12.5),
-    ),
+    "parameter/set-of-home": (param_set(b"HOME_ALT", 12.5), VALUE, valued("HOME_ALT", 12.5)),
     # mission.html: the same for the three types.
     **{
         f"mission/list-{kind}": (
@@ -116,31 +115,18 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
         for kind in (0, 1, 2)
     },
     "mission/upload": (count(2), "MISSION_REQUEST_INT", {"seq": 0}),
-    "mission/too-large": (count(60_000), "MISSION_ACK", {"type": mavlink.MAV_MISSION_NO_SPACE}),
-    "mission/no-such-item": (
-        request_item(9), "MISSION_ACK", {"type": mavlink.MAV_MISSION_INVALID_SEQUENCE},
-    ),
-    "mission/no-such-type": (to_vehicle("MISSION_REQUEST_LIST", 7), "MISSION_ACK", REFUSED),
+    "mission/too-large": (count(60_000), ENDED, {"type": mavlink.MAV_MISSION_NO_SPACE}),
+    "mission/no-such-item": (request_item(9), ENDED, NO_ITEM),
+    "mission/no-such-type": (to_vehicle("MISSION_REQUEST_LIST", 7), ENDED, REFUSED),
     "mission/partial-download": (
         to_vehicle("MISSION_REQUEST_PARTIAL_LIST", 0, 3, 0),
-        "MISSION_ACK", REFUSED,
+        ENDED, REFUSED,
     ),
-    "mission/partial-upload": (
-        to_vehicle("MISSION_WRITE_PARTIAL_LIST", 0, 3, 0),
-        "MISSION_ACK", REFUSED,
-    ),
-    "mission/stray-item": (item(3), "MISSION_ACK", {"type": mavlink.MAV_MISSION_ERROR}),
-    "mission/empty-upload": (
-        count(0, 1), "MISSION_ACK", {"type": mavlink.MAV_MISSION_ACCEPTED, "mission_type": 1},
-    ),
-    "mission/older-request": (
-        to_vehicle("MISSION_REQUEST", 2, 0),
-        "MISSION_ACK", {"type": mavlink.MAV_MISSION_INVALID_SEQUENCE},
-    ),
-    "mission/clear": (
-        to_vehicle("MISSION_CLEAR_ALL", 255),
-        "MISSION_ACK", {"type": mavlink.MAV_MISSION_ACCEPTED},
-    ),
+    "mission/partial-upload": (to_vehicle("MISSION_WRITE_PARTIAL_LIST", 0, 3, 0), ENDED, REFUSED),
+    "mission/stray-item": (item(3), ENDED, {"type": mavlink.MAV_MISSION_ERROR}),
+    "mission/empty-upload": (count(0, 1), ENDED, STORED | {"mission_type": 1}),
+    "mission/older-request": (to_vehicle("MISSION_REQUEST", 2, 0), ENDED, NO_ITEM),
+    "mission/clear": (to_vehicle("MISSION_CLEAR_ALL", 255), ENDED, STORED),
     "mission/set-current-none": (to_vehicle("MISSION_SET_CURRENT", 4), "STATUSTEXT", {}),
     # ftp.html: an answer to every opcode, with the request's opcode in it.
     "ftp/open": (ftp_request(4, b"/general.json"), FTP, {"opcode": (128, 4)}),

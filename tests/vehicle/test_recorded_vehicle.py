@@ -31,12 +31,10 @@ class LogContents:
             f"P{i}": packed(value(f"P{i}".encode(), i, 9, parameters, i), SYSTEM)
             for i in range(parameters)
         }
-        home = mavlink.MAVLink_home_position_message(
-            470_000_000, 85_000_000, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0
-        )
-        item = mavlink.MAVLink_mission_item_int_message(
-            255, 1, 0, 6, 16, 0, 1, 0, 0, 0, 0, 470_000_000, 85_000_000, 50, MISSION
-        )
+        here = (470_000_000, 85_000_000)
+        home = mavlink.MAVLink_home_position_message(*here, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
+        head = (255, 1, 0, 6, 16, 0, 1, 0, 0, 0, 0)
+        item = mavlink.MAVLink_mission_item_int_message(*head, *here, 50, MISSION)
         self.kept = {HOME: [packed(home, SYSTEM)]}
         self.missions = {MISSION: [packed(item, SYSTEM)]}
 
@@ -96,10 +94,9 @@ CHANGES = {
     "clear": (mavlink.MAVLink_mission_clear_all_message(*ME, MISSION), "MISSION_ACK"),
     "erase": (mavlink.MAVLink_log_erase_message(*ME), ""),
     "home message": (
-        mavlink.MAVLink_set_home_position_message(SYSTEM, 0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0),
-        "",
+        mavlink.MAVLink_set_home_position_message(SYSTEM, *[0] * 6, [1, 0, 0, 0], 0, 0, 0), "",
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CHANGES)

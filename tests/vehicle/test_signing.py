@@ -206,12 +206,9 @@ def test_oldest_key_is_discarded_beyond_the_limit() -> None:
     timestamps = signing.SigningTimestamps()
     for n in range(2 * signing.MAX_KEYS):
         assert timestamps.accept(f"{n}", "0.1.1", n, oldest=0)
-    assert list(timestamps.exact()) == [
-        f"{n}" for n in range(signing.MAX_KEYS, 2 * signing.MAX_KEYS)
-    ]
-    again, newest = (
-        signing.SigningTimestamps(timestamps.to_keep()),
-        signing.MAX_KEYS + signing.RESERVE_TICKS,
-    )
+    kept = range(signing.MAX_KEYS, 2 * signing.MAX_KEYS)
+    assert list(timestamps.exact()) == [f"{n}" for n in kept]
+    again = signing.SigningTimestamps(timestamps.to_keep())
+    newest = signing.MAX_KEYS + signing.RESERVE_TICKS
     assert not again.accept(f"{signing.MAX_KEYS}", "0.1.1", newest, oldest=0)
     assert again.accept(f"{signing.MAX_KEYS}", "0.1.1", newest + 1, oldest=0)

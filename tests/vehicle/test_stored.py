@@ -35,9 +35,8 @@ def random_plan(seed: int) -> StoredPlan:
     rng = np.random.default_rng(seed)
     numbers = rng.integers(-900_000_000, 900_000_000, (MAX_ITEMS[0], 2)).tolist()
     floats = rng.standard_normal((MAX_ITEMS[0], 5)).astype(np.float32).astype(float).tolist()
-    items = [
-        Item(3, 16, 1, (*f[:4],), x, y, f[4]) for (x, y), f in zip(numbers, floats, strict=True)
-    ]
+    pairs = zip(numbers, floats, strict=True)
+    items = [Item(3, 16, 1, (*f[:4],), x, y, f[4]) for (x, y), f in pairs]
     return StoredPlan(mission=tuple(items))
 
 

@@ -300,12 +300,8 @@ EVENTS: dict[str, tuple[dict[str, Any], list[str]]] = {
         ["Receiver lost: port", "Receiver connected: port"],
     ),
     "rejected fixes": ({"flags": REJECTED}, ["GPS fixes rejected", "GPS accepted again"]),
-    "useless fixes": (
-        {"flags": LOST}, ["Position is dead-reckoned", "Position follows GPS again"],
-    ),
-    "faulty sensor": (
-        {"valid": NO_ATTITUDE, "flags": FAULT}, ["Sensor fault", "Sensors OK again"],
-    ),
+    "useless fixes": ({"flags": LOST}, ["Position is dead-reckoned", "Position follows GPS again"]),
+    "faulty sensor": ({"valid": NO_ATTITUDE, "flags": FAULT}, ["Sensor fault", "Sensors OK again"]),
     "lost attitude": ({"valid": NO_ATTITUDE}, ["Attitude not valid", "Attitude valid"]),
     "disturbed field": (
         {"valid": ~NavFlags.HEADING_VALID, "flags": NavFlags.MAG_DISTURBED},

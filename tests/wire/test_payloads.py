@@ -104,18 +104,16 @@ def test_payload_with_signal_has_the_layout_of_the_protocol() -> None:
     packet = bytes.fromhex(RADIO[0]["payload_hex"])
     content = bytes.fromhex(SIGNAL_HEAD + "79 e4") + packet  # -121 dBm, -7 dB
     frame = payloads.decode_content(content)
-    assert frame == payloads.RadioFrame(
-        7, 2, 0x03020100, plain.header, plain.payload, RadioSignal(-121, -7.0)
-    )
+    head = (7, 2, 0x03020100, plain.header, plain.payload)
+    assert frame == payloads.RadioFrame(*head, RadioSignal(-121, -7.0))
     assert payloads.encode_radio(7, 2, 0x03020100, packet, frame.signal) == content
 
 
 def test_foreign_packet_has_the_layout_of_the_protocol() -> None:
     content = bytes.fromhex("14 07 ff 00010203 50 28") + b"\xff\x07\x21\x00text"
     frame = payloads.decode_content(content)
-    assert frame == payloads.ForeignFrame(
-        7, 0x03020100, RadioSignal(-80, 10.0), b"\xff\x07\x21\x00text"
-    )
+    text = b"\xff\x07\x21\x00text"
+    assert frame == payloads.ForeignFrame(7, 0x03020100, RadioSignal(-80, 10.0), text)
 
 
 @pytest.mark.parametrize(
@@ -210,9 +208,8 @@ def test_month_13_is_a_fault_and_a_leap_second_a_time() -> None:
 
 
 def test_pipe_above_five_is_a_fault() -> None:
-    content = payloads.encode_radio(
-        0, 6, 0, payloads.encode_payload(HEADER, payloads.BaroPayload(1, 1))
-    )
+    packet = payloads.encode_payload(HEADER, payloads.BaroPayload(1, 1))
+    content = payloads.encode_radio(0, 6, 0, packet)
     assert payloads.decode_content(content) == Fault(FaultKind.VALUE, len(content))
 
 

@@ -107,9 +107,7 @@ def test_offset_measured_with_queued_packets_is_corrected_by_two_packets() -> No
     tracker = ClockTracker()
     for step in range(10):
         tracker.observe(step * 10_000, 2_000_000 + 400_000 + step * 10_000)
-    observed = [
-        tracker.observe(step * 10_000, 2_000_000 + step * 10_000) for step in (100, 101, 102)
-    ]
+    observed = [tracker.observe(n * 10_000, 2_000_000 + n * 10_000) for n in (100, 101, 102)]
     assert observed == [3_000_000, 3_010_000, 3_020_000]
     assert tracker.observe(1_030_000, 3_330_000) == 3_030_000, "its queue is known again"
 

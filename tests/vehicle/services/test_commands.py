@@ -174,9 +174,7 @@ def test_each_station_that_starts_a_recording_gets_its_own_answer(station: Groun
     assert [results(each.receive(actions)) for each in stations[:3]] == [[], [ACCEPTED], [ACCEPTED]]
 
 
-SET_HOME_POSITION = mavlink.MAVLink_set_home_position_message(
-    1, 0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0
-)
+SET_HOME_POSITION = mavlink.MAVLink_set_home_position_message(1, *[0] * 6, [1, 0, 0, 0], 0, 0, 0)
 FTP = "FILE_TRANSFER_PROTOCOL"
 REQUESTS: dict[str, tuple[Any, tuple[str, str] | None]] = {
     "message": (command(512, 12_345), ("COMMAND_LONG REQUEST_MESSAGE 12345", "UNSUPPORTED")),

@@ -10,9 +10,7 @@ SET, GET = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_GET_MESSAGE_INT
 ATTITUDE, QUATERNION, HOME = 30, 31, 242
 
 
-@pytest.mark.parametrize(
-    ("requested_us", "reported_us"), [(200_000, 200_000), (-1, -1), (0, 20_000)]
-)
+@pytest.mark.parametrize(("requested_us", "reported_us"), [(200_000,) * 2, (-1, -1), (0, 20_000)])
 def test_slower_rate_is_passed_to_the_hub(
     station: GroundStation, requested_us: int, reported_us: int
 ) -> None:

@@ -60,9 +60,8 @@ def test_radio_status_has_the_weakest_measured_signal_if_any(health: Health) -> 
     assert health.radio_status(0) is None
     strong, weak = RadioSignal(-60, 10.0), RadioSignal(-121, -7.25)
     other = link(NodeId(2, 0), signal=RadioSignal(-127, -15.0))
-    health.on_link(
-        report(link(IMU_NODE, signal=strong), link(GPS_NODE, signal=weak, lost=7), other)
-    )
+    nodes = link(IMU_NODE, signal=strong), link(GPS_NODE, signal=weak, lost=7)
+    health.on_link(report(*nodes, other))
     sent = health.radio_status(0)
     # As QGroundControl reads them: signed bytes.
     assert [value - 256 for value in (sent.rssi, sent.noise)] == [-121, -114]
