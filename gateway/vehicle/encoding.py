@@ -2,11 +2,11 @@
 
 A MAVLink integer field often reserves its greatest value for "unknown". The functions for fields
 take the value to send in that case, and saturate one below it, so that a too large value is never
-read as "not known".
+read as unknown.
 
 Two messages of the standard and one of its development dialect are missing in pymavlink. Clients
-request them all the same; PROTOCOL_VERSION decides whether QGroundControl uses MAVLink 2. Each is
-laid out as the generator does it: larger fields first, and a CRC seeded by the definition.
+request them nevertheless; PROTOCOL_VERSION decides whether QGroundControl uses MAVLink 2. Each has
+the layout of the generator: larger fields first, and a CRC seeded by the definition.
 """
 
 import math
@@ -34,7 +34,8 @@ _Base: Any = mavlink.MAVLink_message
 AUTOPILOT_COMPONENT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: clients look for a vehicle under no other component id."""
 _pack_head: Final = struct.Struct("<BBBBB5s").pack
-"""Start, length, two flag bytes, sequence, and the key: system, component and message."""
+"""Head of a frame: start, length, two flag bytes, sequence, and the key (system, component and
+message)."""
 _KEY: Final = struct.Struct("<BBHB")
 _INTEGER_LIMITS: Final = {
     "int8_t": (-(2**7), 2**7 - 1),
@@ -61,13 +62,13 @@ AUTOPILOTS: Final[dict[str, int]] = {
     "ardupilotmega": mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
     "px4": mavlink.MAV_AUTOPILOT_PX4,
 }
-"""By the setting `autopilot`."""
+"""MAV_AUTOPILOT by the setting `autopilot`."""
 CUSTOM_MODES: Final[dict[int, int]] = {
     mavlink.MAV_AUTOPILOT_GENERIC: 0,
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: 0,
     mavlink.MAV_AUTOPILOT_PX4: 1 << 16,
 }
-"""The mode in which a pilot flies by hand: MANUAL or STABILIZE of ArduPilot, main mode 1 of PX4."""
+"""Mode in which a pilot flies manually: MANUAL or STABILIZE of ArduPilot, main mode 1 of PX4."""
 UID_PREFIX: Final = int.from_bytes(b"mavgate")
 
 
@@ -108,14 +109,14 @@ def uint32(value: float) -> int:
 
 
 def compass_cdeg(angle_rad: float) -> int:
-    """Turn an angle from north into 0 to 35999 hundredths of a degree, 65535 if not known."""
+    """Convert an angle from north to 0 to 35999 hundredths of a degree, 65535 if unknown."""
     if not math.isfinite(angle_rad):
         return UINT16_MAX
     return round(math.degrees(angle_rad) * 100.0) % 36000
 
 
 def compass_deg(angle_rad: float) -> int:
-    """Turn an angle from north into 0 to 359 whole degrees; an unknown angle must not come here."""
+    """Convert a known angle from north to 0 to 359 whole degrees."""
     return round(math.degrees(angle_rad)) % 360
 
 
@@ -134,7 +135,7 @@ class _Extra(_Base):  # type: ignore[misc]
         self.wire_values = wire_values
 
     def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
-        """Build the frame; these ids do not fit MAVLink 1."""
+        """Build the frame; the ids of these messages do not fit MAVLink 1."""
         payload = self.unpacker.pack(*self.wire_values)
         frame: bytes = self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1)
         return frame
@@ -190,7 +191,7 @@ class MessagePacker:
         self.types = [types[name] for name, _ in elements]
 
     def __call__(self, *values: float) -> "PackedMessage":
-        """Make a message of its values in the order of the definition, arrays spread out."""
+        """Make a message of its values in the order of the definition, arrays flattened."""
         return PackedMessage(self, values)
 
 
@@ -227,7 +228,7 @@ class Encoder:
         self._sequence = 0
 
     def encode(self, message: Any, client_id: int | None = None) -> Outgoing:
-        """Build the MAVLink 2 frame of one message, for the one client that it answers, or all.
+        """Build the MAVLink 2 frame of one message, for the client that it answers, or for all.
 
         A number beyond its field's range is saturated, so that no measurement can stop the
         telemetry.
@@ -251,7 +252,7 @@ class Encoder:
     def _outgoing(
         self, frame: bytes, message_id: int, client_id: int | None, has_target: bool
     ) -> Outgoing:
-        """Advance the sequence, and describe a frame of the present number for the hub."""
+        """Advance the sequence, and return the frame with its header for the hub."""
         header, sequence = None, self._sequence
         self._sequence = sequence + 1 & 0xFF
         if not has_target:
@@ -262,7 +263,7 @@ class Encoder:
     def _frame(
         self, message_id: int, crc_extra: int, payload: bytes, *, force_mavlink1: bool = False
     ) -> bytes:
-        """Put header and checksum around a payload; `force_mavlink1` is pymavlink's own."""
+        """Add header and checksum to a payload; `force_mavlink1` is a parameter of pymavlink."""
         del force_mavlink1
         body = payload.rstrip(b"\0") or payload[:1]
         key = self._keys.get(message_id) or self._make_key(message_id)
@@ -300,7 +301,7 @@ def _fit(value: float, kind: str) -> float:
 
 
 def software_version(version: str) -> int:
-    """Pack major, minor and patch into the upper three bytes, and the type into the lowest."""
+    """Pack major, minor and patch into the upper three bytes, and the type into the lowest one."""
     parts = [int(part) if part.isdigit() else 0 for part in version.split(".")[:3]]
     major, minor, patch = (*parts, 0, 0, 0)[:3]
     kind: int = mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL

@@ -1,6 +1,6 @@
-"""Locations, items of missions, fences and rally points, and the plan kept over a restart.
+"""Locations, items of missions, fences and rally points, and the plan stored over a restart.
 
-Items are read, checked, and returned unchanged. The kept plan is one JSON text per aircraft; an
+Items are read, checked, and returned unchanged. The stored plan is one JSON text per aircraft; an
 unknown number is written as NaN, as Python and most readers do.
 """
 
@@ -22,7 +22,7 @@ MAX_LAT_DEG: Final = 90.0
 MAX_LON_DEG: Final = 180.0
 MIN_ALT_M: Final = -1000.0
 MAX_ALT_M: Final = 50_000.0
-"""Heights above mean sea level: below the Dead Sea, and above every balloon."""
+"""Valid heights above mean sea level, m: from below the Dead Sea to above every balloon."""
 
 ABSOLUTE_FRAMES: Final = frozenset({mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT})
 RELATIVE_FRAMES: Final = frozenset(
@@ -33,7 +33,7 @@ RELATIVE_FRAMES: Final = frozenset(
         mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT,
     }
 )
-"""Heights above home; the terrain, which is not known here, is taken to be as high as home."""
+"""Frames with heights above home; the unknown terrain is assumed to be as high as home."""
 GLOBAL_FRAMES: Final = ABSOLUTE_FRAMES | RELATIVE_FRAMES
 WANTED: Final = Geodesic.DISTANCE | Geodesic.AZIMUTH
 HomeSource = Literal["none", "gps", "operator"]
@@ -43,7 +43,7 @@ MISSION: Final[int] = mavlink.MAV_MISSION_TYPE_MISSION
 FENCE: Final[int] = mavlink.MAV_MISSION_TYPE_FENCE
 RALLY: Final[int] = mavlink.MAV_MISSION_TYPE_RALLY
 MAX_ITEMS: Final = {MISSION: 1000, FENCE: 500, RALLY: 100}
-"""More than a flight needs, with little memory for each aircraft."""
+"""Maximum items by type: more than a flight needs, with little memory for each aircraft."""
 ACCEPTED: Final[int] = mavlink.MAV_MISSION_ACCEPTED
 FLOAT_FRAMES: Final = {
     mavlink.MAV_FRAME_GLOBAL_INT: mavlink.MAV_FRAME_GLOBAL,
@@ -53,7 +53,7 @@ FLOAT_FRAMES: Final = {
 """The frames of MISSION_ITEM that correspond to those of integer coordinates."""
 KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally"}
 LOCAL_SCALE: Final = 1e4
-"""Of x and y of MISSION_ITEM_INT in a local frame, per metre."""
+"""Units per metre of x and y of MISSION_ITEM_INT in a local frame."""
 
 
 def is_on_earth(lat_deg: float, lon_deg: float) -> bool:
@@ -62,7 +62,7 @@ def is_on_earth(lat_deg: float, lon_deg: float) -> bool:
 
 
 def height_amsl_m(height_m: float, frame: int, home_alt_m: float) -> float:
-    """Convert a height in a MAV_FRAME to one above mean sea level; NaN if it is not known."""
+    """Convert a height in a MAV_FRAME to one above mean sea level; NaN if it is unknown."""
     relative = frame in RELATIVE_FRAMES
     height = height_m + home_alt_m if relative else height_m
     return height if math.isfinite(height) else math.nan
@@ -99,20 +99,20 @@ class Home:
 
 
 class HomeParameters(Settings, frozen=True):
-    """Home as ground stations see and set it among the parameters; all zero while there is none."""
+    """Home as ground stations show and set it among the parameters; all zero without a home."""
 
     source: Annotated[
         HomeSource,
         setting(
-            "Who set home: none yet, the GPS, or an operator. Set 2 to keep a home of the GPS as "
+            "Source of home: none yet, the GPS, or an operator. Set 2 to keep a home of the GPS as "
             "the operator's; set 0 to clear home and let the GPS measure it again."
         ),
     ] = "none"
     lat_deg: Annotated[
         float,
         setting(
-            "Latitude of home. While there is no home, one begins when latitude, longitude and "
-            "height have all been set.",
+            "Latitude of home. Without a home, one is set once latitude, longitude and height "
+            "have all been set.",
             "deg",
             ge=-90.0,
             le=90.0,
@@ -130,7 +130,7 @@ def is_3d(fix: GpsFix) -> bool:
 
 
 def is_good_enough(fix: GpsFix, accuracy_m: float, satellites: int) -> bool:
-    """Return whether a fix may set home; an accuracy that is not known does not forbid it."""
+    """Return whether a fix may set home; an unknown accuracy is accepted."""
     # Some receivers report latitude 0, longitude 0 as valid before the first fix.
     somewhere = (fix.lat_dege7, fix.lon_dege7) != (0, 0) and math.isfinite(fix.alt_amsl_m)
     accurate = fix.satellites >= satellites and not fix.h_acc_m > accuracy_m
@@ -188,7 +188,7 @@ class Item:
         return (*self.params, self.x / scale, self.y / scale, self.z)
 
     def location(self, home_alt_m: float) -> Location | None:
-        """Return its position, or None; 0, 0 means "here" to autopilots."""
+        """Return its position, or None if it has none; 0, 0 means "here" to autopilots."""
         located = self.command in LOCATED_COMMANDS and self.frame in GLOBAL_FRAMES
         if not located or (self.x, self.y) == (0, 0):
             return None
@@ -259,16 +259,16 @@ def _integer(value: float) -> int:
 
 
 class StoredPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Missions, mark and home of one vehicle, as kept over a restart."""
+    """Missions, mark and home of one vehicle, as stored over a restart."""
 
     version: Literal[1] = 1
     home: Location | None = None
-    """Where an operator set it; a home that the GPS measured is not kept."""
+    """Home that an operator has set; one that the GPS measured is not stored."""
     mark: Location | None = None
     mark_of: int | None = None
-    """MAV_MISSION_TYPE of the items that the mark follows; None if it was set by itself."""
+    """MAV_MISSION_TYPE of the items that the mark follows; None if it was set on its own."""
     current: int = 0
-    """Item of the mission."""
+    """Index of the current mission item."""
     mission: tuple[Item, ...] = ()
     fence: tuple[Item, ...] = ()
     rally: tuple[Item, ...] = ()
@@ -282,7 +282,7 @@ def encode_plan(plan: StoredPlan) -> str:
 def decode_plan(text: str) -> StoredPlan:
     """Read a text of `encode_plan`.
 
-    ValueError names the first fault: also a value that no ground station could have stored.
+    ValueError names the first fault, which may be a value that no ground station could have stored.
     """
     try:
         plan = msgspec.convert(json.loads(text), StoredPlan)

@@ -1,16 +1,16 @@
-"""A recorded vehicle as a MAVLink system: it answers from its log, and declines the rest.
+"""A recorded vehicle as a MAVLink system: it answers from its log, and denies other requests.
 
-| asked                                | answered                                                |
+| request                              | answer                                                  |
 | ------------------------------------ | ------------------------------------------------------- |
-| PARAM_REQUEST_LIST, …_READ           | the recorded values; PARAM_ERROR where there are none   |
-| PARAM_SET                            | PARAM_ERROR and the recorded value: it stays            |
-| MISSION_REQUEST_LIST and its items   | the recorded items; none where there are none           |
+| PARAM_REQUEST_LIST, …_READ           | the recorded values; PARAM_ERROR without any            |
+| PARAM_SET                            | PARAM_ERROR and the unchanged value                     |
+| MISSION_REQUEST_LIST and its items   | the recorded items, if any                              |
 | an upload, MISSION_CLEAR_ALL         | MISSION_ACK denied                                      |
 | REQUEST_MESSAGE, GET_HOME_POSITION … | the recorded message; unsupported if it was never sent  |
-| SET_MESSAGE_INTERVAL                 | thins what is played to the client that asks            |
+| SET_MESSAGE_INTERVAL                 | fewer messages are played to the client that asks       |
 | any other command, SET_MODE          | denied: the past cannot be changed                      |
-| logs, terrain, extended parameters   | there are none                                          |
-| files, COMPONENT_METADATA            | of own recordings the parameters' metadata              |
+| logs, terrain, extended parameters   | empty lists                                             |
+| files, COMPONENT_METADATA            | for own recordings, the parameters' metadata            |
 | PING, TIMESYNC                       | answered                                                |
 
 A station that tries to change something is also sent a text.
@@ -57,7 +57,7 @@ THE_PAST: Final = StatusText(NOTICE, "This is a recording: nothing can be change
 TEXTS_AT_ONCE: Final = 3
 TEXT_INTERVAL_US: Final = 20 * US_PER_S
 STREAMED: Final = frozenset({"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"})
-"""Sent many times a second by a ground station with a joystick."""
+"""Messages that a ground station with a joystick sends many times a second."""
 
 RecordedAction = Outgoing | ClientInterval
 
@@ -163,7 +163,7 @@ class _Commands(Service):
 class RecordedVehicle:
     """One vehicle of a recording, under the system id with which it is played.
 
-    Metadata of the parameters is used where the recorded ones are those that it describes.
+    Metadata of the parameters is used if it describes the recorded ones.
     """
 
     def __init__(
@@ -175,7 +175,7 @@ class RecordedVehicle:
     ) -> None:
         self.system_id = system_id
         self.metadata = metadata
-        """Of the recorded parameters; None if they are of another version."""
+        """Metadata of the recorded parameters; None if they are of another version."""
         if metadata is not None and not metadata.describes(answers.parameters()):
             self.metadata = None
         self._reader = RequestReader(system_id)
@@ -211,7 +211,7 @@ class RecordedVehicle:
         return self._finish(service.handle(request, now_us))
 
     def _explain(self, request: Request, now_us: int) -> list[Answer]:
-        """Return the text for a station that wants to change something."""
+        """Return the text for a station that requests a change."""
         found = self._texts.say(THE_PAST, now_us)
         return [request.reply(each.message) for each in found if isinstance(each, Reply)]
 
@@ -221,7 +221,7 @@ class RecordedVehicle:
         return self._mavlink.decode(bytearray(frames[0])) if frames else None
 
     def poll(self, now_us: int) -> list[RecordedAction]:
-        """Send the next of every list and file that is under way."""
+        """Send the next answers of every list and file."""
         return self._finish([answer for each in self._services for answer in each.poll(now_us)])
 
     def next_due_us(self) -> int | None:

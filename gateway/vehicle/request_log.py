@@ -1,6 +1,6 @@
 """The failed requests to a vehicle, for `mavgate status --requests`.
 
-Equal ones share an entry with a count; the entries are bounded, and the oldest gives way.
+Equal ones share an entry with a count; the number of entries is bounded, and the oldest is removed.
 """
 
 import re
@@ -12,7 +12,7 @@ from gateway.records import LoggedRequest
 from gateway.vehicle.service import Answer, Reply, Request
 
 MAX_ENTRIES: Final = 64
-"""Kinds of requests that are kept; a client that sends random ones must not fill the memory."""
+"""Maximum kinds of requests: a client that sends random ones must not fill the memory."""
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_@/.? =-]")
 _GOOD_RESULTS: Final = (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
 _FTP_OPCODE, _FTP_DATA = 3, 12
@@ -68,7 +68,7 @@ class RequestLog:
 def failure_of(message: Any, request: Any) -> str | None:
     """Return the reason in a negative answer; None for any other message.
 
-    The end of a file or a list, and the end of a session that has ended already, are no failures.
+    The end of a file or a list, and ending a session that has ended already, are not failures.
     """
     match message.get_type():
         case "COMMAND_ACK" if message.result not in _GOOD_RESULTS:

@@ -54,7 +54,7 @@ class RequestReader:
 
     def _decode(self, frame: bytes) -> Any:
         """Decode a frame, or return its fault."""
-        # An unknown incompatibility flag forbids reading on.
+        # A frame with an unknown incompatibility flag must be discarded.
         if not frame or (frame[0] == START_V2 and frame[2:] and frame[2] & ~SIGNED):
             return "malformed"
         try:
@@ -63,7 +63,7 @@ class RequestReader:
             return "broken"
         if message.get_type().startswith("UNKNOWN"):
             return "unknown"
-        # Only the pair is ours: a companion computer shares the system id of its vehicle.
+        # Only the pair of ids is ours: a companion computer shares the system id of its vehicle.
         sender = (message.get_srcSystem(), message.get_srcComponent())
         if sender == (self._system_id, AUTOPILOT_COMPONENT):
             return "own id"

@@ -1,4 +1,4 @@
-"""One request of a client, its answers, and the interface of the services that give them."""
+"""A client's request, its answers, and the interface of the services that answer."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
@@ -18,7 +18,7 @@ INFO: Final = mavlink.MAV_SEVERITY_INFO
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
-    """A message before it is encoded: to the client that asked, or to all."""
+    """A message before it is encoded: to the client that requested it, or to all."""
 
     message: Any
     client_id: int | None = None
@@ -35,12 +35,12 @@ class Request:
     may_change: bool
     """Whether the client may change state: trusted, and signed where a key is set."""
     reason: str = ""
-    """Why it may not, and the remedy."""
+    """The reason why it may not, with the remedy."""
     is_rejected: bool = False
     """Whether its signature is wrong, so that it is not handled at all."""
 
     def reply(self, message: Any) -> Reply:
-        """Answer the client that asked."""
+        """Answer the client that sent the request."""
         return Reply(message, self.client_id)
 
 
@@ -54,7 +54,7 @@ class StatusText:
 
 @dataclass(frozen=True, slots=True)
 class SettingsChange:
-    """A section of this vehicle's settings has a new, already checked value: apply it live."""
+    """A new, checked value of a section of this vehicle's settings, to be applied at once."""
 
     section: str
     """Key of the section, as it was given to the vehicle."""
@@ -63,16 +63,16 @@ class SettingsChange:
 
 @dataclass(frozen=True, slots=True)
 class SaveSettings:
-    """Store what differs from the settings file, and report the outcome to the vehicle."""
+    """Store the differences to the settings file, and report the outcome to the vehicle."""
 
     vehicle_id: int
     request: Request
-    """Who waits for the outcome."""
+    """The request that waits for the outcome."""
 
 
 @dataclass(frozen=True, slots=True)
 class SavePlan:
-    """Keep missions, mark and home for the next start."""
+    """Store missions, mark and home for the next start."""
 
     vehicle_id: int
     plan: StoredPlan
@@ -94,10 +94,10 @@ class LogWarning:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationMeasured:
-    """A calibration of the calibrated samples, which the aircraft's own is then joined with."""
+    """A calibration of the calibrated samples, to be combined with that of the aircraft."""
 
     correction: NodeCalibration
-    """In body axes; see `gateway.sensing.calibrating.corrected_by`."""
+    """Calibration in body axes; see `gateway.sensing.calibrating.corrected_by`."""
 
 
 Action = (

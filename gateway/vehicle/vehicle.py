@@ -73,14 +73,15 @@ from gateway.wire.mavlink_signing import (
 OWN_SECTION: Final = "vehicle"
 HOME_STEP_M: Final = 20.0
 HOME_STEP_SHARE: Final = 0.06
-"""Of the distance: an autopilot's radio may send the direction of home in steps of 3 degrees."""
+"""Share of the distance to home by which a reported home may differ: an autopilot's radio may send
+its direction in steps of 3 degrees."""
 REFUSALS_AT_ONCE: Final = 3
 REFUSAL_INTERVAL_US: Final = 20 * US_PER_S
-"""A refusal is announced to all at most this often: enough as a warning, without a flood."""
+"""Least interval of refusals that are announced to all: enough as a warning, without a flood."""
 
 REJECTION_INTERVAL_US: Final = 20 * US_PER_S
-"""A wrong signature is logged at most this often: a station with a wrong clock sends them for ever;
-all are listed by `status --requests`."""
+"""Least interval of logging wrong signatures, which a station with a wrong clock sends for ever;
+`status --requests` lists all of them."""
 
 
 class Vehicle:
@@ -102,12 +103,12 @@ class Vehicle:
         """Start without any data.
 
         The system id, 1 to 250, is also the id in the radio payloads. The sections are other
-        settings of this aircraft that ground stations may change as parameters, by the key under
-        which the change comes back. Clock and timestamps are needed for signing only.
+        settings of this aircraft that ground stations may change as parameters, by the key that
+        `SettingsChange` contains. Clock and timestamps are needed for signing only.
         """
         self.system_id = system_id
         self.refusals = 0
-        """Requests to change something that were refused."""
+        """Number of refused requests for changes."""
         self.requests = RequestLog(system_id)
         self.health = Health(system_id, settings.node_silent_s, settings.supply_low_v)
         self.telemetry = Telemetry(settings, self.health)
@@ -154,7 +155,7 @@ class Vehicle:
         self._route(commands)
 
     def _add_identity(self) -> None:
-        """Let clients request the versions, modes and metadata of the vehicle."""
+        """Add messages that clients may request: versions, modes and metadata of the vehicle."""
         of, add = self.telemetry, self.telemetry.add
         add(
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
@@ -168,7 +169,7 @@ class Vehicle:
         add(MAVLINK_MSG_ID_COMPONENT_METADATA, self.metadata.announcement)
 
     def _route(self, commands: CommandService) -> None:
-        """Register which service handles which message, and which are polled."""
+        """Register the services of each message, and the polled services."""
         self._timed: tuple[Service, ...] = (
             self._intervals,
             self._parameters,
@@ -193,7 +194,7 @@ class Vehicle:
         return self.in_flight if reported is None else reported
 
     def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Action]:
-        """Take in the estimate for one IMU sample."""
+        """Process the estimate for one IMU sample."""
         self.health.on_state(state, sample)
         found = self.telemetry.on_state(state, sample)
         found += self._announcements.on_state(state, sample, now_us)
@@ -204,12 +205,12 @@ class Vehicle:
         return self._finish(found) if found else []
 
     def on_baro(self, sample: BaroSample, _now_us: int) -> list[Action]:
-        """Take in one barometer sample."""
+        """Process one barometer sample."""
         self.health.on_baro(sample)
         return self._finish(self.telemetry.on_baro(sample))
 
     def on_gps(self, fix: GpsFix, now_us: int) -> list[Action]:
-        """Take in one GPS fix."""
+        """Process one GPS fix."""
         self.health.on_gps(fix)
         had_home = self.telemetry.home is not None
         found = self.telemetry.on_gps(fix)
@@ -220,10 +221,10 @@ class Vehicle:
         return self._finish(found)
 
     def on_report(self, report: VehicleReport, now_us: int) -> list[Action]:
-        """Take in what the vehicle's own autopilot reports.
+        """Process a report of the vehicle's own autopilot.
 
         Home is set by the first fix after arming, unless the autopilot reports it. A reported one
-        is coarse: only a change that is greater than its steps moves home.
+        is coarse: only a change beyond its resolution moves home.
         """
         was_armed = self.telemetry.armed
         self.health.on_report(report)
@@ -237,7 +238,7 @@ class Vehicle:
         return self._finish(found)
 
     def _on_home(self, home: Location, time_us: int) -> list[Answer]:
-        """Take over the home that the vehicle's own autopilot reports, if it is another."""
+        """Set home to the one that the vehicle's own autopilot reports, if it differs."""
         telemetry = self.telemetry
         state, known = telemetry.state, telemetry.home
         if known is not None:
@@ -251,17 +252,17 @@ class Vehicle:
         return [telemetry.set_home(Home(home, time_us))]
 
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Action]:
-        """Take in the GPS latency that the estimator uses, and the one that is set, s."""
+        """Process the GPS latency that the estimator uses, and that of the settings, s."""
         return self._finish(self._announcements.on_latency(used_s, set_s, now_us))
 
     def on_node_status(self, status: NodeStatus, now_us: int) -> list[Action]:
-        """Take in a node's report about itself."""
+        """Process a node's report about itself."""
         findings = self.health.on_node_status(status)
         found = self.telemetry.on_node_status(status)
         return self._finish(found + self._announcements.on_findings(findings, now_us))
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Action]:
-        """Take in the state of the serial link and of all radio links."""
+        """Process the state of the serial link and of all radio links."""
         findings = self.health.on_link(report)
         found = self._announcements.on_link(report, now_us)
         return self._finish(found + self._announcements.on_findings(findings, now_us))
@@ -291,7 +292,7 @@ class Vehicle:
         return self._finish(answers)
 
     def _note_rejected(self, request: Request, now_us: int) -> list[Action]:
-        """List a request with a wrong signature, and log one now and then."""
+        """List a request with a wrong signature; log some of them."""
         self.requests.add(request, f"refused: {request.reason}", now_us)
         if now_us < self._rejection_due_us:
             return []
@@ -313,10 +314,10 @@ class Vehicle:
         return self._finish(answers)
 
     def introduction(self) -> list[Outgoing]:
-        """Encode what every ground station requests at its start, for a recording alone.
+        """Encode the answers that every ground station requests at its start, for a recording only.
 
-        Version, modes, parameters, home, and missions as if they were downloaded; in a sequence of
-        their own, so that no client counts a loss.
+        Version, modes, parameters, home, and missions as if they were downloaded, with separate
+        sequence numbers, so that no client counts a loss.
         """
         encoder = Encoder(self.system_id)
         asked = (
@@ -353,7 +354,7 @@ class Vehicle:
     def on_recorder(
         self, trouble: str, now_us: int, *, recording: bool, expected: bool = True
     ) -> list[Action]:
-        """Note whether a recording runs and should, or why not; the armed bit may follow it."""
+        """Note the state of the recorder, which the armed bit may follow."""
         self.health.recording, self.health.recording_expected = recording, expected
         return self._finish(self._recording.update(trouble, now_us, recording=recording))
 
@@ -392,7 +393,7 @@ class Vehicle:
         self._sign_by(settings.signing_passphrase)
 
     def _sign_by(self, passphrase: str) -> None:
-        """Sign and check with another key; the old one's timestamps are kept against replays."""
+        """Sign and check with another key; timestamps stay, so that old frames are not accepted."""
         key = key_from_passphrase(passphrase) if passphrase else None
         if key == self.signing_key:
             return

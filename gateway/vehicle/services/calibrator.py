@@ -1,15 +1,15 @@
-"""Calibration on command, of the samples as they are calibrated now.
+"""Calibration on command, from samples that have the present calibration.
 
 | command                     | what the operator does                | what is solved       |
 | --------------------------- | ------------------------------------- | -------------------- |
 | PREFLIGHT_CALIBRATION 1 = 1 | leave it at rest, 3 s                 | gyroscope bias       |
 | PREFLIGHT_CALIBRATION 5 = 2 | leave it level and at rest, 3 s       | tilt of the mounting |
 | PREFLIGHT_CALIBRATION 5 = 4 | leave it level and at rest, 3 s       | accelerometer bias   |
-| PREFLIGHT_CALIBRATION 5 = 1 | rest it on each of its six sides      | the same, and scale  |
+| PREFLIGHT_CALIBRATION 5 = 1 | rest it on each of its six sides      | bias and scale       |
 | PREFLIGHT_CALIBRATION 2 = 1 | turn it about all axes, up to 1 min   | hard and soft iron   |
 | FIXED_MAG_CAL_YAW           | leave it at rest at a heading, 3 s    | hard iron            |
 
-`gateway.sensing.calibrating` solves them. None is done in flight, where nothing is at rest.
+`gateway.sensing.calibrating` solves them. None is done in flight.
 
 Progress goes out as COMMAND_ACK (in progress) and as the `[cal]` texts that ground stations read;
 the result is an action, because the calibration belongs to another stage.
@@ -67,7 +67,7 @@ FIT_EVERY: Final = 50
 MOVED: Final = "it was moved"
 
 SIDES: Final = ("back", "front", "left", "right", "up", "down")
-"""Which side lies below when +x, -x, +y, -y, +z, -z reads plus one gravity; level is "down"."""
+"""The lower side when +x, -x, +y, -y, +z, -z measures plus one gravity; level is "down"."""
 
 
 Method = Callable[[NodeSamples, NodeCalibration], NodeCalibration]
@@ -79,7 +79,8 @@ METHODS: Final[dict[tuple[int, int, int], tuple[str, Method | None]]] = {
     (0, 0, 1): ("accel", None),
     (0, 1, 0): ("mag", None),
 }
-"""By the parameters 1, 2 and 5 of PREFLIGHT_CALIBRATION; with its solver if one rest suffices."""
+"""Kind by the parameters 1, 2 and 5 of PREFLIGHT_CALIBRATION; with its solver if one rest
+suffices."""
 
 
 @dataclass(slots=True)
@@ -94,7 +95,7 @@ class _Run:
     mag: list[Vec3] = field(default_factory=list)
     mag_times_us: list[int] = field(default_factory=list)
     poses: list[NodeSamples] = field(default_factory=list)
-    """Of each side that it lay on."""
+    """Samples of each side that it rested on."""
     progress: int = 0
 
     @property
@@ -112,7 +113,7 @@ class _Run:
         return self.began_us + (SIX_SIDES_TIMEOUT_US if self.has_sides else TIMEOUT_US)
 
     def add(self, sample: ImuSample) -> int:
-        """Collect a sample; return how long they span."""
+        """Collect a sample; return the time that all samples span."""
         self.samples.append(sample)
         if sample.mag_b_ut is not None and len(self.mag) < MAG_SAMPLES:
             self.mag.append(sample.mag_b_ut)
@@ -136,7 +137,7 @@ class _Run:
 class Calibrator(Service):
     """At most one calibration at a time, and none in flight.
 
-    The newest estimate, if there is any, is where the field of the Earth is looked up.
+    The field of the Earth is looked up at the position of the newest estimate, if there is one.
     """
 
     def __init__(self, in_flight: Callable[[], bool], state: Callable[[], NavState | None]) -> None:
@@ -180,7 +181,7 @@ class Calibrator(Service):
         return IN_PROGRESS, _text(f"calibration started: 2 {run.kind}")
 
     def on_sample(self, sample: ImuSample) -> list[Answer]:
-        """Take in one calibrated sample while a calibration is under way."""
+        """Process a calibrated sample during a calibration."""
         run = self._run
         if run is None:
             return []

@@ -1,15 +1,15 @@
 """Commands, each acknowledged once to its sender; message rates of single clients; queries.
 
-Recording on command is acknowledged when the recorder has started, not when it was requested to:
+Recording on command is acknowledged when the recorder has started, not at the request:
 
 | command       | recorder                        | answer                                   |
 | ------------- | ------------------------------- | ---------------------------------------- |
-| LOGGING_START | records already                 | ACCEPTED                                 |
+| LOGGING_START | is recording                    | ACCEPTED                                 |
 | LOGGING_START | idle                            | IN_PROGRESS, then one of the next three  |
-|               | has opened its files            | ACCEPTED to all who wait                 |
-|               | cannot open them                | FAILED to all who wait, and why as text  |
-|               | has not reported for 10 s       | FAILED to all who wait                   |
-| LOGGING_STOP  | any                             | ACCEPTED; FAILED to all who wait         |
+|               | has opened its files            | ACCEPTED to all waiting clients          |
+|               | cannot open them                | FAILED to them, and a text with a reason |
+|               | has not reported for 10 s       | FAILED to all waiting clients            |
+| LOGGING_STOP  | any                             | ACCEPTED; FAILED to all waiting clients  |
 
 A start that failed stays pending: the recorder retries by itself, and announces when it succeeds.
 """
@@ -43,14 +43,14 @@ REQUEST_MESSAGE: Final = mavlink.MAV_CMD_REQUEST_MESSAGE
 SET_INTERVAL: Final = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
 GET_INTERVAL: Final = mavlink.MAV_CMD_GET_MESSAGE_INTERVAL
 RESPOND_TO_ALL: Final = 2
-"""Last parameter of MAV_CMD_REQUEST_MESSAGE."""
+"""Value of the last parameter of MAV_CMD_REQUEST_MESSAGE: answer to all clients."""
 
 REFUSALS: Final = {
     mavlink.MAV_CMD_COMPONENT_ARM_DISARM: "A tracker cannot be armed: it controls nothing",
     mavlink.MAV_CMD_DO_SET_MODE: "A tracker has no modes to switch",
     mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: "The gateway is restarted on its own machine",
 }
-"""Commands that are understood but denied, and why."""
+"""Commands that are understood but denied, with the reason."""
 SHORTHANDS: Final = {
     mavlink.MAV_CMD_GET_HOME_POSITION: mavlink.MAVLINK_MSG_ID_HOME_POSITION,
     mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
@@ -60,18 +60,18 @@ SHORTHANDS: Final = {
 Outcome = tuple[int, list[Answer]]
 """Result of a command, and the answers after its acknowledgement."""
 Explain = Callable[[str, int], list[Answer]]
-"""Announces a text to all at a time: why something was refused."""
+"""Announces to all clients, at a time, the reason of a refusal."""
 Build = Callable[[int, int], Any]
 """Builds the message of an id at a time; None if there is nothing yet."""
 MAX_FAST_STREAMS: Final = 64
-"""Each costs an encoding of its own."""
+"""Maximum separate streams, since each message of one is encoded separately."""
 MIN_INTERVAL_US: Final = 1000
 MIN_TIMED_INTERVAL_US: Final = 20_000
-"""Of messages that no sample carries: faster they would only repeat themselves."""
+"""Least interval of messages that no sample carries: more often they would repeat the same."""
 MAX_REQUESTED: Final = 1024
-"""Clients come and go; the oldest requested intervals are discarded first."""
+"""Maximum requested intervals, since clients come and go; the oldest are discarded first."""
 KEEPS_CLIENTS_US: Final = US_PER_S
-"""A client that gets fewer heartbeats loses the vehicle."""
+"""Longest interval of heartbeats: with a longer one, a client reports the vehicle as lost."""
 DEFAULT: Final = 0
 NONE: Final = -1
 HEARTBEAT: Final = mavlink.MAVLINK_MSG_ID_HEARTBEAT
@@ -105,7 +105,8 @@ SINGLE: Final = {
     "AUTOPILOT_VERSION_REQUEST": mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
     "SET_GPS_GLOBAL_ORIGIN": mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
 }
-"""Older requests of one message. The origin is the first home; the answer has the one in use."""
+"""Older requests of one message. SET_GPS_GLOBAL_ORIGIN changes nothing: the origin is the first
+home, and the answer contains it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,7 @@ class Command:
     request: Request
     number: int
     params: tuple[float, ...]
-    """All seven; the fifth and sixth of a COMMAND_INT are its x and y."""
+    """All seven parameters; the fifth and sixth of a COMMAND_INT are its x and y."""
     frame: int = mavlink.MAV_FRAME_GLOBAL
 
     @property
@@ -179,7 +180,7 @@ class IntervalService(Service):
     def handle(self, request: Request, _now_us: int) -> list[Answer]:
         """Thin a group of messages by REQUEST_DATA_STREAM, which has no answer.
 
-        It only ever thins: its rate is for whole groups, and raising everything in them would
+        It only lowers rates: a rate is for whole groups, and raising all of their messages would
         flood the client.
         """
         message = request.message
@@ -350,7 +351,7 @@ class RecordingService(Service):
         self._explain = explain
         self._recording = False
         self._waiting: dict[int, Command] = {}
-        """The newest order to start of each client that waits for the outcome."""
+        """The newest start command of each client that waits for the outcome."""
         self._due_us: int | None = None
 
     def register(self, commands: CommandService) -> None:
@@ -376,7 +377,7 @@ class RecordingService(Service):
         return self._end(FAILED) + self._explain("Cannot record: no answer from the disk", now_us)
 
     def next_due_us(self) -> int | None:
-        """Return when to give up."""
+        """Return the time of the timeout."""
         return self._due_us
 
     def remove_client(self, client_id: int) -> None:
@@ -425,14 +426,14 @@ NOTHING: Final[dict[str, Callable[[Any], Any]]] = {
     "PARAM_EXT_REQUEST_READ": _no_extended_parameter,
     "PARAM_EXT_SET": _extended_parameter_refused,
 }
-"""Answers that there are no logs, no terrain data and no extended parameters."""
+"""Answers for requests of logs, terrain data and extended parameters, which do not exist."""
 
 
 class QueryService(Service):
     """Answer requests that need no state.
 
-    A ground station that gets no answer repeats its request for seconds, so a request of something
-    that does not exist here is answered too.
+    A ground station without an answer repeats its request for seconds, so requests of data that
+    does not exist here are answered too.
     """
 
     types = ("PING", "TIMESYNC", "SETUP_SIGNING", *SINGLE, *NOTHING)
@@ -466,6 +467,6 @@ class QueryService(Service):
         else:
             sender = (request.system_id, request.component_id)
             pong = mavlink.MAVLink_ping_message(message.time_usec, message.seq, *sender)
-            # One with a target is an answer.
+            # A message with a target is an answer.
             found = [] if message.target_system or message.target_component else [pong]
         return [request.reply(answer) for answer in found if answer is not None]

@@ -1,8 +1,8 @@
 """MAVLink FTP, for reading only: the component metadata and the packed parameters.
 
 Everything else is refused with the protocol's own error, with the session, the sequence number and
-the opcode of the request echoed: a client that gets a proper refusal goes on at once, one that
-gets none retries for a quarter of a minute.
+the opcode of the request echoed: a client that gets a proper refusal continues at once, one that
+gets none retries for 15 s.
 
 References
 ----------
@@ -27,11 +27,12 @@ PAYLOAD_BYTES: Final = 251
 MAX_DATA: Final = PAYLOAD_BYTES - HEADER.size
 MAX_SESSIONS: Final = 255
 MAX_SESSIONS_OF_ONE: Final = 4
-"""A client reads one file after the other; its oldest session gives way, and nobody else's."""
+"""Maximum sessions of a client, which reads one file after the other; for a further one, its own
+oldest session is closed."""
 MAX_ANSWERS: Final = 512
-"""Clients whose last answer is kept."""
+"""Maximum clients whose last answer is stored."""
 MIN_BURST_DATA: Final = 64
-"""A burst of single bytes would cost both sides sixty times as much."""
+"""Least data per packet of a burst, bytes: single bytes would cost both sides 60 times as much."""
 
 _SCHEME: Final = re.compile(r"mftp://(?:\[?;comp=\d+\]?)?", re.IGNORECASE)
 """The part before the path in a URI of the component metadata."""
@@ -40,7 +41,7 @@ ACK: Final = mavlink.MAV_FTP_OPCODE_ACK
 NAK: Final = mavlink.MAV_FTP_OPCODE_NAK
 WRITING: Final = range(mavlink.MAV_FTP_OPCODE_CREATEFILE, mavlink.MAV_FTP_OPCODE_RENAME + 1)
 File = bytes | Callable[[Request, str], bytes]
-"""The content, or a function of the request and the query of its path, such as `withdefaults=1`."""
+"""Content, or a function of the request and the query of its path, such as `withdefaults=1`."""
 
 
 class Opcode(IntEnum):
@@ -86,7 +87,7 @@ class Packet(NamedTuple):
     data: bytes
 
     def encode(self) -> bytes:
-        """Lay it out, padded to the payload's full length."""
+        """Encode it, padded to the payload's full length."""
         *head, data = self
         return (HEADER.pack(*head) + data).ljust(PAYLOAD_BYTES, b"\0")
 
@@ -153,7 +154,7 @@ class FtpService(TransferService):
             self._drop(number)
 
     def has_session(self, request: Request, packet: Packet) -> bool:
-        """Return whether the session of a request is one of this client's here."""
+        """Return whether the session of a request is one of the client's own."""
         session = self._sessions.get(packet.session)
         return session is not None and session.client_id == request.client_id
 
@@ -175,7 +176,8 @@ class FtpService(TransferService):
     def _open(self, request: Request, packet: Packet) -> tuple[int, bytes]:
         """Open a session, under the number of the request if that is free.
 
-        The server chooses the number [1]_, but MAVProxy ignores answers with another than its own.
+        The server chooses the number [1]_, but MAVProxy ignores answers whose number differs from
+        that of its request.
         """
         content = self._generate(*_path(packet), request)
         self._make_room(request)
@@ -186,7 +188,7 @@ class FtpService(TransferService):
         return number, struct.pack("<I", len(content))
 
     def _make_room(self, request: Request) -> None:
-        """Close a session left open: the client's own, or for a trusted client an untrusted one."""
+        """Close a session if there are too many: an own one, or for a trusted client an untrusted."""
         own = [n for n, s in self._sessions.items() if s.client_id == request.client_id]
         if len(own) >= MAX_SESSIONS_OF_ONE:
             self._drop(own[0])
@@ -204,7 +206,7 @@ class FtpService(TransferService):
         return b""
 
     def _reset(self, request: Request, _packet: Packet) -> bytes:
-        # One client's reset must not close another's files.
+        # A client's reset must not close the files of others.
         self.remove_client(request.client_id)
         return b""
 
@@ -270,10 +272,10 @@ def crc32(content: bytes) -> int:
 
 
 def _path(packet: Packet) -> tuple[str, str]:
-    """Read a path, however the client writes it, and the query behind it.
+    """Read a path, in any spelling of a client, and the query after it.
 
-    QGroundControl makes `//general.json` of `mftp:///general.json`, MAVSDK sends it without a
-    slash or as a URI with the component, MAVProxy lists `/`, an empty path or `.`.
+    For `mftp:///general.json` QGroundControl sends `//general.json`; MAVSDK sends it without a
+    slash or as a URI with the component; MAVProxy lists `/`, an empty path or `.`.
     """
     text = packet.data.split(b"\0", 1)[0].decode("utf-8", "replace")
     path, _, query = _SCHEME.sub("", text.strip()).partition("?")
@@ -281,7 +283,7 @@ def _path(packet: Packet) -> tuple[str, str]:
 
 
 def full_path(packet: Packet) -> str:
-    """Return the path of a request, with the query behind it."""
+    """Return the path of a request, with the query after it."""
     return "?".join(filter(None, _path(packet)))
 
 

@@ -22,20 +22,20 @@ An upload, seen from here:
 |        | a request had to be repeated    | three times: the ACK may be lost  |        |
 | idle   | the last item once more         | ACK accepted again                | idle   |
 
-MAVSDK repeats no item by itself. It counts the half seconds since it sent the newest item and the
+MAVSDK repeats no item by itself. It counts the half seconds since it sent the newest item, and the
 requests for older ones, and gives up at five: so a request is repeated a little sooner than after
-half a second, however slow the link is. An item that therefore comes twice is answered once:
+half a second, even on a slow link. An item that is therefore received twice is answered once:
 otherwise every later item would be sent twice too, and a second ACK would end the next upload.
-After a late request MAVSDK goes back to its item and ignores requests beyond the next one: so the
+After a late request MAVSDK returns to its item and ignores requests beyond the next one: so the
 item after the newest received one is requested again.
 
-What is stored changes only when an upload is complete. A download has no state: each request is
-answered from the store.
+The stored items change only when an upload is complete. A download has no state: each request is
+answered from the stored items.
 
-Old clients such as DroneKit know only MISSION_REQUEST and MISSION_ITEM, whose coordinates are
+Old clients such as DroneKit support only MISSION_REQUEST and MISSION_ITEM, whose coordinates are
 floats. A client that has never used the INT form is answered by MISSION_ITEM. While the form of a
-client is not known, every third request of an upload is a MISSION_REQUEST. A client that refuses
-that (MAVSDK, when both requests before were lost) is asked by MISSION_REQUEST_INT only.
+client is unknown, every third request of an upload is a MISSION_REQUEST. A client that refuses that
+(MAVSDK, when both requests before were lost) is then sent MISSION_REQUEST_INT only.
 """
 
 from collections.abc import Callable
@@ -61,11 +61,11 @@ REPEAT_US: Final = 400_000
 GIVE_UP_US: Final = 5 * US_PER_S
 """Timeout of an upload without progress; longer than the round trip of a slow link."""
 OLD_FORM_EVERY: Final = 3
-"""One in so many requests to a client of unknown form is in the older form."""
+"""Every n-th request to a client of unknown form is in the older form."""
 MAX_CLIENTS: Final = 512
-"""Clients whose form is stored."""
+"""Maximum clients whose form is stored."""
 CHECKS: Final = 3
-"""Further requests for the last item where the ACK may have been lost."""
+"""Number of further requests for the last item when the ACK may have been lost."""
 ALL: Final = mavlink.MAV_MISSION_TYPE_ALL
 CHANGING: Final = frozenset(
     {
@@ -85,7 +85,7 @@ Changed = Callable[[int], list[Answer]]
 
 @dataclass(slots=True)
 class _Upload:
-    """An upload, kept after its last item, as that may come again."""
+    """An upload, kept after its last item, because that may be received again."""
 
     request: Request
     """The MISSION_COUNT that began it."""
@@ -93,12 +93,12 @@ class _Upload:
     count: int
     due_us: int
     progress_us: int
-    """When the first missing item was requested first."""
+    """When the first missing item was first requested."""
     items: list[Item] = field(default_factory=list)
     wanted: int = 0
     """The requested item: the first missing one, or an earlier one where the client resumes."""
     repeats: int = 0
-    """Number of repeated requests for it: so many copies of that item may still come."""
+    """Number of repeated requests for it, each of which may still produce a copy of the item."""
     loses: bool = False
     """Whether any request had to be repeated."""
     checks: int = 0
@@ -123,14 +123,14 @@ class MissionService(Service):
         explain: Callable[[str, int], list[Answer]],
         empty: Callable[[], Items] = tuple,
     ) -> None:
-        """Start without items; `empty` returns the mission that is sent while there is none."""
+        """Start without items; `empty` returns the mission that is sent while none is stored."""
         self._empty = empty
         self.items: dict[int, Items] = dict.fromkeys(KINDS, ())
         self.current = 0
         self._changed = changed
         self._explain = explain
         self._forms: dict[Sender, bool] = {}
-        """Whether a client has used the INT form; without an entry it is not known yet."""
+        """Whether a client has used the INT form; without an entry this is unknown."""
         self._upload: _Upload | None = None
         self._handlers: dict[str, Callable[[Request, int], list[Answer]]] = {
             "MISSION_REQUEST_LIST": self._list,
@@ -167,7 +167,7 @@ class MissionService(Service):
         return handler(request, now_us)
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Request a missing item again; finally cancel the upload."""
+        """Request a missing item again, or cancel the upload after the timeout."""
         due_us, upload = self.next_due_us(), self._upload
         if upload is None or due_us is None or now_us < due_us:
             return []
@@ -220,7 +220,7 @@ class MissionService(Service):
         return mavlink.MAVLink_mission_current_message(self.current, total, state, 0)
 
     def download(self) -> list[Any]:
-        """Return the messages of a download of all that is stored, to nobody."""
+        """Return the messages of a download of all stored items, without a recipient."""
         found: list[Any] = []
         for kind, items in self.items.items():
             found.append(mavlink.MAVLink_mission_count_message(0, 0, len(items), kind))
@@ -309,7 +309,7 @@ class MissionService(Service):
         return [mission_ack(request, ACCEPTED), *self._store(upload.kind, tuple(upload.items))]
 
     def _stray_item(self, request: Request, done: _Upload | None) -> list[Answer]:
-        """Acknowledge a last item that comes again because the ACK was lost; deny what is new."""
+        """Acknowledge a repeated last item, whose ACK was lost; deny a new one."""
         kind, sequence = request.message.mission_type, request.message.seq
         if done is None or kind != done.kind or sequence >= done.count:
             return [mission_ack(request, mavlink.MAV_MISSION_ERROR)]
@@ -345,7 +345,7 @@ class MissionService(Service):
     def _end(self, request: Request, now_us: int) -> list[Answer]:
         """Handle a client's MISSION_ACK: the end of its download, or of its own upload.
 
-        What it accepts is a download, also if that comes late, after the begin of an upload.
+        An acceptance belongs to a download, even if it arrives after the begin of an upload.
         """
         upload = self._upload_of(request)
         if upload is None or upload.is_complete or request.message.type == ACCEPTED:

@@ -10,12 +10,12 @@
 | release | another is, or nobody                  | denied                    |
 | any     | the sender is not trusted              | denied                    |
 
-The station in control is known by its client and its MAVLink system id, so that frames of others
-with the same id neither keep control nor use it; the same station may request it again by another
-link. It loses control when its link closes, and when nothing was received from it for `TIMEOUT_US`.
-CONTROL_STATUS reports who is in control; it is sent with "exclusive" only, since a ground station
-that has received one expects to need control. This is the protocol's single-owner mode: there are
-no secondary stations.
+The station in control is identified by its client and its MAVLink system id, so that frames of
+others with the same id neither keep control nor use it; the same station may request it again by
+another link. It loses control when its link closes, or after `TIMEOUT_US` without a frame from it.
+CONTROL_STATUS reports the station in control; it is sent with "exclusive" only, since a ground
+station that has received one expects to need control. This is the protocol's single-owner mode:
+there are no secondary stations.
 
 The command has two orders of parameters. Definitions before 2026-04-15 begin with a system id, 0
 from a ground station; those since then with the action:
@@ -56,13 +56,13 @@ REQUEST_OPERATOR_CONTROL: Final = 32100
 """MAV_CMD_REQUEST_OPERATOR_CONTROL, which pymavlink's dialects lack."""
 SYSTEM_MANAGER: Final = 1
 TAKEOVER_ALLOWED: Final = 2
-"""GCS_CONTROL_STATUS_FLAGS."""
+"""Values of GCS_CONTROL_STATUS_FLAGS."""
 INTERVAL_US: Final = US_PER_S
 TIMEOUT_US: Final = 30 * US_PER_S
 
 REQUEST: Final = 1
 RELEASE: Final = 0
-"""Actions of the command."""
+"""Values of the action of the command."""
 TIMEOUTS_S: Final = (3, 60)
 """Shortest and longest timeout of a request, by which the two orders of parameters differ."""
 
@@ -81,18 +81,18 @@ class _Wanted:
     takeover: int
     timeout_s: float
     systems: range
-    """System ids that it may be sent by; empty for any."""
+    """System ids that may send it; empty for any."""
     is_former: bool
 
     def parameters(self, system_id: int) -> tuple[float, ...]:
-        """Return the command's parameters that pass a request of a system on."""
+        """Return the command's parameters that forward a system's request."""
         if self.is_former:
             return (system_id, self.action, self.takeover, self.timeout_s)
         return (self.action, self.takeover, self.timeout_s, system_id)
 
 
 def read_wanted(params: tuple[float, ...], sender: int) -> _Wanted:
-    """Read the command; where both orders are possible it is in the present one."""
+    """Read the command; if both orders are possible, the present one is assumed."""
     first, second, third, fourth, fifth = map(whole, params[:5])
     shortest, longest = TIMEOUTS_S
     is_former = first not in (RELEASE, REQUEST) or (
@@ -111,7 +111,7 @@ def read_wanted(params: tuple[float, ...], sender: int) -> _Wanted:
 @dataclass(slots=True)
 class _Operator:
     request: Request
-    """Its newest request of control."""
+    """Its newest request for control."""
     received_us: int
     """When its newest message was received."""
     allows_takeover: bool
@@ -120,7 +120,7 @@ class _Operator:
 
 
 class OperatorControl(Service):
-    """The ground station that controls one vehicle; if exclusive, only that may change things."""
+    """The ground station in control of one vehicle; if exclusive, only it may change things."""
 
     types = ("CHANGE_OPERATOR_CONTROL",)
 
@@ -135,7 +135,7 @@ class OperatorControl(Service):
         return not self.exclusive or self._is_operator(request)
 
     def denial(self, request: Request) -> str:
-        """Return why another station may not change things."""
+        """Return the reason why another station may not change things."""
         if self._operator is None:
             return "no station is in control; request it first"
         system_id = self._operator.request.system_id

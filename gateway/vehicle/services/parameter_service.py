@@ -32,7 +32,7 @@ from gateway.vehicle.services.plan_service import PlanService
 from gateway.vehicle.services.transfers import TransferService
 
 MAX_LISTENERS: Final = 512
-"""Clients that are sent changes."""
+"""Maximum clients that are sent changes."""
 BY_NAME: Final = -1
 PACKED_PATH: Final = "/@PARAM/param.pck"
 """The list as a file, which MAVProxy and Mission Planner read first."""
@@ -40,9 +40,9 @@ PACKED_PATH: Final = "/@PARAM/param.pck"
 WRITE: Final = 1
 RESET: Final = 2
 RESET_CALIBRATION: Final = 3
-"""PREFLIGHT_STORAGE_PARAMETER_ACTION."""
+"""Values of PREFLIGHT_STORAGE_PARAMETER_ACTION."""
 CALIBRATION: Final = "calibration"
-"""The section that holds the sensors' errors."""
+"""The section with the calibration of the sensors."""
 HOME_SECTION: Final = "home"
 
 UNKNOWN: Final = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
@@ -101,14 +101,14 @@ class ReadOnlyParameters(TransferService, Generic[Entry]):
         entry = self.entries().get(request.message.param_id)
         if entry is None:
             return [_error(request, UNKNOWN)]
-        # The error first: a client that sees only the old value would retry.
+        # The error first: a client that receives the old value first would retry.
         return [_error(request, error), self.value(entry, request.client_id)]
 
 
 class ParameterService(ReadOnlyParameters[Parameter]):
     """Parameters of one vehicle.
 
-    Those of home are no settings and have no defaults: the plan applies and keeps their changes.
+    The parameters of home are not settings and have no defaults: the plan applies and stores them.
     """
 
     def __init__(self, vehicle_id: int, table: ParameterTable, plan: PlanService) -> None:
@@ -154,8 +154,8 @@ class ParameterService(ReadOnlyParameters[Parameter]):
     def store(self, command: Command, _now_us: int) -> Outcome:
         """Carry out MAV_CMD_PREFLIGHT_STORAGE: store, or restore the defaults.
 
-        What is stored is acknowledged by `Vehicle.on_saved`, when the disk has it. The defaults
-        leave the sensors' calibration alone: it has its own reset.
+        Storing is acknowledged by `Vehicle.on_saved`, once the file is written. The defaults do
+        not change the sensors' calibration, which has its own reset.
         """
         asked = whole(command.params[0])
         if asked == WRITE:
@@ -176,12 +176,12 @@ class ParameterService(ReadOnlyParameters[Parameter]):
         return [self.value(entry, None).message for entry in self.table.parameters.values()]
 
     def packed(self, request: Request, query: str) -> bytes:
-        """Return the file of ArduPilot's parameters; who reads it is sent changes from then on."""
+        """Return the file of ArduPilot's parameters; its reader is sent changes from then on."""
         self.listen(request.client_id)
         return packed_parameters(self.table, query)
 
     def update(self, section: str, settings: Any) -> list[Answer]:
-        """Apply a section that was changed elsewhere, and send what differs."""
+        """Apply a section that was changed elsewhere, and send the values that differ."""
         before = self._numbers()
         self.table.sections[section] = settings
         return self._changed_since(before)
@@ -190,7 +190,7 @@ class ParameterService(ReadOnlyParameters[Parameter]):
         return {name: self.table.number(each) for name, each in self.table.parameters.items()}
 
     def _changed_since(self, before: Mapping[str, float]) -> list[Answer]:
-        """Send the values that differ from these."""
+        """Send the values that differ from `before`."""
         now = self._numbers()
         changed = [
             each for name, each in self.table.parameters.items() if before[name] != now[name]
@@ -198,7 +198,7 @@ class ParameterService(ReadOnlyParameters[Parameter]):
         return [answer for each in changed for answer in self._changed(each)]
 
     def _changed(self, parameter: Parameter) -> list[Answer]:
-        """Send the value of a parameter to the clients that listen; record it if none does."""
+        """Send the value of a parameter to the listening clients; without any, only record it."""
         clients = self._listeners or (RECORDED_ONLY,)
         return [self.value(parameter, client_id) for client_id in clients]
 

@@ -7,8 +7,8 @@ PX4. An integer that a client encodes byte-wise is understood all the same.
 A name has at most 16 characters and is made from the settings' own keys: `paper.alpha_gyro` becomes
 PAPER_ALPHA_GYRO and `rates.attitude_quaternion_hz` RATE_ATT_QUAT. The unit is left out (it is in
 the metadata), long words have fixed abbreviations, and a name that is still too long loses vowels
-after its first word. It depends on the section's keys alone, so that it stays the same when
-settings elsewhere come and go.
+after its first word. It depends on the section's keys alone, so that other settings may be added
+or removed without changing it.
 
 The component metadata describes the meaning, unit and range of each parameter as JSON [1]_. The
 file is compressed by xz, as the specification allows: 6 kB in place of 40 kB, which takes a 57600
@@ -90,7 +90,7 @@ ABBREVIATIONS: Final = {
 VOWELS: Final = frozenset("AEIOU")
 AXES: Final = ("X", "Y", "Z")
 ANGLES: Final = (("ROLL", "Roll", 180.0), ("PIT", "Pitch", 90.0), ("YAW", "Yaw", 180.0))
-"""The angles of a rotation: in names, in texts, and how far each goes to either side."""
+"""The angles of a rotation: in names, in texts, and the limit of each to either side, deg."""
 RotationAngles = tuple[
     Annotated[float, msgspec.Meta(ge=-180.0, le=180.0)],
     Annotated[float, msgspec.Meta(ge=-90.0, le=90.0)],
@@ -111,8 +111,8 @@ INTEGER_CODES: Final = {
 }
 GENERAL_PATH: Final = "/general.json"
 PARAMETER_PATH: Final = "/parameter.json.xz"
-"""Also for programs that know the names. Each vehicle announces names of its own, since programs
-download under the name: two vehicles would overwrite each other's file."""
+"""Path for programs with fixed paths. Each vehicle announces its own paths, since programs store
+a download under its name: two vehicles would overwrite each other's file."""
 TYPE_PARAMETER: Final = 1
 """COMP_METADATA_TYPE_PARAMETER."""
 MAX_SHORT: Final = 100
@@ -123,22 +123,22 @@ PLACES: Final = 4
 
 
 def without_unit(key: str) -> str:
-    """Take the unit off a key."""
+    """Remove the unit from a key."""
     head, _, tail = key.rpartition("_")
     return head if head and tail in UNITS else key
 
 
 @cache
 def parameter_name(section: str, key: str, axis: str = "") -> str:
-    """Name the parameter of a key of the innermost section that holds it."""
+    """Name the parameter of a key in its innermost section."""
     words = key.split("_")
-    # A key that repeats its section need not do so in the name.
+    # A key that begins with the name of its section does not repeat it.
     if words[0] != section:
         words.insert(0, section)
     short = [ABBREVIATIONS.get(word, word.upper()) for word in words]
     room = MAX_NAME - (len(axis) + 1 if axis else 0)
     while len("_".join(short)) > room:
-        # The first word stays whole: ground stations group parameters by it.
+        # The first word is not shortened: ground stations group parameters by it.
         longest = max(range(1, len(short)), key=lambda index: len(short[index]))
         short[longest] = _shorten(short[longest])
     return "_".join([*short, axis] if axis else short)
@@ -168,13 +168,13 @@ class Parameter:
 
     name: str
     section: str
-    """Key of the tree of settings that holds it."""
+    """Key of the tree of settings that contains it."""
     path: tuple[str, ...]
     """Keys within that tree."""
     axis: int | None
     """Component of a vector; of a rotation: roll, pitch or yaw."""
     field: Field
-    """The setting; of a rotation with its angles in place of its matrix."""
+    """The setting; for a rotation, with angles instead of the matrix."""
     index: int = 0
     """Its number among the parameters of its table."""
 
@@ -212,9 +212,9 @@ class ParameterTable:
         self.sections = dict(sections)
         self.kinds = tuple((key, type(tree)) for key, tree in sections.items())
         self.parameters = parameters_of(self.kinds)
-        """By name, in their order."""
-        # As they were set: a matrix alone would give others, where the pitch is a right angle or
-        # only some of the three have been set yet.
+        """Parameters by name, in their order."""
+        # The angles as they were set: the matrix alone would give others if the pitch is a right
+        # angle, or while only some of the three are set.
         self._angles: dict[tuple[str, ...], tuple[Matrix3, Vec3]] = {}
 
     def number(self, parameter: Parameter) -> float:
@@ -255,8 +255,8 @@ def packed_parameters(table: ParameterTable, query: str) -> bytes:
     for a default in the upper four bits; how many characters its name shares with the one before
     in the lower, and the number of others less one in the upper four bits; the other characters;
     the value; the default, if the flag is set. The padding at block boundaries in [1]_ is left
-    out: it protects against values that change between two reads, and a file here is fixed when it
-    is opened. Of the options of the query, `withdefaults=1` adds the defaults.
+    out: it protects against values that change between two reads, and here the content of a file is
+    fixed when it is opened. In the query, `withdefaults=1` adds the defaults.
 
     References
     ----------
@@ -354,14 +354,14 @@ class Metadata:
             **dict.fromkeys((self._general, GENERAL_PATH), general),
             **dict.fromkeys((parameters, PARAMETER_PATH), described),
         }
-        """By their FTP paths."""
+        """Files by their FTP paths."""
 
     def of(self, system_id: int) -> "Metadata":
-        """Return the same for another vehicle."""
+        """Return the metadata for another vehicle."""
         return Metadata(self._table, system_id)
 
     def describes(self, names: Collection[str]) -> bool:
-        """Return whether parameters, at least one, are those of this version."""
+        """Return whether all parameters (and at least one) are those of this version."""
         return bool(names) and set(names) <= self._table.parameters.keys()
 
     def of_parameters(self) -> dict[str, tuple[float, str]]:
@@ -387,12 +387,12 @@ def _named(path: str, system_id: int) -> str:
 def _described(kinds: tuple[tuple[str, type[Settings]], ...]) -> bytes:
     """Write the file that describes the parameters, once for all vehicles."""
     described = [_describe(parameter) for parameter in parameters_of(kinds).values()]
-    # CRC32 is the check that every decoder of xz supports; embedded ones lack the default, CRC64.
+    # Every decoder of xz supports the check CRC32; embedded ones lack the default, CRC64.
     return lzma.compress(_json({"version": 1, "parameters": described}), check=lzma.CHECK_CRC32)
 
 
 def _general(parameter_path: str, parameter_crc: int) -> bytes:
-    """Write the file that names the others."""
+    """Write the general metadata file, which lists the other files."""
     general = {
         "version": 1,
         "vendorName": "mavgate",
@@ -436,7 +436,7 @@ def _describe(parameter: Parameter) -> dict[str, Any]:
 
 
 def _first_sentence(text: str) -> str:
-    """Return the first sentence, cut at a word where it is longer than the schema allows."""
+    """Return the first sentence, cut after a word if it is longer than the schema allows."""
     sentence = text.split(". ")[0].rstrip(".")
     if len(sentence) <= MAX_SHORT:
         return sentence

@@ -1,6 +1,6 @@
-"""Home, the marked location, and the plan, as ground stations set them and as they are kept.
+"""Home, the marked location, and the plan: set by ground stations, and stored.
 
-The newest mark is valid, whoever set it: the current item of an uploaded mission, the first rally
+The newest mark is valid, from any source: the mission, from its current item on, the first rally
 point, a region of interest, a home set by command, or the command line.
 """
 
@@ -51,7 +51,7 @@ NUMBERS: Final = {"lat_deg": "lat_deg", "lon_deg": "lon_deg", "alt_m": "alt_amsl
 """Parameters of home, and the fields of `Location` that they set."""
 Say = Callable[[StatusText, int], list[Answer]]
 USE_CURRENT: Final = 1
-"""First parameter of MAV_CMD_DO_SET_HOME."""
+"""Value of the first parameter of MAV_CMD_DO_SET_HOME: use the current position."""
 
 
 class Mark:
@@ -60,10 +60,10 @@ class Mark:
     def __init__(self, location: Location | None = None, of: int | None = None) -> None:
         self.location = location
         self.of = of
-        """Kind of the stored items that it follows; None if it was put by itself."""
+        """Kind of the stored items that it follows; None if it was set on its own."""
 
     def put(self, location: Location | None) -> None:
-        """Mark a location, or none.
+        """Mark a location, or clear the mark with None.
 
         Raises ValueError if its coordinates are out of range; its height may be NaN.
         """
@@ -84,8 +84,8 @@ class Mark:
         """Encode distance and bearing to the mark; None without a mark or a position.
 
         The desired heading is the bearing; bearings are -180 to 180, as autopilots send them.
-        Desired roll and pitch and the crosstrack do not exist here and are NaN. The airspeed error
-        is 0, since none is desired; clients print it as an integer, so NaN would fail.
+        Desired roll and pitch and the crosstrack error do not exist here and are NaN. The airspeed
+        error is 0, since no airspeed is desired; clients print it as an integer, so NaN would fail.
         """
         mark = self.location
         if state is None or mark is None or not is_on_earth(state.lat_deg, state.lon_deg):
@@ -106,11 +106,11 @@ class Mark:
 
 
 class PlanService:
-    """Set home and the mark, and keep them and the missions over a restart.
+    """Set home and the mark, and store them and the missions over a restart.
 
     A home that the GPS measured is measured again at every start, which may be at another field;
-    one that an operator set is kept. A command keeps it at once, a parameter when the parameters
-    are stored.
+    one that an operator set is stored: at once if by a command, or with the parameters if by a
+    parameter.
     """
 
     def __init__(self, vehicle_id: int, telemetry: Telemetry, say: Say, stored: StoredPlan) -> None:
@@ -124,7 +124,7 @@ class PlanService:
         self._kept_home = stored.home
         self._announces_home = stored.home is not None
         self._entered: set[str] = set()
-        """Parameters of home that were set while there was none."""
+        """Parameters of home that were set while there was no home."""
         if stored.home is not None:
             telemetry.set_home(Home(stored.home, 0, "operator"))
         telemetry.add(
@@ -136,7 +136,7 @@ class PlanService:
         )
 
     def _empty_mission(self) -> tuple[Item, ...]:
-        """Return the mission that is sent while there is none: of ArduPilot, home as item 0.
+        """Return the mission that is sent while none is stored: for ArduPilot, home as item 0.
 
         DroneKit requests item 0 of every mission, and waits for it.
         """
@@ -157,7 +157,7 @@ class PlanService:
         commands.register(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, self._set_mission_current)
 
     def on_fix(self, fix: GpsFix, now_us: int) -> list[Answer]:
-        """Announce once how far a kept home is: it may be that of another field."""
+        """Announce once the distance of a stored home, which may be that of another field."""
         home = self._kept_home
         if home is None or not self._announces_home or not is_3d(fix):
             return []
@@ -166,7 +166,7 @@ class PlanService:
         return self._explain(f"Stored home is used, {distance_m:.0f} m from here", now_us)
 
     def put_mark(self, location: Location | None, now_us: int) -> list[Answer]:
-        """Mark a location, or none, and announce it."""
+        """Mark a location, or clear the mark with None, and announce it."""
         self.mark.put(location)
         text = "Mark cleared"
         if location is not None:
@@ -184,7 +184,7 @@ class PlanService:
     def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
         """Apply the change of a parameter of home.
 
-        Raises ValueError if there is no such home to name a source of.
+        Raises ValueError if the source is set and there is no such home.
         """
         value: Any = getattr(settings, key)
         if key == "source":
@@ -202,7 +202,7 @@ class PlanService:
         return self._put_home(Location(*(getattr(settings, each) for each in NUMBERS)), now_us)
 
     def store(self) -> list[Answer]:
-        """Keep the home that was set by parameters."""
+        """Store the home that was set by parameters."""
         self._keep_home()
         return [self._save()]
 
@@ -217,12 +217,12 @@ class PlanService:
         return [] if source == home.source else self._put_home(home.location, now_us)
 
     def _put_home(self, location: Location, now_us: int) -> list[Answer]:
-        """Set home for an operator, and send HOME_POSITION."""
+        """Set home as the operator's, and send HOME_POSITION."""
         self._entered.clear()
         return [self._telemetry.set_home(Home(location, now_us, "operator"))]
 
     def _keep_home(self) -> None:
-        """Keep the present home over a restart if an operator set it; else keep none."""
+        """Store the present home over a restart if an operator has set it; else store none."""
         home = self._telemetry.home
         self._kept_home = home.location if home and home.source == "operator" else None
 

@@ -1,4 +1,4 @@
-"""Lists and files that are sent a few answers at a time, each transfer in turn.
+"""Lists and files that are sent in batches of a few answers, each transfer in turn.
 
 That bounds the load of the gateway, and overflows neither a receive buffer nor a slow link.
 """
@@ -10,7 +10,7 @@ from gateway.vehicle.service import Answer, Service
 
 BATCH: Final = 10
 BATCH_INTERVAL_US: Final = 10_000
-"""Between batches of this many answers, for all transfers of a service together."""
+"""Size and interval of batches, for all transfers of a service together."""
 MAX_TRANSFERS: Final = 512
 
 
@@ -19,7 +19,7 @@ class TransferService(Service):
 
     def __init__(self) -> None:
         self._transfers: dict[int, Iterator[Answer]] = {}
-        """The answers that are left of each; whose turn it is comes first."""
+        """Remaining answers of each transfer; the first transfer is the next one to continue."""
         self._due_us = 0
 
     def poll(self, now_us: int) -> list[Answer]:

@@ -1,15 +1,15 @@
-"""Events of one aircraft as STATUSTEXT, at a limited rate: link, nodes, GPS, estimator's flags.
+"""Events of one aircraft as STATUSTEXT, at a limited rate: link, nodes, GPS, estimator flags.
 
 Theory of operation. Every topic ("link", "GPS fix", a flag of the estimator) has a state, and only
-a change of state is announced. After that the topic is held for `HOLD_US`; changes in the meantime
-are merged: at the end of the hold its state is announced if it differs from the last one
-announced. A flapping topic thus costs at most one text in `HOLD_US`, and the last text is always
+a change of state is announced. After that the topic is held for `HOLD_US`; further changes in this
+time are merged: at the end of the hold its state is announced if it differs from the last one
+announced. A flapping topic thus causes at most one text in `HOLD_US`, and the last text is always
 right. Single events that have no state go through `say`, at most `BUCKET` at once and one more
 every `REFILL_US`.
 
 One cause gives one text, and its end one more. A topic that follows from others (`CAUSES`) is
-announced as bad only after `GRACE_US` in which none of them was: a silent GPS node also takes the
-fix and then the position, and all of them recover in any order.
+announced as bad only after `GRACE_US` in which none of them was bad: a GPS node without data also
+causes the loss of the fix and then of the position, and they recover in any order.
 """
 
 from collections import deque
@@ -26,14 +26,15 @@ from gateway.vehicle.telemetry.health import GPS, Finding, Health, status_text
 
 HOLD_US: Final = 5 * US_PER_S
 GRACE_US: Final = 4 * US_PER_S
-"""A cause is found a few seconds after its first consequence, and ends as long before its last."""
+"""Longest time between a cause and its consequences: a cause is found a few seconds after the first
+of them, and ends as long before the last one ends."""
 BUCKET: Final = 10
 REFILL_US: Final = US_PER_S // 2
 TEXT_BYTES: Final = 50
-"""Length of STATUSTEXT's text; longer texts go out in chunks."""
+"""Length of the text of STATUSTEXT; longer texts are sent in chunks."""
 MAX_TEXT_BYTES: Final = 4 * TEXT_BYTES
 FlagTexts = tuple[tuple[NavFlags | ImuFlags, str, str], ...]
-"""A flag, the text when it rises, and the text when it falls."""
+"""A flag, the text when it is set, and the text when it is cleared."""
 FLAG_TEXTS: Final[FlagTexts] = (
     (NavFlags.ATTITUDE_VALID, "Attitude valid", "Attitude not valid"),
     (NavFlags.HEADING_VALID, "Heading valid", "Heading not valid"),
@@ -47,14 +48,14 @@ FLAG_TEXTS: Final[FlagTexts] = (
     (NavFlags.MAG_DISTURBED, "Magnetic field disturbed", "Magnetic field normal again"),
     (NavFlags.SENSOR_FAULT, "Sensor fault", "Sensors OK again"),
 )
-"""Of the estimator. DEGRADED only repeats one of the others."""
+"""Texts of the flags of the estimator. DEGRADED only repeats one of the others."""
 CAUSES: Final[dict[NavFlags | ImuFlags, tuple[str, ...]]] = {
     NavFlags.ATTITUDE_VALID: ("SENSOR_FAULT",),
     NavFlags.HEADING_VALID: ("ATTITUDE_VALID", "SENSOR_FAULT", "MAG_DISTURBED", "MAG_MISPLACED"),
     NavFlags.MAG_DISTURBED: ("MAG_MISPLACED",),
     NavFlags.DEAD_RECKONING: ("GPS", "GPS_REJECTED"),
 }
-"""Topics that a flag may follow from."""
+"""Topics that may cause a flag."""
 GOOD_FLAGS: Final = (NavFlags.ATTITUDE_VALID, NavFlags.HEADING_VALID)
 GPS_FIX: Final = Finding("GPS", True, StatusText(INFO, "GPS fix"))
 GPS_LOST: Final = Finding("GPS", False, StatusText(WARNING, "GPS fix lost"))
@@ -62,14 +63,14 @@ CALIBRATION_TEXTS: Final[FlagTexts] = (
     (ImuFlags.MAG_UNCALIBRATED, "Compass not calibrated", "Compass calibrated"),
     (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer not calibrated", "Accelerometer calibrated"),
 )
-"""Of the sensors."""
+"""Texts of the flags of the sensors."""
 UNCALIBRATED: Final = sum(int(flag) for flag, _, _ in CALIBRATION_TEXTS)
 INERTIAL: Final = UNCALIBRATED & ~int(ImuFlags.MAG_UNCALIBRATED)
 LATENCY_PARAMETER: Final = "REF_GPS_LATENCY"
 LATENCY_SETTLED_US: Final = 60 * US_PER_S
 LATENCY_SPREAD_S: Final = 0.02
-"""A latency that has not changed by more for so long has converged; the first manoeuvres of a
-flight may show one that is 0.08 s off."""
+"""A latency has converged if it has changed by less in `LATENCY_SETTLED_US`; after the first
+manoeuvres of a flight its error may be 0.08 s."""
 RESTART_REPORTS: Final = 10
 """Reports of the link, one a second, in which restarts of a node are counted."""
 MANY_RESTARTS: Final = 3
@@ -82,7 +83,7 @@ class _Topic:
     text: StatusText
     causes: tuple[str, ...] = ()
     held_until_us: int = 0
-    """Its state is not announced before."""
+    """Its state is not announced before this time."""
     bad_us: int = -GRACE_US - 1
     """When it was last bad."""
 
@@ -97,7 +98,7 @@ class Announcer:
     def __init__(self, bucket: int = BUCKET, refill_us: int = REFILL_US) -> None:
         self._topics: dict[str, _Topic] = {}
         self._pending: dict[str, _Topic] = {}
-        """Those whose state is not announced yet."""
+        """Topics whose state is not announced yet."""
         self._bucket = self._tokens = bucket
         self._refill_us = refill_us
         self._refilled_us = 0
@@ -175,9 +176,9 @@ def chunks(text: StatusText, number: int = 1) -> list[Answer]:
     """Encode a text as one STATUSTEXT, or as several chunks."""
     data = utf8(text.text, MAX_TEXT_BYTES)
     if len(data) <= TEXT_BYTES:
-        # Id 0 means a text of one chunk.
+        # The id 0 means a text of one chunk.
         return [Reply(mavlink.MAVLink_statustext_message(text.severity, data))]
-    # A receiver takes a chunk that is not full for the last one.
+    # A receiver treats a chunk that is not full as the last one.
     starts = range(0, len(data) + (len(data) % TEXT_BYTES == 0), TEXT_BYTES)
     return [
         Reply(
@@ -198,7 +199,7 @@ class Announcements(Announcer):
         self._flags = NavFlags(0)
         self._uncalibrated = 0
         self._restarts: dict[int, deque[int]] = {}
-        """How often each node had restarted in the last reports."""
+        """Number of restarts of each node in the last reports."""
         self._latency_s: float | None = None
         self._latency_since_us = 0
 
@@ -206,7 +207,7 @@ class Announcements(Announcer):
         """Announce changes of the sensors' and the estimator's flags."""
         changed = (sample.flags & UNCALIBRATED) ^ self._uncalibrated
         if changed and sample.mag_b_ut is None:
-            # The compass only once it has measured a field.
+            # The compass is announced only once it has measured a field.
             changed &= INERTIAL
         found: list[Answer] = []
         if changed:
@@ -258,12 +259,12 @@ class Announcements(Announcer):
         return [a for finding in findings for a in self.track(finding, now_us)]
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Answer]:
-        """Announce that the receiver or a node was lost or is back."""
+        """Announce that the receiver or a node is lost or is back."""
         lost, back = f"{report.name} lost: {report.port}", f"{report.name} connected: {report.port}"
         text = status_text(not report.connected, lost, back, CRITICAL)
         findings = [Finding("link", "connected" if report.connected else "lost", text)]
         if not report.connected:
-            # Without the receiver every node times out; that need not be announced.
+            # Without the receiver all nodes time out, which is not announced.
             return self.on_findings(findings, now_us)
         silent = self._health.silent_nodes(now_us)
         for node in sorted(self._health.known_nodes()):
@@ -273,11 +274,11 @@ class Announcements(Announcer):
         return self.on_findings(findings, now_us) + self._on_restarts(now_us)
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Announce what changed while its topic was held."""
+        """Announce the changes of topics whose hold has ended."""
         return self.on_fix(now_us) + super().poll(now_us)
 
     def _on_restarts(self, now_us: int) -> list[Answer]:
-        """Announce restarts one by one; many at once only as a state: no board starts so fast."""
+        """Announce restarts one by one; frequent ones as a state, since no board starts so fast."""
         found = []
         for node, restarts in sorted(self._health.restarts().items()):
             known = self._restarts.setdefault(node, deque([restarts], RESTART_REPORTS))

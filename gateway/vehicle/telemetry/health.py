@@ -1,7 +1,7 @@
 """Health of one aircraft: its sensors for SYS_STATUS, and its boards for BATTERY_STATUS and texts.
 
-RADIO_STATUS is sent only where the radio measures its signal: ground stations show the value for
-"unknown", the nRF24L01+'s, as -1 dBm. The losses of the radio are in SYS_STATUS too.
+RADIO_STATUS is sent only for radios that measure their signal (the nRF24L01+ does not): ground
+stations show the value for unknown as -1 dBm. The losses of the radio are in SYS_STATUS too.
 
 A node reports once a second the counters since its start. Most faults of cheap boards appear here
 first: a supply that sags when the radio sends, a broken cable to the sensors, a lost antenna. They
@@ -50,13 +50,14 @@ HYSTERESIS_V: Final = 0.1
 QUIET_REPORTS: Final = 10
 FAILED_SHARE: Final = 0.1
 RADIO_SPAN_US: Final = 10 * US_PER_S
-"""A GPS node sends so seldom that one lost payload is a tenth of a second's."""
+"""Span of the failed sends: a GPS node sends so rarely that in one second a single lost payload
+would be a tenth of all."""
 MAX_REPORTS: Final = 20
-"""In that time; a node reports once a second."""
+"""Maximum reports in `RADIO_SPAN_US`; a node reports once a second."""
 WORD: Final = 0xFFFF
-"""The nodes' counters have 16 bits, and wrap."""
+"""Mask of the nodes' counters, which have 16 bits and wrap."""
 BATTERY_TIMEOUT_US: Final = 10 * US_PER_S
-"""Autopilots report it every second or so, over links that lose many frames."""
+"""Timeout of a battery report: autopilots send one every second or so, and links lose many."""
 CELLS: Final = 10
 MV: Final = 1e3
 GYRO: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -70,7 +71,7 @@ GEOFENCE: Final = mavlink.MAV_SYS_STATUS_GEOFENCE
 PREARM: Final = mavlink.MAV_SYS_STATUS_PREARM_CHECK
 SENSORS: Final = (GYRO, ACCEL, MAG, PRESSURE, GPS)
 NODE_SENSORS: Final = ((NODE_IMU, GYRO | ACCEL), (1 << 1, MAG), (1 << 2, PRESSURE), (NODE_GPS, GPS))
-"""Bits of NodeStatus' masks, and the sensors they stand for."""
+"""Bits of the masks of NodeStatus, and their sensors."""
 
 
 class Finding(NamedTuple):
@@ -81,7 +82,7 @@ class Finding(NamedTuple):
     """False at the start."""
     text: StatusText
     causes: tuple[str, ...] = ()
-    """Topics that it follows from, if one of them is bad."""
+    """Topics that cause it if one of them is bad."""
 
 
 def status_text(is_bad: bool, bad: str, good: str, severity: int = WARNING) -> StatusText:
@@ -109,7 +110,7 @@ class _Radio:
     is_bad: bool = False
 
     def update(self, time_us: int, failed: int, rate_hz: int) -> int:
-        """Take in a report, and return how many sends failed in `RADIO_SPAN_US`."""
+        """Add a report, and return the number of failed sends in `RADIO_SPAN_US`."""
         self.failed.append((time_us, failed))
         while self.failed[0][0] <= time_us - RADIO_SPAN_US:
             self.failed.popleft()
@@ -143,11 +144,11 @@ class Health:
         """A lower supply is announced; 0 disables this."""
         self.recording = False
         self.recording_expected = True
-        """Whether ground stations are to be shown that nothing is recorded."""
+        """Whether a missing recording is reported to ground stations."""
         self.reported = Reported()
-        """What the vehicle's own autopilot reports, if it has one."""
+        """Reports of the vehicle's own autopilot, if it has one."""
         self.is_reported = False
-        """Whether it has reported anything."""
+        """Whether the autopilot has sent a report."""
         self._seen_us: dict[int, int] = {}
         self._boards: dict[int, _Board] = {}
         self._imu_flags = ImuFlags(0)
@@ -176,7 +177,7 @@ class Health:
     def on_state(self, state: NavState, sample: ImuSample) -> None:
         """Note an IMU sample and its estimate."""
         seen, seen_us = self._seen_us, sample.time_us
-        # Samples that waited in the kernel during a stall are older than the time it excuses.
+        # Samples that waited in the kernel during a stall are older than the end of the stall.
         if seen.get(GYRO, 0) > seen_us:
             seen_us = seen[GYRO]
         seen[GYRO] = seen[ACCEL] = seen_us
@@ -194,7 +195,7 @@ class Health:
         self._fix = fix
 
     def on_report(self, report: VehicleReport) -> None:
-        """Note what the vehicle's own autopilot reports."""
+        """Note a report of the vehicle's own autopilot."""
         self.is_reported = True
         if report.attitude_rad is not None:
             self._see(AHRS, report.time_us)
@@ -205,7 +206,7 @@ class Health:
         return GYRO in self._seen_us
 
     def has_state(self, now_us: int) -> bool:
-        """Return whether that from which the state comes is alive."""
+        """Return whether the source of the state is alive."""
         if self.has_imu:
             return self.is_alive(GYRO, now_us)
         return self.is_alive(AHRS, now_us) or self.is_alive(GPS, now_us)
@@ -219,13 +220,13 @@ class Health:
         known = self._boards.setdefault(number, _Board(status))
         before, known.status = known.status, status
         if status.node_time_us < before.node_time_us:
-            # It has restarted, and so have its counters.
+            # The node has restarted, and with it its counters.
             before = status
         errors = status.bus_errors - before.bus_errors & WORD
         failed = status.radio_failed - before.radio_failed & WORD
         failed = known.radio.update(status.time_us, failed, status.sample_rate_hz)
         if status.sensors_present & NODE_IMU:
-            # The share of a sample's time that the node's longest loop took.
+            # The duration of the node's longest loop as a share of the sample interval.
             self._load_permille = status.loop_max_us * status.sample_rate_hz // 1000
         name, bus_errors = self.node_name(number), known.bus.update(errors > 0)
         supply_v = status.supply_mv / MV
@@ -316,7 +317,7 @@ class Health:
             present |= AHRS
             healthy |= AHRS if self.is_alive(AHRS, now_us) else 0
         present |= PREARM | (LOGGING if self.recording or self.recording_expected else 0)
-        # There is no fence, so none is breached; MAVProxy reports a breach without this bit.
+        # Healthy, because there is no fence: MAVProxy reports a breach without this bit.
         healthy |= GEOFENCE
         enabled = present if self.recording else present & ~LOGGING
         healthy |= LOGGING if self.recording else 0
@@ -359,7 +360,7 @@ class Health:
         """Encode RADIO_STATUS of the weakest link; None if no radio measures its signal.
 
         Signal and noise are in dBm as signed bytes, which QGroundControl expects of any radio but
-        SiK's. Nothing is known of the other side, and nothing waits to be sent to it.
+        SiK's. The values of the remote side are unknown, and no data waits to be sent to it.
         """
         signals = [link.signal for link in self._links if link.signal is not None]
         if not signals:
@@ -378,7 +379,7 @@ class Health:
         )
 
     def _error_counts(self) -> list[int]:
-        """Sum up bus errors, failed sends, repeated sends and overruns, as SYS_STATUS has room."""
+        """Sum up bus errors, failed and repeated sends, and overruns, for the four error counts."""
         boards = self._boards.values()
         counts = (
             sum(board.status.bus_errors for board in boards),
@@ -436,7 +437,7 @@ class Health:
         return f"{node_role(board.status.sensors_present) if board else 'Node'} {node_id}"
 
     def restarts(self) -> dict[int, int]:
-        """Return how often each node has restarted."""
+        """Return the number of restarts of each node."""
         return {link.node.node_id: link.restarts for link in self._links}
 
     def gps_nodes(self) -> list[int]:

@@ -1,7 +1,7 @@
-"""Records to MAVLink messages: every unit, sign and "unknown" of the message definitions.
+"""Records to MAVLink messages, with the units, signs and values for unknown of the definitions.
 
-Where a definition has no value for "unknown", the function that builds the message documents the
-choice. Unknown floats are NaN throughout, which is MAVLink's own rule.
+If a definition has no value for unknown, the function that builds the message documents the choice.
+Unknown floats are always NaN, as MAVLink requires.
 """
 
 import math
@@ -28,7 +28,7 @@ from gateway.vehicle.plan import Home, Location, distance_and_bearing, is_3d
 from gateway.vehicle.telemetry.health import ACCEL, GPS, GYRO, MAG, PRESSURE, Health
 
 MIN_COURSE_SPEED_MPS: Final = 0.5
-"""Below this the direction of a GPS velocity is its noise."""
+"""Speed below which the direction of a GPS velocity is only noise."""
 
 MM: Final = 1e3
 CM: Final = 1e2
@@ -36,15 +36,16 @@ CENTI_DOP: Final = 1e2
 CENTI: Final = 1e2
 MILLI: Final = 1e3
 MIN_COS_SQ: Final = 1e-4
-"""Roll and yaw are indistinguishable at a pitch of 90 degrees; their variances stay finite."""
+"""Least square of the cosine of the pitch, so that the variances of roll and yaw, which are
+indistinguishable at 90 degrees, stay finite."""
 UNKNOWN_TERRAIN_M: Final = -10_000.0
-"""In ALTITUDE a terrain altitude below -1000 is unknown."""
+"""Unknown terrain altitude in ALTITUDE: any value below -1000."""
 DEGE5: Final = 1e5
 MS_US: Final = 1000
 
 FIX_TYPES: Final = {
     GpsFixType.NONE: mavlink.GPS_FIX_TYPE_NO_FIX,
-    # MAVLink knows no dead reckoning: without satellites there is no fix.
+    # MAVLink has no fix type for dead reckoning: without satellites there is no fix.
     GpsFixType.DEAD_RECKONING: mavlink.GPS_FIX_TYPE_NO_FIX,
     GpsFixType.FIX_2D: mavlink.GPS_FIX_TYPE_2D_FIX,
     GpsFixType.FIX_3D: mavlink.GPS_FIX_TYPE_3D_FIX,
@@ -81,7 +82,7 @@ GLOBAL_POSITION_INT: Final = encoding.MessagePacker(mavlink.MAVLink_global_posit
 VFR_HUD: Final = encoding.MessagePacker(mavlink.MAVLink_vfr_hud_message)
 HIGHRES_IMU: Final = encoding.MessagePacker(mavlink.MAVLink_highres_imu_message)
 SCALED_PRESSURE: Final = encoding.MessagePacker(mavlink.MAVLink_scaled_pressure_message)
-"""The messages of samples, which are sent most often."""
+"""Packers of the messages of samples, which are sent most often."""
 FAILURES: Final = (
     (GPS, mavlink.HL_FAILURE_FLAG_GPS),
     (PRESSURE, mavlink.HL_FAILURE_FLAG_ABSOLUTE_PRESSURE),
@@ -91,14 +92,14 @@ FAILURES: Final = (
 )
 HALF_DEGREES: Final = 2.0
 FIFTHS: Final = 5.0
-"""Of a metre a second."""
+"""Units of speed per metre a second."""
 TENTHS: Final = 10.0
 INT8_MAX: Final = 127
 UNKNOWN_PERCENT: Final = -1
 
 
 def boot_ms(time_us: int) -> int:
-    """Turn the gateway clock into `time_boot_ms`, which wraps after 49.7 days."""
+    """Convert gateway time to `time_boot_ms`, which wraps after 49.7 days."""
     return (time_us // MS_US) & encoding.UINT32_MAX
 
 
@@ -120,12 +121,12 @@ def has_position(state: NavState) -> bool:
 
 
 def global_position_int(state: NavState, reference_alt_m: float) -> Any:
-    """Encode the fused position; for states that have one.
+    """Encode the fused position of a state that has one.
 
-    Latitude, longitude and heights have no "unknown" in this message, and 0, 0 is a valid position;
-    so nothing is sent before the first position, and the estimate always from then on:
-    ESTIMATOR_STATUS reports its quality. Velocities have no "unknown" either and are zero in the
-    rare state that has a position but no velocity.
+    Latitude, longitude and heights have no value for unknown in this message, and 0, 0 is a valid
+    position; so it is not sent before the first position, and always from then on: ESTIMATOR_STATUS
+    reports the quality of the estimate. Velocities have no value for unknown either and are zero in
+    the rare state that has a position but no velocity.
     """
     heading = NAN
     if state.flags & NavFlags.HEADING_VALID:
@@ -149,10 +150,10 @@ def vfr_hud(
 ) -> Any:
     """Encode speed, heading, height and climb.
 
-    Without an airspeed its field carries the ground speed, as ArduPilot's does without such a
-    sensor, because clients print it as an integer, where NaN fails. Throttle is 0 where none is
-    reported. The heading is the yaw of ATTITUDE; without an attitude it is the heading alone where
-    that is reported, or else the course over ground, or 0.
+    Without an airspeed its field contains the ground speed, as in ArduPilot without such a sensor,
+    because clients print it as an integer, where NaN fails. Throttle is 0 if none is reported. The
+    heading is the yaw of ATTITUDE; without an attitude it is the reported heading, or else the
+    course over ground, or 0.
     """
     north, east, down = state.vel_n_mps
     speed = math.hypot(north, east)
@@ -168,8 +169,8 @@ def vfr_hud(
 def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, updated: int) -> Any:
     """Encode the calibrated sensors.
 
-    HIGHRES_IMU rather than SCALED_IMU: its floats keep the sensors' resolution, it carries the
-    barometer, and `fields_updated` marks the new values, where SCALED_IMU would have to send a
+    HIGHRES_IMU rather than SCALED_IMU: its floats keep the sensors' resolution, it contains the
+    barometer, and `fields_updated` marks the new values, whereas SCALED_IMU would have to send a
     plausible zero for an absent magnetometer. `updated` has the flags of the values that are new
     since the previous message; an unknown field is NaN.
     """
@@ -192,14 +193,14 @@ def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, upda
 
 
 def local_position_ned(state: NavState, origin: Location) -> Any:
-    """Encode position and velocity in the local frame; for states that have a position."""
+    """Encode position and velocity in the local frame, of a state that has a position."""
     return mavlink.MAVLink_local_position_ned_message(
         boot_ms(state.time_us), *local_position_m(state, origin), *state.vel_n_mps
     )
 
 
 def local_position_m(state: NavState, origin: Location) -> Vec3:
-    """Project a position onto the plane that touches the ellipsoid at the origin.
+    """Project a position onto the tangent plane of the ellipsoid at the origin.
 
     The projection is azimuthal equidistant, as autopilots use: distance and bearing from the origin
     are exact.
@@ -213,7 +214,7 @@ def local_position_m(state: NavState, origin: Location) -> Vec3:
 def odometry(state: NavState, origin: Location) -> Any:
     """Encode pose in the local frame and velocity in the body frame, with their variances.
 
-    The state has no correlations: these elements of the covariances are 0. The variances of the
+    The state has no correlations, so these elements of the covariances are 0. The variances of the
     angular rates are not estimated and are NaN.
     """
     return mavlink.MAVLink_odometry_message(
@@ -269,7 +270,7 @@ def _body_velocity_variances(state: NavState) -> Vec3:
 
 
 def altitude(state: NavState, baro: BaroSample | None, home_alt_m: float, origin: Location) -> Any:
-    """Encode the altitudes; the terrain and the clearance below, which are unknown, are not."""
+    """Encode the altitudes; terrain and clearance are unknown."""
     return mavlink.MAVLink_altitude_message(
         state.time_us,
         altitude_monotonic=state.alt_amsl_m if baro is None else baro.alt_pressure_m,
@@ -306,7 +307,7 @@ def scaled_imu(sample: ImuSample, mag_b_ut: Vec3) -> Any:
 
 
 def raw_imu(sample: ImuSample, mag_b_ut: Vec3) -> Any:
-    """Encode RAW_IMU in the units of SCALED_IMU, as ArduPilot does: clients expect these."""
+    """Encode RAW_IMU in the units of SCALED_IMU, as ArduPilot does and clients expect."""
     values = _milli_imu(sample, mag_b_ut)
     return mavlink.MAVLink_raw_imu_message(sample.time_us, *values, 0, _temperature_cdegc(sample))
 
@@ -322,7 +323,7 @@ def gps_global_origin(origin: Location, time_us: int) -> Any:
 
 
 def scaled_pressure(sample: BaroSample) -> Any:
-    """Encode the barometer; the differential pressure, which nothing measures, is NaN."""
+    """Encode the barometer; the differential pressure is not measured and is NaN."""
     press_diff, temperature_of_press_diff = NAN, 0
     return SCALED_PRESSURE(
         boot_ms(sample.time_us),
@@ -344,9 +345,8 @@ def gps_raw_int(fix: GpsFix, located: GpsFix | None = None) -> Any:
     While the receiver has no position, the last one is repeated with fix type NO_FIX, as autopilots
     do: 0, 0 is a valid position.
 
-    The receiver reports only the position's DOP, whose square is the sum of those of HDOP and
-    VDOP; it is divided by the accuracies, which are proportional to them. An extension field that
-    is not known is 0.
+    The receiver reports only the position's DOP, whose square is the sum of the squares of HDOP and
+    VDOP; it is divided in proportion to the accuracies. An unknown extension field is 0.
     """
     north, east, _ = fix.vel_n_mps
     speed = math.hypot(north, east)
@@ -373,7 +373,7 @@ def gps_raw_int(fix: GpsFix, located: GpsFix | None = None) -> Any:
 
 
 def dilutions(fix: GpsFix) -> tuple[float, float]:
-    """Return HDOP and VDOP; NaN without a fix, or if the receiver does not report enough."""
+    """Return HDOP and VDOP; NaN without a fix, or if the receiver reports too little for them."""
     accuracy_m = math.hypot(fix.h_acc_m, fix.v_acc_m)
     if not is_3d(fix) or not accuracy_m > 0.0:
         return NAN, NAN
@@ -411,7 +411,7 @@ def estimator_status(state: NavState) -> Any:
 
 
 def home_position(home: Home) -> Any:
-    """Encode home; its local position, the slope and the approach are not known."""
+    """Encode home; its local position, the slope and the approach are unknown."""
     return mavlink.MAVLink_home_position_message(
         encoding.int32(home.location.lat_deg * DEGE7_PER_DEG),
         encoding.int32(home.location.lon_deg * DEGE7_PER_DEG),
@@ -440,9 +440,9 @@ def high_latency2(
 ) -> Any:
     """Encode the state of the vehicle in 42 bytes.
 
-    Latitude, longitude and altitude have no "unknown" in this message, which is the only one of
-    its link, so it is sent before the first fix too: as PX4 does, with 0, 0, errors of UINT8_MAX
-    and the GPS failure flag. Nothing measures wind, airspeed or throttle.
+    Latitude, longitude and altitude have no value for unknown in this message, which is the only
+    one on its link, so it is also sent before the first fix: as in PX4, with 0, 0, errors of
+    UINT8_MAX and the GPS failure flag. Wind, airspeed and throttle are not measured.
     """
     failures = sum(flag for sensor, flag in FAILURES if not health.is_alive(sensor, now_us))
     h_acc_m = v_acc_m = NAN
@@ -458,7 +458,7 @@ def high_latency2(
         timestamp=boot_ms(now_us),
         type=kind,
         autopilot=autopilot,
-        # The upper half of PX4's, as PX4 sends it.
+        # The upper half of the mode, as PX4 sends it.
         custom_mode=CUSTOM_MODES[autopilot] >> 16,
         latitude=encoding.int32(known.lat_deg * DEGE7_PER_DEG) if known is not None else 0,
         longitude=encoding.int32(known.lon_deg * DEGE7_PER_DEG) if known is not None else 0,

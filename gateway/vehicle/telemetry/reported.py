@@ -1,7 +1,7 @@
-"""The newest of what a vehicle's own autopilot reports, and the messages of it.
+"""The newest reports of a vehicle's own autopilot, and the messages built from them.
 
-The reports are passed on with their own times. A part that has not been reported for the timeout of
-the settings is not known any more: its message is not sent, or has the value for unknown.
+The reports are passed on with their own times. A field that has not been reported for the timeout
+of the settings is unknown: its message is not sent, or contains the value for unknown.
 """
 
 import math
@@ -27,15 +27,15 @@ from gateway.vehicle.plan import is_3d
 
 UNKNOWN_QUAT: Final[Quat] = (NAN, NAN, NAN, NAN)
 WITHOUT_IMU_US: Final = 3 * US_PER_S
-"""A vehicle that has sent no IMU sample for so long has none: its fixes are its position."""
+"""Time without an IMU sample after which a vehicle's position is taken from its fixes."""
 MAX_CELLS: Final = 14
 JOINED_US: Final = 10 * US_PER_S
-"""How old the rest of a battery's report may be."""
+"""Maximum age of the other part of a battery report."""
 CHANNELS: Final = 18
 MAX_BATTERIES: Final = 8
 MAX_MODES: Final = 64
 OWN_MODE: Final = 1000
-"""Number of the first mode that ArduPilot does not have; its own are below 100."""
+"""First number of modes that ArduPilot does not have; its own numbers are below 100."""
 LOW_PERCENT: Final = 20.0
 _NUMBERS: Final = (
     "heading_rad",
@@ -58,13 +58,13 @@ class Reported:
         self.vehicle_type: int | None = None
         self.mode_changes = 0
         self.batteries: dict[int, tuple[int, BatteryReport]] = {}
-        """Time and content by number."""
+        """Time and content of the batteries, by number."""
         self._modes: list[str] = []
         self._newest: dict[str, tuple[int, Any]] = {}
-        """Time and value of other fields."""
+        """Time and value of the other fields."""
 
     def update(self, report: VehicleReport) -> None:
-        """Take over the fields that a report has."""
+        """Store the fields of a report."""
         for name in ("attitude_rad", "channels_us"):
             if value := getattr(report, name):
                 self._newest[name] = (report.time_us, value)
@@ -85,7 +85,7 @@ class Reported:
             self.custom_mode = self._number_of(report)
 
     def _joined(self, report: VehicleReport) -> BatteryReport:
-        """Join a battery with what another report holds of it: cells come apart from the rest."""
+        """Join a battery with its other report: cells are reported separately from the rest."""
         fresh = report.battery or BatteryReport()
         known = self.battery(report.time_us, JOINED_US, fresh.number)
         if known is None:
@@ -94,7 +94,7 @@ class Reported:
         return replace(known, **{name: v for name, v in fields if v == v and v != ()})
 
     def _number_of(self, report: VehicleReport) -> int:
-        """Return the number of a mode: ArduPilot's, or one in the order in which others came."""
+        """Return the number of a mode: ArduPilot's, or the next free one for another mode."""
         if report.custom_mode is not None:
             return report.custom_mode
         if report.mode not in self._modes and len(self._modes) < MAX_MODES:
@@ -102,7 +102,7 @@ class Reported:
         return OWN_MODE + self._modes.index(report.mode) if report.mode in self._modes else OWN_MODE
 
     def value(self, name: str, now_us: int, timeout_us: int) -> Any:
-        """Return a field that is not older than the timeout; None if there is none."""
+        """Return a field, or None if it is unknown or older than the timeout."""
         time_us, value = self._newest.get(name, (0, None))
         return value if value is not None and now_us - time_us <= timeout_us else None
 
@@ -156,13 +156,13 @@ class Reported:
         )
 
     def battery(self, now_us: int, timeout_us: int, number: int = 0) -> BatteryReport | None:
-        """Return a battery unless its report is old."""
+        """Return a battery, or None if its report is too old."""
         time_us, battery = self.batteries.get(number, (0, None))
         return battery if battery is not None and now_us - time_us <= timeout_us else None
 
 
 def battery_status(battery: BatteryReport) -> Any:
-    """Encode BATTERY_STATUS of the vehicle's battery; its cells, or else its whole voltage."""
+    """Encode BATTERY_STATUS of the vehicle's battery, with its cells or else the total voltage."""
     cells = battery.cells_v[:MAX_CELLS] or (battery.voltage_v,)
     mv = [encoding.uint16(cell * MV_PER_V) for cell in cells]
     first = [*mv[:10], *[encoding.UINT16_MAX] * (10 - len(mv[:10]))]

@@ -1,23 +1,23 @@
-"""When each message is due: at its own interval, on the clock of the samples that carry it.
+"""The schedule of each message: at its own interval, on the clock of the samples that trigger it.
 
 Theory of operation. A message about the attitude is most useful when its sample arrives, so no
-timer sends it: every sample is offered to its stream, and the stream takes the samples nearest to
-a grid of its own interval. Three effects could disturb that:
+timer sends it: every sample is offered to its stream, and the stream uses the samples nearest to a
+grid of its own interval. Three effects could disturb that:
 
 - *Drift.* The grid advances by the interval, not from the sample that was sent, so 50 Hz out of
   60 Hz samples stays 50 Hz.
 - *Beating.* With samples at nearly a multiple of the rate, the grid would slide across the samples
-  and now and then skip or double one. The grid therefore leans a sixteenth of the way towards
-  each sample it takes. Where the sample rate is within 3 % of a multiple the grid locks on, and
-  every n-th sample is sent; elsewhere the pulls cancel out over a period.
-- *Bursts.* After a gap, or where samples come slower than the interval, the moments that were
-  missed are left out, so a sample is sent once at most.
+  and occasionally skip or double one. The grid is therefore corrected by a sixteenth of the
+  difference to each sample that is sent. If the sample rate is within 3 % of a multiple, the grid
+  locks, and every n-th sample is sent; otherwise the corrections cancel out over a period.
+- *Bursts.* After a gap, or if samples arrive more slowly than the interval, the missed points of
+  the grid are skipped, so a sample is sent at most once.
 
-Messages that no sample carries (HEARTBEAT and the like) run on the same grid by `tick`.
+Messages that no sample triggers (such as HEARTBEAT) use the same grid by `tick`.
 
-Many intervals are multiples of each other, so messages whose grids begin at the same moment are
-due together, again and again, and the loop that sends them does nothing else meanwhile. `begin`
-sets them apart, and a gap leaves them so.
+Many intervals are multiples of each other, so messages whose grids begin at the same time are
+always due together, and sending them delays the event loop. `begin` gives them different starting
+times, which a gap does not change.
 """
 
 from collections.abc import Callable
@@ -31,10 +31,10 @@ OFF: Final = -1
 """Interval of a message that is not sent, as in MESSAGE_INTERVAL."""
 
 LEAN: Final = 16
-"""A sixteenth: locks within 3 % of a multiple, and averages jitter over 16 samples."""
+"""Divisor of the correction: locks within 3 % of a multiple, averages jitter over 16 samples."""
 PACE_WEIGHT: Final = 8
 MAX_PERIOD_US: Final = US_PER_S
-"""A longer gap says nothing about the pace of the samples."""
+"""A longer gap does not count as an interval of samples."""
 
 
 def interval_us(rate_hz: float) -> int:
@@ -43,14 +43,14 @@ def interval_us(rate_hz: float) -> int:
 
 
 class Pace:
-    """How far apart samples come, on average over the last few."""
+    """Average interval of the last samples."""
 
     def __init__(self) -> None:
         self._last_us: int | None = None
         self._period_us = 0
 
     def update(self, time_us: int) -> int:
-        """Use the time of a sample; return the present period in us; 0 at the first."""
+        """Add the time of a sample; return the present period in us, 0 at the first sample."""
         period_us = self._period_us
         if self._last_us is not None and 0 < (gap_us := time_us - self._last_us) <= MAX_PERIOD_US:
             period_us = period_us or gap_us
@@ -83,7 +83,7 @@ class Stream:
         return self.offer_paced(time_us, self._pace.update(time_us))
 
     def offer_paced(self, time_us: int, period_us: int) -> bool:
-        """Do the same where several streams are carried by the same samples, of a known pace."""
+        """Do the same with the known period of samples that several streams share."""
         interval_us = self.interval_us
         if interval_us == OFF:
             return False
@@ -98,7 +98,7 @@ class Stream:
         return True
 
     def tick(self, now_us: int) -> bool:
-        """Return whether a message that no sample carries is due."""
+        """Return whether a message that no sample triggers is due."""
         if self.interval_us == OFF:
             return False
         due_us = now_us if self.due_us is None else self.due_us
@@ -111,7 +111,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class NewestRecords:
-    """The newest records of one aircraft, each None until the first has come."""
+    """The newest records of one aircraft, each None until the first is received."""
 
     state: NavState | None
     sample: ImuSample | None
@@ -126,7 +126,7 @@ class AddedMessage:
     message_id: int
     rate_hz: float
     build: Callable[[NewestRecords], Any]
-    """Returns a message of pymavlink, or None while there is nothing to send."""
+    """Returns a pymavlink message, or None if there is nothing to send."""
 
 
 ADDED_MESSAGES: Final[dict[int, AddedMessage]] = {}
@@ -140,9 +140,9 @@ def add_message(
     Parameters
     ----------
     message_id : int
-        Of the `common` dialect, so that recordings and routers know it.
+        Id in the `common` dialect, so that recordings and routers support it.
     rate_hz : float
-        How often it is sent; a client may request another rate, as for any message.
+        Rate of the message; a client may request another one, as for any message.
     build : callable
         Builds it from the newest records.
 

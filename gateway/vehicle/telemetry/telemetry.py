@@ -1,4 +1,4 @@
-"""The telemetry of a vehicle, each message at its own rate; and whether the vehicle is in the air.
+"""The telemetry of a vehicle, each message at its own rate; and the landed state.
 
 Every message has one builder, which works from the newest records; the streams and the answer to
 a request for a single message share it.
@@ -63,7 +63,7 @@ LANDING_US: Final = 5 * US_PER_S
 VELOCITY_VALID: Final = int(NavFlags.VELOCITY_VALID)
 ALTITUDE_VALID: Final = int(NavFlags.ALTITUDE_VALID)
 SLOW: Final = 0.5
-"""Share of the take-off limits below which the vehicle has come down."""
+"""Share of the take-off limits below which the vehicle is slow and low."""
 STATE_MESSAGES: Final = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 0,
@@ -71,8 +71,8 @@ STATE_MESSAGES: Final = {
     mavlink.MAVLINK_MSG_ID_VFR_HUD: 30_000,
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 50_000,
 }
-"""Carried by IMU samples, each from so many µs after the first: at the usual rates no sample
-carries more than two. The quaternion comes first, because its latency is the visible one."""
+"""Messages sent with IMU samples, and the start of each after the first sample, us: at the usual
+rates no sample triggers more than two. The quaternion is first, because its latency is visible."""
 REQUESTED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_SCALED_IMU,
     mavlink.MAVLINK_MSG_ID_RAW_IMU,
@@ -80,8 +80,8 @@ REQUESTED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_ODOMETRY,
     mavlink.MAVLINK_MSG_ID_ALTITUDE,
 )
-"""Carried by IMU samples too, but sent only to clients that request them: QGroundControl that has
-received one ALTITUDE shows altitudes of no other message."""
+"""Messages sent with IMU samples only to clients that request them: after one ALTITUDE,
+QGroundControl shows altitudes of no other message."""
 CARRIED_MESSAGES: Final = frozenset({*STATE_MESSAGES, *REQUESTED_MESSAGES})
 TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_HEARTBEAT,
@@ -100,21 +100,21 @@ ATTITUDE_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
     mavlink.MAVLINK_MSG_ID_ATTITUDE,
 )
-"""Carried by the attitudes that the vehicle's own autopilot reports."""
+"""Messages sent with the attitudes that the vehicle's own autopilot reports."""
 POSITION_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
     mavlink.MAVLINK_MSG_ID_VFR_HUD,
 )
-"""Carried by fixes where there is no IMU."""
+"""Messages sent with fixes of a vehicle without an IMU."""
 APART_US: Final = 13_000
-"""Between the first of one timed message and of the next: with equal intervals, they would else be
-due at the same moments for ever. No multiple of 10 ms: they would come with samples at 100 Hz."""
+"""Time between the starts of successive timed messages: otherwise those with equal intervals would
+always be due together. Not a multiple of 10 ms, at which samples of 100 Hz arrive."""
 HEARTBEAT_HZ: Final = 1.0
-"""Clients expect heartbeats at this rate, and take a vehicle without them for lost."""
+"""Clients expect heartbeats at this rate, and report a vehicle without them as lost."""
 RADIO_STATUS_HZ: Final = 1.0
-"""As often as the links are counted."""
+"""Rate of the link reports."""
 RC_CHANNELS_HZ: Final = 5.0
-"""Only of a vehicle whose own autopilot reports its link or channels."""
+"""Sent only for a vehicle whose own autopilot reports its link or channels."""
 Builder = Callable[[int], Any]
 
 
@@ -156,7 +156,7 @@ class Telemetry:
         self.motion = Motion(settings.takeoff_speed_mps, settings.takeoff_height_m)
         self.home: Home | None = None
         self._origin: Home | None = None
-        """Origin of the local frame: the first home, which a later one does not move."""
+        """Origin of the local frame: the first home; a later home does not move it."""
         self.calibrating = False
         self.state: NavState | None = None
         self._reference_alt_m = NAN
@@ -166,24 +166,24 @@ class Telemetry:
         self._baro: BaroSample | None = None
         self.fix: GpsFix | None = None
         self._located_fix: GpsFix | None = None
-        """The newest with a position, which is repeated while there is none."""
+        """The newest fix with a position, which is repeated without a fix."""
         self._mag_b_ut = UNKNOWN_VEC3
         self._updated = 0
         self._first_us: int | None = None
-        """When the first fix came."""
+        """Time of the first fix."""
         self._announced_modes = 0
         self._batteries: dict[int, Stream] = {}
         self._unix_offset_us: int | None = None
         self.streams = {message_id: Stream(us) for message_id, us in _intervals(settings).items()}
         self._pace = Pace()
-        """Of the IMU samples."""
+        """Interval of the IMU samples."""
         self._timed_due_us: int | None = None
-        """When the next timed message is due; None if that must be computed."""
+        """When the next timed message is due; None if it must be computed."""
         self._state_due_us = 0
-        """No sample before it carries a message."""
+        """Time before which no sample triggers a message."""
         self._builders = self._own_builders()
         self._state_streams = [(self.streams[m], self._builders[m]) for m in STATE_MESSAGES]
-        """Schedule and builder of each message that IMU samples carry."""
+        """Schedule and builder of each message that IMU samples trigger."""
         self._timed = [*TIMED_MESSAGES]
         self._add_registered()
         self._polled = False
@@ -264,7 +264,7 @@ class Telemetry:
         return flying or recording or rule == "always"
 
     def on_state(self, state: NavState, sample: ImuSample) -> list[Answer]:
-        """Take in a navigation state and its IMU sample, and return the messages due."""
+        """Process a navigation state and its IMU sample, and return the messages due."""
         time_us = state.time_us
         if self.state is None:
             for message_id, after_us in STATE_MESSAGES.items():
@@ -274,7 +274,7 @@ class Telemetry:
         if sample.mag_b_ut is not None:
             self._mag_b_ut = sample.mag_b_ut
             self._updated |= messages.MAG_UPDATED
-        # Not NaN: the latitude first, which is not known for long without GPS.
+        # Tests for NaN, the latitude first, which is NaN for a long time without GPS.
         if (
             self._reference_alt_m != self._reference_alt_m
             and state.lat_deg == state.lat_deg
@@ -286,7 +286,7 @@ class Telemetry:
         return [] if time_us + period_us < self._state_due_us else self._carried(time_us, period_us)
 
     def _carried(self, time_us: int, period_us: int) -> list[Answer]:
-        """Build the messages that a sample carries, and note when the next one is due."""
+        """Build the messages that a sample triggers, and note when the next one is due."""
         found: list[Answer] = []
         soon_us, next_us = time_us + period_us, time_us + US_PER_S
         for stream, build in self._state_streams:
@@ -305,7 +305,7 @@ class Telemetry:
         return found
 
     def on_report(self, report: VehicleReport) -> list[Answer]:
-        """Take in a part of the state that the vehicle's own autopilot reports."""
+        """Process a report of the vehicle's own autopilot."""
         reported, time_us = self.health.reported, report.time_us
         reported.update(report)
         found: list[Answer] = [Reply(message) for message in named_values(report)]
@@ -324,7 +324,7 @@ class Telemetry:
         return found
 
     def _on_reported(self, time_us: int, carried: tuple[int, ...]) -> list[Answer]:
-        """Take in the state of a vehicle without an IMU of ours, and return its messages."""
+        """Update the state of a vehicle without an IMU of ours, and return its messages."""
         self.state = state = self.health.reported.state(time_us, self.fix, self.health.silent_us)
         if math.isnan(self._reference_alt_m) and messages.has_position(state):
             self._reference_alt_m = state.alt_amsl_m
@@ -335,7 +335,7 @@ class Telemetry:
         return [Reply(message) for message in built if message is not None]
 
     def _position_of_fix(self, fix: GpsFix) -> list[Answer]:
-        """Let a fix be the position of a vehicle that has no IMU."""
+        """Use a fix as the position of a vehicle that has no IMU."""
         if self._first_us is None:
             self._first_us = fix.time_us
         known = self.health.is_reported or fix.time_us - self._first_us >= WITHOUT_IMU_US
@@ -344,14 +344,14 @@ class Telemetry:
         return self._on_reported(fix.time_us, POSITION_MESSAGES)
 
     def on_baro(self, sample: BaroSample) -> list[Answer]:
-        """Take in a barometer sample, and return its message if due."""
+        """Process a barometer sample, and return its message if due."""
         self._baro = sample
         self._updated |= messages.PRESSURE_UPDATED
         stream = self.streams[mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE]
         return [Reply(messages.scaled_pressure(sample))] if stream.offer(sample.time_us) else []
 
     def on_gps(self, fix: GpsFix) -> list[Answer]:
-        """Take in a GPS fix, return its messages if due, and set home at the first good one."""
+        """Process a GPS fix, return its messages if due, and set home at the first good one."""
         self.fix = fix
         if messages.is_located(fix):
             self._located_fix = fix
@@ -404,7 +404,7 @@ class Telemetry:
         silent = not self.health.is_alive(GPS, now_us)
         wanted = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT].interval_us > 0
         if silent and wanted and mavlink.MAVLINK_MSG_ID_HEARTBEAT in due:
-            # Nothing else carries GPS_RAW_INT while the node is silent.
+            # Without data from the GPS node, no fix triggers GPS_RAW_INT.
             found.append(Reply(messages.gps_absent(now_us, self._located_fix)))
         return found
 
@@ -421,7 +421,7 @@ class Telemetry:
         return builder(now_us) if builder else None
 
     def _of_attitude(self, build: Callable[[NavState], Any]) -> Builder:
-        """Build nothing while the attitude is not known, as of a vehicle with GPS only."""
+        """Build a message only if the attitude is known; with GPS only it is not."""
 
         def builder(_now_us: int) -> Any:
             state = self.state
@@ -430,7 +430,7 @@ class Telemetry:
         return builder
 
     def _estimator_status(self, _now_us: int) -> Any:
-        """Build nothing for a state that is not an estimate of ours."""
+        """Build a message only for a state that is our own estimate."""
         known = self.state is not None and self._sample is not None
         return messages.estimator_status(self.state) if known and self.state else None
 
@@ -516,13 +516,13 @@ class Telemetry:
         return high_latency2(self._type, self.autopilot, self.state, self.fix, self.health, now_us)
 
     def _heartbeat(self, now_us: int) -> Any:
-        # The aircraft is flown by radio control; the gateway only watches.
+        # The aircraft is flown by radio control; the gateway does not control it.
         base_mode = mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
         if self.armed:
             base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
         autopilot = self.autopilot
         if autopilot != mavlink.MAV_AUTOPILOT_GENERIC or self.health.reported.mode:
-            # Clients name a mode of these autopilots by its number only.
+            # Clients look up the name of a mode of these autopilots by its number.
             base_mode |= mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         return mavlink.MAVLink_heartbeat_message(
             self._type,
@@ -547,7 +547,7 @@ class Telemetry:
 
 
 def _intervals(settings: VehicleSettings) -> dict[int, int]:
-    """Return the interval of every message; a rate's setting is named after its message."""
+    """Return the interval of every message; the setting of a rate has the name of its message."""
     found = dict.fromkeys(REQUESTED_MESSAGES, OFF)
     found[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = interval_us(HEARTBEAT_HZ)
     found[mavlink.MAVLINK_MSG_ID_RADIO_STATUS] = interval_us(RADIO_STATUS_HZ)
