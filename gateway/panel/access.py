@@ -36,13 +36,13 @@ HOLDER: Final = "mavgate.holder"
 MAX_BODY: Final = 1 << 20
 MAX_LOGIN_BODY: Final = 1 << 13
 LOGIN_S: Final = 10.0
-"""Longest time for the body of a login request."""
+"""Timeout of the body of a login request."""
 RECORDINGS: Final = "/recordings/"
 MAPS: Final = "/maps/"
-"""Paths below these two accept whole files."""
+"""Prefixes of the paths that accept whole files."""
 LOGIN_STYLE: Final = "/web/panel.css"
 PUSH: Final = "/push/"
-"""Paths without a login: its style, and posts of devices, which have a token."""
+"""Paths without a login: the style sheet of the login page, and posts of devices with a token."""
 API_PATHS: Final = ("/v1/", "/mavlink", "/helper/", "/ws/mavlink", "/info")
 """Paths of the REST and WebSocket API, which pages of `panel.origins` may use."""
 CORS_HEADERS: Final = {
@@ -57,13 +57,13 @@ CORS_HEADERS: Final = {
 }
 """Answer to an allowed page of another origin, its preflight request included."""
 MAX_DIGITS: Final = 18
-"""Of a length; Python reads no number of more than some thousand."""
+"""Maximum digits of a length; Python refuses numbers of some thousand digits."""
 LARGE_ANSWERS: Final = re.compile(r"(/mavlink2rest)?(/v1)?/mavlink(/|$)|/path/|/history/")
-"""Answers that may have megabytes: one at a time for each session."""
+"""Paths whose answers may have megabytes: one at a time for each session."""
 PIECE: Final = 1 << 16
 """Bytes of an answer that are handed to the connection at once."""
 WRITE_S: Final = 30.0
-"""Longest time until a client has taken a piece; it holds memory for so long."""
+"""Timeout of sending a piece, since a slow client occupies memory."""
 
 LOGIN_PAGE: Final = """<!doctype html><html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>mavgate</title>
@@ -143,7 +143,7 @@ class AccessControl:
             await _refuse(scope, receive, send, HTTPStatus.UNAUTHORIZED, "log in first")
 
     def _refusal(self, headers: Headers, *, is_allowed: bool) -> str:
-        """Return why a request is not from this page or an allowed one; empty if it is."""
+        """Return the reason to refuse a request of another page; empty if it is allowed."""
         host = headers.get("host", "")
         if not self._is_ours(host):
             return f"this panel is not called {host!r}; settings: panel.hosts"
@@ -163,7 +163,7 @@ class AccessControl:
         name = _split(f"//{host}").hostname or ""
         if name in self._names:
             return True
-        # An IP address cannot be rebound, as a name can.
+        # An IP address, unlike a name, cannot be rebound.
         return not self._is_local and _is_number(name)
 
     async def _pass_on(self, scope: Scope, receive: Receive, send: Send, token: str) -> None:
@@ -171,7 +171,7 @@ class AccessControl:
             await self._pass_websocket(scope, receive, send, token)
             return
         if scope.get("method") == "HEAD":
-            # Answered as GET; the server, which has the scope itself, leaves the body out.
+            # Answered as GET; the server, which has the original scope, omits the body.
             scope = {**scope, "method": "GET"}
         limit = self._upload_limit if scope["path"].startswith((RECORDINGS, MAPS)) else MAX_BODY
         refusal = _TooLargeError(limit)
@@ -196,7 +196,7 @@ class AccessControl:
             try:
                 await _send_in_pieces(send, message)
             except TimeoutError:
-                # The rest is dropped, as for a client that has left.
+                # The rest is dropped, as for a client that has disconnected.
                 self._on_stuck(tuple(scope.get("client") or ("", 0)))
 
         try:
@@ -207,7 +207,7 @@ class AccessControl:
                 await answer(scope, receive, with_headers(send))
 
     def _turn(self, scope: Scope) -> AbstractAsyncContextManager[None]:
-        """Wait for other large answers to the same session, or connection without one."""
+        """Wait for other large answers to the session, or to a connection without a session."""
         if scope["method"] != "GET" or not LARGE_ANSWERS.match(scope["path"]):
             return nullcontext()
         key = scope[HOLDER].session or tuple(scope.get("client") or ())
@@ -226,7 +226,7 @@ class AccessControl:
                 del self._sockets[token]
 
     def _end_session(self, token: str) -> None:
-        """End all that a session has opened."""
+        """End all connections and pages of a session."""
         self._on_session_end(token)
         for socket in self._sockets.get(token, ()):
             socket.close_soon()
@@ -314,29 +314,29 @@ class _SessionSocket:
 
 
 async def _answer(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Let a request be answered, unless the browser disconnects meanwhile."""
+    """Answer a request, unless the browser disconnects before the end."""
     left = False
 
-    async def heard() -> Message:
+    async def receive_noting() -> Message:
         nonlocal left
         message = await receive()
         left = message["type"] == "http.disconnect"
         return message
 
     try:
-        await app(scope, heard, send)
+        await app(scope, receive_noting, send)
     except ClientDisconnect:
         return
     except RuntimeError:
-        # Starlette's middleware misses an answer that nobody waits for any more.
+        # Starlette's middleware raises an error without an answer; after a disconnect none is due.
         if not left:
             raise
 
 
 async def _send_in_pieces(send: Send, message: Message) -> None:
-    """Send a part of an answer; raises TimeoutError if the client does not take it.
+    """Send a part of an answer; raises TimeoutError if the client does not read it.
 
-    The server waits for room between two pieces: of what is not read, only some are in memory.
+    The server waits for room between two pieces, so that only some unread pieces are in memory.
     """
     body = message.get("body", b"")
     for begin in range(0, len(body) - PIECE, PIECE):
@@ -377,7 +377,7 @@ def _closing(reason: str) -> Message:
 
 
 def _token(headers: Headers) -> str:
-    # The browser sends the cookies of all programs of this host, with whatever names they have.
+    # The browser sends the cookies of all programs on this host, which may have any names.
     for value in headers.getlist("cookie"):
         if (token := cookie_parser(value).get(COOKIE)) is not None:
             return token

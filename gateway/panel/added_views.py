@@ -20,7 +20,7 @@ class View:
     """One view of the page."""
 
     key: str
-    """Its name in the page's source."""
+    """Name in the page's source."""
     title: str
     icon: str
     """Name of a Material icon, which NiceGUI includes."""

@@ -1,9 +1,9 @@
-"""Admission of the panel's clients: places for their sessions, connections, pages and exports.
+"""Admission of the panel's clients: slots for their sessions, connections, pages and exports.
 
-Everything that a client may hold is bounded by the same rule. Each role has places of its own, so
-no viewer, and nobody without a login, takes a place from an operator. Within a role, a session and
-an address may hold a part of them; beyond that, a newcomer takes the oldest place of its own
-session or address, or else of the address that holds most.
+All resources of clients are bounded by the same rule. Each role has separate slots, so no viewer,
+and no client without a login, takes a slot from an operator. Within a role, a session and an
+address may hold a part of the slots; beyond that, a new item replaces the oldest one of its own
+session or address, or else of the address with the most slots.
 """
 
 import ipaddress
@@ -14,7 +14,7 @@ from enum import StrEnum
 from typing import Final, Generic, NamedTuple, TypeVar
 
 IPV6_PREFIX: Final = 64
-"""Bits of the network that one IPv6 subscriber usually gets."""
+"""Prefix length of the network that one IPv6 subscriber usually gets."""
 
 Item = TypeVar("Item")
 
@@ -27,14 +27,14 @@ class Role(StrEnum):
 
 
 class Holder(NamedTuple):
-    """A client that holds something."""
+    """A client that holds slots."""
 
     role: Role | None
     """None before the login."""
     session: str
     """Token of the session; empty for none, as without passwords."""
     address: str
-    """As by `address_group`."""
+    """Key of its address, from `address_group`."""
 
 
 LOCAL: Final = Holder(Role.OPERATOR, "", "")
@@ -43,18 +43,18 @@ LOCAL: Final = Holder(Role.OPERATOR, "", "")
 
 @dataclass(slots=True)
 class Places(Generic[Item]):
-    """Items of one kind by their holders; see the theory of operation above."""
+    """Slots for one kind of items, with their holders; see the rule in the module's docstring."""
 
     of_session: int
     of_address: int
     of_role: int
     evict: Callable[[Item], object] | None = None
-    """Ends an item that must make room; None if newcomers wait for room instead."""
+    """Ends an item that is replaced; None if new items wait for a free slot instead."""
     _held: dict[Item, Holder] = field(default_factory=dict)
-    """Oldest first."""
+    """Holders by item, oldest item first."""
 
     def admit(self, item: Item, holder: Holder) -> bool:
-        """Add an item; return False, and do not add it, if there is no room for it."""
+        """Add an item; return False, without adding it, if there is no slot for it."""
         self._held.pop(item, None)
         rules: list[tuple[int, Callable[[Holder], bool]]] = [
             (self.of_address, lambda held: held.address == holder.address),
@@ -80,11 +80,11 @@ class Places(Generic[Item]):
         return True
 
     def release(self, item: Item) -> Holder | None:
-        """Give a place back; return its holder, None if it had no place."""
+        """Free the slot of an item; return its holder, None if it had no slot."""
         return self._held.pop(item, None)
 
     def holder(self, item: Item) -> Holder | None:
-        """Return the holder of a place."""
+        """Return the holder of an item."""
         return self._held.get(item)
 
     def items(self) -> list[Item]:
@@ -93,7 +93,7 @@ class Places(Generic[Item]):
 
 
 def address_group(host: str) -> str:
-    """Return the key by which an address is limited: itself, or the network of an IPv6 one."""
+    """Return the key of the limit of an address: the address, or the network of an IPv6 one."""
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:

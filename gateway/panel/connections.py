@@ -1,4 +1,4 @@
-"""Connections to the panel: places by role, header timeouts, and clients that do not read.
+"""Connections to the panel: slots by role, header timeouts, and clients that do not read.
 
 Any client can open connections and send nothing. A connection has no holder until a request on it
 has passed access control; see `Places` for the limits. Each must send a complete request header
@@ -22,14 +22,14 @@ from gateway.panel.admission import Holder, Places, address_group
 log = logging.getLogger(__name__)
 
 CONNECTIONS_OF_SESSION: Final = 48
-"""A page needs up to eight."""
+"""Maximum connections of a session; a page needs up to eight."""
 CONNECTIONS_OF_ADDRESS: Final = 64
 CONNECTIONS_OF_ROLE: Final = 128
-"""Of operators, of viewers, and of clients that have not logged in."""
+"""Maximum connections of operators, of viewers, and of clients that have not logged in, each."""
 HEADER_S: Final = 10.0
-"""Longest time for a TLS handshake, and for a complete request header."""
+"""Timeout of a TLS handshake, and of a complete request header."""
 MAX_HEADER: Final = 1 << 16
-"""Bytes of a request header; browsers send less than 8 kB."""
+"""Maximum bytes of a request header; browsers send less than 8 kB."""
 BACKLOG: Final = 128
 Client = tuple[str, int]
 """Address and port of a peer."""
@@ -60,7 +60,7 @@ class ConnectionLimits:
             self._places.admit(client, holder)
 
     def shut(self, client: Client) -> None:
-        """Close a connection, whatever waits to be sent."""
+        """Close a connection, and discard data that waits to be sent."""
         self.refused += 1
         sock = self._sockets.pop(client, None)
         self._places.release(client)
@@ -92,8 +92,8 @@ class LimitedProtocol(HttpToolsProtocol):
         """Parse data; close the connection if a header is too long."""
         waits, headers = self._header_timer is not None, self._headers
         super().data_received(data)
-        # Only bytes that are all of one header count: data may also hold the end of a body before
-        # it, or the beginning of its own.
+        # Only data within one header counts: other data may contain the end of the previous body,
+        # or the beginning of the next.
         if waits and self._header_timer is not None and self._headers == headers:
             self._header_bytes += len(data)
             if self._header_bytes > MAX_HEADER:
@@ -134,7 +134,7 @@ class LimitedServer(uvicorn.Server):
     async def serve_on(self, sock: socket.socket, on_open: Callable[[], None]) -> None:
         """Serve on a bound socket until `should_exit` is set.
 
-        uvicorn's own `serve` takes over the signals of the process, and accepts without a limit.
+        uvicorn's own `serve` handles the signals of the process, and accepts without a limit.
         """
         self.lifespan = self.config.lifespan_class(self.config)
         await self.startup(sockets=[])

@@ -1,7 +1,7 @@
-"""Exchanges with aircraft of more than one message: parameters, metadata, calibration.
+"""Exchanges of several messages with aircraft: parameters, metadata, calibration.
 
-One for the whole panel, so that every open page sees the same, and a reloaded page finds a running
-calibration.
+All pages share the dialogue with an aircraft, so that they show the same, and a reloaded page finds
+a running calibration.
 """
 
 import asyncio
@@ -39,9 +39,9 @@ class Dialogue:
         self._reading: str | None = None
         """Metadata file that is being read."""
         self.calibration: CalibrationRun | None = None
-        """The newest one, running or finished."""
+        """The newest calibration, running or finished."""
         self.before: dict[str, float] = {}
-        """All parameters at its start."""
+        """All parameters at the start of the calibration."""
 
     def load(self, now_us: int) -> list[Any]:
         """Request the parameters and their metadata; return the messages to send."""
@@ -54,7 +54,7 @@ class Dialogue:
 
     @property
     def unanswered(self) -> CalibrationStep | None:
-        """The step that was calibrated but neither stored nor undone yet."""
+        """The calibrated step that is neither stored nor undone yet."""
         run = self.calibration
         return run.step if run is not None and run.state is RunState.DONE else None
 
@@ -85,7 +85,7 @@ class Dialogue:
         return found + self._follow_files(now_us)
 
     def _follow_files(self, now_us: int) -> list[Any]:
-        """Read the general metadata file, then the parameters' one; each is parsed only once."""
+        """Read the general metadata file, then that of the parameters; each is parsed only once."""
         path, following = self._reading, None
         if path is None or self.files.busy:
             return []

@@ -1,4 +1,4 @@
-"""The last minutes fused again by every estimator, with the present parameters.
+"""Comparison of all estimators on the last minutes, with the present parameters.
 
 It runs in a separate process, so that the page is not blocked.
 """
@@ -35,13 +35,13 @@ from gateway.units import US_PER_S
 from gateway.vehicle.services.parameters import ParameterTable
 
 LEAST_S: Final = 20.0
-"""Shorter spans show only the convergence."""
+"""Shortest span for a comparison, s: a shorter one shows only the convergence."""
 LEAST_HZ: Final = 20.0
 SHOWN_HZ: Final = 5.0
 
 
 class ComparisonError(ValueError):
-    """There is too little data to fuse; the text names the missing data."""
+    """Too little data to fuse; the text names the missing data."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Estimate:
 
     name: str
     time_us: IntArray
-    """On the panel's clock."""
+    """Time on the panel's clock."""
     roll_deg: FloatArray
     pitch_deg: FloatArray
     yaw_deg: FloatArray
@@ -62,7 +62,7 @@ class Estimate:
 def compare(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estimate]:
     """Fuse the frames with each estimator; raises ComparisonError if the frames are too few.
 
-    If they came too slowly over the whole time, the newest alone are used.
+    If their rate is too low over the whole time, only the newest ones are used.
     """
     settings = settings_of(parameters)
     try:
@@ -88,7 +88,7 @@ def settings_of(parameters: Mapping[str, float]) -> FusionSettings:
         try:
             table.change(parameter, value)
         except ValueError:
-            # Out of range, as from another version: use the default.
+            # A value out of range, as from another version: use the default.
             continue
     estimation = table.sections["estimation"]
     assert isinstance(estimation, EstimationSettings)
@@ -102,7 +102,7 @@ async def compare_apart(frames: TimedFrames, parameters: Mapping[str, float]) ->
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(pool, compare, frames, dict(parameters))
     finally:
-        # The page is not blocked until the process has ended.
+        # In a thread, so that waiting for the process does not block the page.
         pool.shutdown(wait=False)
 
 
@@ -115,7 +115,7 @@ def _flight_of(frames: TimedFrames, settings: FusionSettings) -> tuple[Flight, i
             [TableBlock(rows)], NodeCalibration(), settings, name="the last minutes", description=""
         )
     except ValueError as error:
-        raise ComparisonError("no sensor samples came yet") from error
+        raise ComparisonError("no sensor samples received yet") from error
     rate_hz = (len(flight.time_us) - 1) / max(flight.duration_s, 1.0 / LEAST_HZ)
     if flight.duration_s < LEAST_S or rate_hz < LEAST_HZ:
         raise ComparisonError(

@@ -1,7 +1,7 @@
 """A flight as one HTML file that needs no network: its data, and the panel's own web components.
 
-The recording's MAVLink messages (of a table, those of its fusion) go through the panel's own state
-of an aircraft, whose columns are stored as differences of integers. Data and scripts are packed;
+The recording's MAVLink messages (for a table, those of its fusion) update the panel's own state of
+an aircraft, whose columns are stored as differences of integers. Data and scripts are compressed;
 the browser unpacks them and runs the scripts as modules.
 """
 
@@ -45,12 +45,12 @@ COMPONENTS: Final = (
     "flight_display.js", "flight_scene.js", "flight_map.js", "number_strip.js", "flight_plots.js",
     "flight_page.js",
 )  # fmt: skip
-"""Those of the panel, the last of which contains the others."""
+"""Components of the panel; the last one contains the others."""
 STEP_US: Final = 250_000
-"""Between two states of the page, which interpolates."""
+"""Interval of the states in the page, which interpolates between them."""
 COMPARED_STEP_US: Final = US_PER_S // 2
 MAX_ROWS: Final = 80_000
-"""States of one aircraft: more than five hours; of a longer flight every n-th is kept."""
+"""Maximum states of one aircraft: more than five hours; of a longer flight every n-th is kept."""
 MAX_TEXTS: Final = 2000
 READ: Final = frozenset(
     MESSAGE_IDS[name]
@@ -60,14 +60,14 @@ READ: Final = frozenset(
         "ESTIMATOR_STATUS", "NAV_CONTROLLER_OUTPUT",
     )
 )  # fmt: skip
-"""Messages that a state is made of."""
+"""Messages from which a state is built."""
 RESOLUTION: Final = {
     "lat_deg": 1e-6, "lon_deg": 1e-6, "q_nb.0": 5e-4, "q_nb.1": 5e-4, "q_nb.2": 5e-4,
     "q_nb.3": 5e-4, "fix_type": 1.0, "satellites": 1.0, "heading_deg": 1.0, "battery_v": 0.01,
     "battery_percent": 1.0, "mark_distance_m": 1.0, "mark_bearing_deg": 1.0,
 }  # fmt: skip
 DEFAULT_RESOLUTION: Final = 0.1
-"""Of the other columns, m or m/s."""
+"""Resolution of the other columns, m or m/s."""
 LEFT_OUT: Final = frozenset(
     {*(f"rate_b_radps.{n}" for n in range(3)), *(f"vel_n_mps.{n}" for n in range(3))}
 )
@@ -83,7 +83,7 @@ LIBRARIES: Final = {
         "Leaflet, (c) Volodymyr Agafonkin, CloudMade and contributors, BSD-2-Clause",
     ),
 }
-"""By the name that the components import: file below NiceGUI's folder, and licence."""
+"""File below NiceGUI's folder, and licence, by the name that the components import."""
 LEAFLET_CSS: Final = "elements/leaflet/dist/leaflet/leaflet.css"
 
 
@@ -100,9 +100,9 @@ class PageFlight:
     """Times at which the track of an aircraft begins again after an interruption, µs."""
     distances: dict[int, GroundDistance] = field(default_factory=dict)
     texts: list[tuple[int, int, int, str]] = field(default_factory=list)
-    """Time in µs, system id, severity, text."""
+    """Time in µs, system id, severity and text of each STATUSTEXT."""
     compared: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
-    """By estimator: `time_us`, `roll_deg`, `pitch_deg`, `yaw_deg`, `alt_amsl_m`."""
+    """Columns by estimator: `time_us`, `roll_deg`, `pitch_deg`, `yaw_deg`, `alt_amsl_m`."""
     remarks: list[str] = field(default_factory=list)
 
 
@@ -148,12 +148,12 @@ def _add(flight: PageFlight, message: VehicleMessage, reader: Any, track: Contin
 
 
 def begin_comparison(files: Sequence[Path], options: ReadOptions) -> Connection:
-    """Fuse the sensor data of a recording with every estimator, in a process of its own."""
+    """Fuse the sensor data of a recording with every estimator, in a separate process."""
     return begin_copy(_compare, (files, options))
 
 
 def add_comparison(flight: PageFlight, compared: Connection) -> None:
-    """Wait for a comparison, and add it; a remark says if there is none."""
+    """Wait for a comparison, and add it, or else a remark with the reason why there is none."""
     try:
         unix_us_at_zero, tracks = compared.recv()
     except EOFError:
@@ -166,7 +166,7 @@ def add_comparison(flight: PageFlight, compared: Connection) -> None:
 
 
 def _compare(argument: tuple[Sequence[Path], ReadOptions], sender: Connection) -> None:
-    """Send the civil time of the clock's zero and the tracks, or the reason why there are none."""
+    """Send the civil time of clock time zero and the tracks, or the reason why there are none."""
     try:
         sensors, table, _ = flight_of_files(*argument, name="")
         tracks = {
@@ -200,7 +200,7 @@ def render_page(flight: PageFlight) -> str:
     packed["modules"] = _packed(json.dumps(sources))
     css = "\n".join(
         [
-            # These rules draw no pictures.
+            # These rules use no images.
             re.sub(r"url\([^)]*\)", "none", (folder / LEAFLET_CSS).read_text()),
             (WEB / "panel.css").read_text(),
         ]

@@ -16,7 +16,7 @@ from gateway.panel.admission import Holder, Places, Role, address_group
 from gateway.panel.panel_settings import LOOPBACK
 
 COST: Final = 1 << 15
-"""scrypt's N with r = 8 and p = 1: 32 MB and some 0.1 s, once a login."""
+"""scrypt's N, with r = 8 and p = 1: 32 MB and some 0.1 s for each login."""
 BLOCK: Final = 8
 MEMORY: Final = 64 << 20
 SALT_BYTES: Final = 16
@@ -24,15 +24,15 @@ SESSION_S: Final = 12 * 3600
 SESSIONS_OF_ADDRESS: Final = 16
 SESSIONS_OF_ROLE: Final = 32
 MAX_ATTEMPTS: Final = 5
-"""Attempts of one address within `ATTEMPT_WINDOW_S`; a right password clears them."""
+"""Maximum attempts of one address within `ATTEMPT_WINDOW_S`; a correct password clears them."""
 ATTEMPT_WINDOW_S: Final = 60.0
 MAX_PEERS: Final = 256
 MAX_WAITING: Final = 4
-"""Passwords of one network that wait to be hashed."""
+"""Maximum passwords of one network that wait to be hashed."""
 MAX_NETWORKS: Final = 16
-"""Networks with passwords that wait: an operator waits for one hash of each, some seconds."""
+"""Maximum networks with waiting passwords: an operator waits for one hash of each, some s."""
 MAX_KNOWN: Final = 64
-"""Addresses of successful logins that are remembered."""
+"""Maximum stored addresses of successful logins."""
 
 
 def hash_password(password: str) -> str:
@@ -52,11 +52,11 @@ def matches(password: str, hashed: str) -> bool:
 
 
 class BusyError(Exception):
-    """Too many others wait."""
+    """Too many callers are waiting."""
 
 
 class FairTurns:
-    """Let one caller at a time pass; those who wait get their turns by group, one after another."""
+    """A lock that waiting callers get in turn by group, one caller of each group after another."""
 
     def __init__(self) -> None:
         self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
@@ -64,7 +64,7 @@ class FairTurns:
 
     @asynccontextmanager
     async def turn(self, group: str, *, is_known: bool) -> AsyncIterator[None]:
-        """Wait for a turn; raises BusyError if too many wait, which a known group never does."""
+        """Wait for a turn; raises BusyError if too many of the group, or other groups, wait."""
         if self._is_taken:
             waiting = self._waiting.get(group, ())
             if len(waiting) >= MAX_WAITING or (
@@ -76,7 +76,7 @@ class FairTurns:
             try:
                 await turn
             except asyncio.CancelledError:
-                # Given the turn and cancelled at once: it is passed on.
+                # The turn was given to this caller, which was cancelled: pass it on.
                 if turn.done() and not turn.cancelled():
                     self._pass_on()
                 raise
@@ -106,7 +106,7 @@ class Logins:
     operator_hash: str
     viewer_hash: str
     on_close: Callable[[str], object] = lambda _: None
-    """Called with the token of a session that has ended, for whatever reason."""
+    """Called with the token of a session that has ended, for any reason."""
     _sessions: dict[str, tuple[Role, float]] = field(default_factory=dict)
     _places: Places[str] = field(init=False)
     _attempts: dict[str, deque[float]] = field(default_factory=dict)
@@ -115,7 +115,7 @@ class Logins:
     """Addresses from which a login has succeeded, the last one at the end."""
 
     def __post_init__(self) -> None:
-        """Make the places of the sessions."""
+        """Create the slots of the sessions."""
         self._places = Places(
             SESSIONS_OF_ROLE, SESSIONS_OF_ADDRESS, SESSIONS_OF_ROLE, self.close_session
         )
@@ -138,8 +138,8 @@ class Logins:
     def may_attempt(self, host: str) -> bool:
         """Return whether an address may attempt a login, and count the attempt.
 
-        It is counted before the password is checked, which takes time: parallel attempts must not
-        all be checked.
+        It is counted before the password is checked, which takes time: otherwise any number of
+        parallel attempts would be checked.
         """
         group, now_s = address_group(host), time.monotonic()
         attempts = self._attempts.get(group)
@@ -171,7 +171,7 @@ class Logins:
         return role
 
     def open_session(self, role: Role, host: str) -> str:
-        """Open a session and return its token; an older one of the role may end for it."""
+        """Open a session and return its token; an older one of the role may be ended for it."""
         token = secrets.token_urlsafe(32)
         self._places.admit(token, Holder(role, token, address_group(host)))
         self._sessions[token] = (role, time.monotonic() + SESSION_S)

@@ -1,7 +1,7 @@
 """An area of a map as a PMTiles file for use without a network, cut out of a larger one.
 
-A PMTiles file on a web server is read by ranges of bytes, one request at a time, and only as much
-as the area needs. Tile servers with `{z}/{x}/{y}` in their addresses forbid such downloads, and are
+A PMTiles file on a web server is read by ranges of bytes, one request at a time, and only as far as
+the area requires. Tile servers with `{z}/{x}/{y}` in their addresses forbid such downloads, and are
 refused.
 """
 
@@ -25,7 +25,7 @@ EARTH_M: Final = 6_378_137.0
 MAX_TILES: Final = 20_000
 MAX_BYTES: Final = 500_000_000
 MAX_PIECE: Final = 16 << 20
-"""Bytes of one request: a directory or a tile is smaller."""
+"""Maximum bytes of one request: a directory or a tile is smaller."""
 TIMEOUT_S: Final = 30.0
 SPANS: Final = {"m": 1.0, "km": 1000.0, "mi": 1609.344, "nm": 1852.0}
 
@@ -34,7 +34,7 @@ Box = tuple[float, float, float, float]
 
 
 class MapAreaError(Exception):
-    """An area cannot be fetched; the text says why."""
+    """An area cannot be fetched; the text gives the reason."""
 
 
 def length_m(text: str) -> float:

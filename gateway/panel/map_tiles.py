@@ -1,7 +1,7 @@
 """Tiles of the map: from a file, or from the network with a cache on disk.
 
 Browsers load tiles only from this panel, so that cached tiles work without a network, and the
-map's owner does not see the users.
+map's owner does not learn the users' addresses.
 """
 
 import asyncio
@@ -47,12 +47,12 @@ from gateway.panel.recording_transfer import answer_upload, open_regular
 log = logging.getLogger(__name__)
 
 FRESH_S: Final = 30 * 86_400
-"""An older tile is fetched again, and still used if that fails."""
+"""Age after which a tile is fetched again; it is still used if that fails."""
 MAX_TILE: Final = 1 << 20
-"""Bytes of a tile; reading stops beyond it."""
+"""Maximum bytes of a tile; reading stops beyond."""
 TIMEOUT_S: Final = 6.0
 AT_ONCE: Final = 4
-"""Parallel requests to one server, as tile servers' policies ask."""
+"""Maximum parallel requests to one server, as tile servers' policies require."""
 TIDY_EVERY: Final = 200
 """Tiles fetched between two checks of the folder's size."""
 MAX_ZOOM: Final = 24
@@ -62,14 +62,14 @@ STYLE_NAME: Final = re.compile(r"\w[\w .-]{0,31}")
 RASTER: Final = {TileType.PNG, TileType.JPEG, TileType.WEBP}
 MAX_HEADER: Final = 127
 MAX_DIRECTORY: Final = 1 << 19
-"""Bytes of a directory, packed and unpacked; of a large map they have up to 200,000."""
+"""Maximum bytes of a directory, packed and unpacked; those of a large map have up to 200,000."""
 MAX_DEPTH: Final = 4
 MAX_ATTRIBUTION: Final = 300
 MARKUP: Final = re.compile(r"<[^>]*>")
 LONG_NUMBER: Final = re.compile(rb"[\x80-\xff]{10}")
-"""A number of more than 64 bits; a long one would take minutes to read."""
+"""A number of more than 64 bits: reading a very long one would take minutes."""
 BROKEN: Final = (ValueError, EOFError, IndexError, OverflowError, zlib.error)
-"""Raised by the library for damaged contents."""
+"""Errors that the library raises for damaged contents."""
 
 GetBytes = Callable[[int, int], bytes]
 """Reads a range of bytes, given its offset and length; fewer at the end of the file."""
@@ -83,15 +83,15 @@ SIGNATURES: Final = (
 
 
 def kind_of_image(data: bytes) -> str | None:
-    """Return the media type of a picture by its first bytes; None for anything else."""
+    """Return the media type of an image by its first bytes; None for other data."""
     return next((kind for head, kind in SIGNATURES if data.startswith(head)), None)
 
 
 class PmTiles:
     """A PMTiles file of raster tiles, read with bounds: its contents may be hostile.
 
-    The library's own reader unpacks directories without a limit. Raises ValueError if it is no such
-    file; the text says why.
+    The library's own reader unpacks directories without a limit. Raises ValueError, with the
+    reason, if it is not such a file.
     """
 
     def __init__(self, get_bytes: GetBytes) -> None:
@@ -155,7 +155,7 @@ class PmTiles:
         if LONG_NUMBER.search(data):
             raise ValueError("a directory of it is damaged")
         try:
-            # The library takes packed ones only.
+            # The library accepts only packed directories.
             return deserialize_directory(gzip.compress(data, 0))
         except BROKEN as error:
             raise ValueError("a directory of it is damaged") from error
@@ -180,7 +180,7 @@ def file_reader(path: Path) -> GetBytes:
     """Return a function that reads ranges of bytes of a file; it raises OSError or ValueError."""
 
     def get_bytes(offset: int, length: int) -> bytes:
-        # Not mapped into memory: a file that becomes shorter would end the process.
+        # Not mapped into memory: truncating a mapped file would crash the process.
         with open_regular(path.resolve()) as file:
             try:
                 return os.pread(file.fileno(), length, offset)
@@ -261,7 +261,7 @@ class MapTiles:
             raise ValueError(f"there is a map {name!r} already in {self._folder}")
 
     def _add(self, style: MapStyle) -> None:
-        """Open a style; one that cannot be opened has no tiles."""
+        """Open a style; without its file it has no tiles."""
         source: MapStyle | GetTile = style
         if not style.url.startswith(("http://", "https://")):
             path = Path(style.url).expanduser()
@@ -296,7 +296,7 @@ class MapTiles:
 
     async def _fetch(self, url: str) -> bytes | None:
         if self._client is None:
-            # A packed answer could become larger than its limit when unpacked.
+            # A compressed answer could exceed the limit when it is unpacked.
             headers = {"user-agent": f"mavgate/{__version__}", "accept-encoding": "identity"}
             self._client = httpx.AsyncClient(headers=headers, timeout=TIMEOUT_S)
         async with self._turns:
@@ -367,7 +367,7 @@ def _open_mbtiles(path: Path) -> Callable[[int, int, int], bytes | None]:
 
 
 def _map_name(name: str, path: Path) -> str:
-    """Return the file name of an uploaded map; raises ValueError if it is none."""
+    """Return the file name of an uploaded map; raises ValueError if it is not a map."""
     data = PmTiles(file_reader(path)).first_tile()
     if data is None or kind_of_image(data) is None:
         raise ValueError("it has no PNG, JPEG or WEBP tile")

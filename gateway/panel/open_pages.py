@@ -1,8 +1,8 @@
-"""The open pages: places for those that have not connected, and the session that each belongs to.
+"""The open pages: slots for those that have not connected, and the session of each.
 
 NiceGUI keeps a loaded page for a minute, and a client could load pages without running their
-scripts. Its messages name the page that they are for, so each is checked: a page takes messages
-only of the session that has loaded it, and ends with that.
+scripts. Messages name their page, so each is checked: a page accepts messages only from the session
+that has loaded it, and ends with that session.
 """
 
 from collections.abc import Awaitable, Callable
@@ -15,7 +15,7 @@ from gateway.panel.access import HOLDER
 from gateway.panel.admission import Holder, Places
 
 PENDING_OF_SESSION: Final = 8
-"""A browser may restore some tabs at once."""
+"""Maximum pages of a session that are loading: a browser may restore some tabs at once."""
 PENDING_OF_ADDRESS: Final = 12
 PENDING_OF_ROLE: Final = 16
 NAMESPACE: Final = "/"
@@ -28,7 +28,7 @@ class OpenPages:
 
     def __init__(self) -> None:
         self._pages: dict[str, tuple[Client, Holder]] = {}
-        """By the page's id."""
+        """Pages and their holders by the id of the page."""
         self._pending: Places[str] = Places(
             PENDING_OF_SESSION, PENDING_OF_ADDRESS, PENDING_OF_ROLE, self._delete
         )
@@ -41,7 +41,7 @@ class OpenPages:
         self._pending.admit(page.id, holder)
 
     def holder(self, page_id: str) -> Holder:
-        """Return whose page it is."""
+        """Return the holder of a page."""
         return self._pages[page_id][1]
 
     def end_session(self, token: str) -> None:

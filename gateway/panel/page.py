@@ -39,7 +39,7 @@ VIEWS: Final = (
     View("plots", "Plots", "show_chart", PlotsView),
     View("events", "Events", "notifications", EventsView),
 )
-"""In the order of the rail, and of the keys 1 to 9, which added views follow."""
+"""Views in the order of the rail and of the keys 1 to 9; added views follow."""
 
 
 def build_page(parts: PanelParts, role: Role) -> None:
@@ -85,7 +85,7 @@ class _Page:
         self.show(VIEWS[0].key)
 
     def show(self, key: str) -> None:
-        """Note that the browser shows a view; fill it at the first time."""
+        """Note that the browser shows a view; build it at the first time."""
         if key not in self._views:
             return
         self._context.shown = key
@@ -198,7 +198,7 @@ def _clock(seconds: float) -> str:
 
 
 def _mode_of(context: ViewContext) -> str:
-    """Return where the data comes from."""
+    """Return the source of the data."""
     status = context.parts.watch.status
     if status is None:
         return "MAVLink"

@@ -48,7 +48,7 @@ from gateway.panel.view_context import WEB, PanelParts
 log = logging.getLogger(__name__)
 
 WS_QUEUE: Final = 4
-"""Messages of a WebSocket that may wait to be handled, of at most 1 MB each."""
+"""Maximum waiting messages of a WebSocket, of at most 1 MB each."""
 RECONNECT_S: Final = 30.0
 """A browser that reconnects within this time keeps its page."""
 LEAFLET: Final = Path(inspect.getfile(ui.leaflet)).parent / "dist" / "leaflet"
@@ -56,7 +56,7 @@ LEAFLET: Final = Path(inspect.getfile(ui.leaflet)).parent / "dist" / "leaflet"
 
 
 class PanelError(Exception):
-    """The panel cannot be opened; the text says why."""
+    """The panel cannot be opened; the text gives the reason."""
 
 
 def run_panel(
@@ -88,11 +88,11 @@ def run_panel(
         log_level="warning",
         access_log=False,
         server_header=False,
-        # Behind a proxy of this machine a client could name any address as its own.
+        # Not trusted: behind a proxy of this machine a client could claim any address.
         proxy_headers=False,
         ws_max_size=1 << 20,
         ws_max_queue=WS_QUEUE,
-        # Unpacking would take a multiple of the time that sending takes.
+        # Off: unpacking would take several times as long as sending.
         ws_per_message_deflate=False,
         timeout_graceful_shutdown=1,
         ssl_certfile=certificate,
@@ -115,9 +115,9 @@ def tls_files(settings: PanelSettings) -> tuple[Path | None, Path | None]:
     key = Path(settings.certificate_key).expanduser() if settings.certificate_key else certificate
     try:
         for file in (certificate, key):
-            # The library of TLS does not say which one is missing.
+            # The error of the TLS library does not name the missing file.
             file.read_bytes()
-        # It asks for no password of the key: a service has no terminal.
+        # Never ask for a password of the key: a service has no terminal.
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, password="")
     except ssl.SSLError as error:
         why = f" ({error.reason.lower().replace('_', ' ')})" if error.reason else ""
@@ -129,7 +129,7 @@ def tls_files(settings: PanelSettings) -> tuple[Path | None, Path | None]:
 
 
 def without_traceback(record: logging.LogRecord) -> bool:
-    """Let a log line pass, without a traceback where a browser sent invalid text."""
+    """Pass a log line, without its traceback if a browser has sent invalid text."""
     if record.exc_info and isinstance(record.exc_info[1], UnicodeDecodeError):
         record.exc_info = None
     return True
@@ -192,7 +192,7 @@ def make_app(parts: PanelParts) -> FastAPI:
         parts.pages.add(ui.context.client, request.scope[HOLDER])
         build_page(parts, request.scope[ROLE])
 
-    # The nonces are put into the text, which is then compressed: the last one added is outermost.
+    # Nonces are inserted before the text is compressed: the middleware added last is outermost.
     pages.add_middleware(ScriptNonces)
     pages.add_middleware(GZipMiddleware)
     ui.run_with(
@@ -243,7 +243,7 @@ def _add_head() -> None:
 
 
 class _CheckedFiles(StaticFiles):
-    """Files that a browser may keep but asks for again, so that it never uses old ones."""
+    """Files that a browser may cache but must revalidate, so that it never uses outdated ones."""
 
     def file_response(self, *args: Any, **named: Any) -> Response:
         """Return the response of a file."""

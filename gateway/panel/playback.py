@@ -36,13 +36,14 @@ HEIGHT_GAP_US: Final = US_PER_S // 5
 RECORDED: Final = "recorded"
 FUSED_AGAIN: Final = "fused again"
 READY_S: Final = 120.0
-"""A table of hours is opened in some seconds. A player that fails is noticed when it ends."""
+"""Timeout of the start of a player: a table of hours takes some seconds. A failing player ends
+earlier."""
 STEP_S: Final = 0.1
 WATCH_S: Final = 0.25
 LEAP_S: Final = 0.5
-"""A larger step back is not jitter of the player's clock, but a loop or a seek."""
+"""A larger backward step is not jitter of the player's clock, but a loop or a seek."""
 MAX_PLAYERS: Final = 4
-"""Each is a process."""
+"""Maximum players, each of which is a process."""
 SPEEDS: Final = (0.25, 0.5, 1, 2, 5, 10, 50)
 
 
@@ -51,7 +52,7 @@ class Profile:
     """Height over time."""
 
     time_s: tuple[float, ...] = ()
-    """Since its begin."""
+    """Time since the begin of the recording."""
     alt_amsl_m: tuple[float, ...] = ()
 
 
@@ -62,13 +63,13 @@ class RecordedAircraft:
     recorded_id: int
     """Its recorded MAVLink system id."""
     origin: str
-    """`RECORDED`, or `FUSED_AGAIN` for one that is fused again while it plays."""
+    """`RECORDED`, or `FUSED_AGAIN` if it is fused again during playback."""
     profile: Profile
-    """Empty if no height was recorded."""
+    """Its height; empty if none was recorded."""
 
 
 def look_into(files: Sequence[Path]) -> list[list[RecordedAircraft]]:
-    """Read which aircraft the files hold: a list for each flight that a player makes of them.
+    """Read the aircraft of the files: a list for each flight that a player makes of them.
 
     Raises OSError if a file cannot be read.
     """
@@ -82,7 +83,7 @@ def look_into(files: Sequence[Path]) -> list[list[RecordedAircraft]]:
 
 
 def free_ids(count: int, taken: Collection[int]) -> range:
-    """Find consecutive free system ids, the highest possible.
+    """Find the highest consecutive free system ids.
 
     Raises ValueError if there are not enough.
     """
@@ -141,7 +142,7 @@ def _profile(points: Sequence[TrackPoint], begin_us: int) -> Profile:
 
 
 class PlaybackError(Exception):
-    """A recording cannot be played; the text says why."""
+    """A recording cannot be played; the text gives the reason."""
 
 
 class Playback:
@@ -150,9 +151,9 @@ class Playback:
     def __init__(self, uplink: Uplink, fleet: FleetState, page: str) -> None:
         self._page = page
         self.name = ""
-        """Of the recording; empty while none is open."""
+        """Name of the recording; empty while none is open."""
         self.aircraft: dict[int, RecordedAircraft] = {}
-        """The aircraft that are played, by their played system ids."""
+        """The played aircraft by their played system ids."""
         self.status: dict[str, Any] | None = None
         """Result of `play.status`."""
         self._uplink = uplink
@@ -165,7 +166,7 @@ class Playback:
 
     @property
     def has_fused_again(self) -> bool:
-        """Whether some of it is fused again."""
+        """Whether an aircraft is fused again."""
         return any(one.origin == FUSED_AGAIN for one in self.aircraft.values())
 
     async def open(self, folder: Path, name: str, *, fused_again: bool) -> None:
@@ -216,7 +217,7 @@ class Playback:
     async def order(self, verb: str, **params: Any) -> None:
         """Send the player a request; see docs/control.md.
 
-        Raises PlaybackError if none plays, or it refuses.
+        Raises PlaybackError if no player runs, or it refuses the request.
         """
         async with self._ordering:
             await self._order(verb, **params)
@@ -228,9 +229,9 @@ class Playback:
             await self._order("play.pause" if playing else "play.resume")
 
     async def _order(self, verb: str, **params: Any) -> None:
-        """Send one request, and take its answer for the player's present state.
+        """Send one request, and store its answer as the player's present state.
 
-        One at a time: else the answer to an earlier one may come after that to a later one.
+        One request at a time: otherwise an earlier answer could arrive after a later one.
         """
         control, before = self._control, self.status
         if control is None:
@@ -240,7 +241,7 @@ class Playback:
         except ControlError as error:
             raise PlaybackError(str(error)) from error
         if control is not self._control:
-            # Closed meanwhile.
+            # Closed during the request.
             return
         self.status = status
         went_back = before is not None and (status["position_s"] < before["position_s"] - LEAP_S)
@@ -259,7 +260,7 @@ class Playback:
                 await self.order("play.status")
 
     def _number(self, flights: Sequence[Sequence[RecordedAircraft]]) -> list[int]:
-        """Give the aircraft free system ids; return the first of each flight."""
+        """Assign free system ids to the aircraft; return the first id of each flight."""
         firsts = []
         for flight in flights:
             ids = free_ids(
@@ -296,13 +297,13 @@ class Playback:
             async with asyncio.timeout(READY_S):
                 while self.status is None and child.returncode is None:
                     await asyncio.sleep(STEP_S)
-                    # Its socket is there a moment before it answers.
+                    # The socket exists shortly before the player answers.
                     with suppress(PlaybackError):
                         await self.order("play.status")
         except TimeoutError:
             log.warning("the player does not start in %.0f s", READY_S)
         if self._child is not child:
-            # Closed meanwhile.
+            # Closed during the start.
             return
         if self.status is None:
             text = await self._failure()
@@ -317,7 +318,7 @@ class Playback:
             await asyncio.sleep(WATCH_S)
 
     async def _failure(self) -> str:
-        """Return why the player ended."""
+        """Return the reason why the player ended."""
         if self._child is None or self._child.stderr is None or self._child.returncode is None:
             return "the player does not start"
         text = (await self._child.stderr.read()).decode(errors="replace").strip()

@@ -28,7 +28,7 @@ class TimeSlider(Element, component=WEB / "time_slider.js"):
 
 
 class PlayerBar:
-    """Play, pause, speed and the time, built at the current place of the page."""
+    """Play, pause, speed and the time, built at the current position in the page."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
@@ -52,7 +52,7 @@ class PlayerBar:
             close.props('flat round dense aria-label="Close the playback"')
         self._bar.set_visibility(False)
         self._is_showing = False
-        """While the values of the player are set, which are no choices of the user."""
+        """Whether the controls are being set from the player's state, not by the user."""
         ui.timer(POSITION_S, self._show)
 
     def _show(self) -> None:

@@ -1,4 +1,4 @@
-"""REST: where to point an antenna at a live vehicle, from home, a location or another system."""
+"""REST: antenna pointing to a live vehicle, from home, a location or another system."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,7 +16,7 @@ def pointing_router(fleet: FleetState, now_us: Callable[[], int]) -> APIRouter:
 
     @router.get("/v1/pointing/{system_id}")
     async def pointing(system_id: int, station: str = HOME) -> dict[str, float]:
-        """Return azimuth, elevation and distance; `station` as of `rotator:` endpoints."""
+        """Return azimuth, elevation and distance; `station` is as in `rotator:` endpoints."""
         states = {key: vehicle.state for key, vehicle in fleet.visible("").items()}
         if system_id not in states:
             raise HTTPException(HTTPStatus.NOT_FOUND, f"no vehicle {system_id}")

@@ -12,13 +12,13 @@ from gateway.live.control_socket import ControlError
 from gateway.panel.uplink import ControlClient
 
 PIECE: Final = 10_000
-"""Characters of a request to the control socket, of which each becomes six bytes at most."""
+"""Maximum characters of a request to the control socket; each becomes at most six bytes."""
 ASK_AGAIN_S: Final = 1.0
-"""A wrong token is compared with those of the gateway again after this time."""
+"""Least interval of reading the gateway's tokens, to which a wrong token is compared again."""
 
 
 class _Tokens:
-    """The tokens of the gateway: a flood of wrong ones must not load its event loop."""
+    """Cache of the gateway's tokens, so that a flood of wrong ones does not load its event loop."""
 
     def __init__(self, control: ControlClient) -> None:
         self._control = control
@@ -35,7 +35,7 @@ class _Tokens:
                 self._asked_s = time.monotonic()
                 self._known = [*await self._control.ask("source.tokens")]
                 if not self._has(token):
-                    # The gateway counts it.
+                    # Sent so that the gateway counts the wrong token.
                     await self._control.ask("source.push", token=token, text="")
         if not self._has(token):
             raise ControlError("no source has this token")

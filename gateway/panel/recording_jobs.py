@@ -1,8 +1,8 @@
 """Jobs on recordings: exports to other formats, and the update of the catalogue.
 
-Both are made by other processes at a lower priority, so that neither the gateway nor the page waits
-for them: one export of each role at a time, so that no operator waits for a viewer. A file is
-deleted once everyone who asked for it has fetched it.
+Both run in other processes at a lower priority, so that neither the gateway nor the page waits for
+them: one export of each role at a time, so that no operator waits for a viewer. A file is deleted
+once all clients that requested it have fetched it.
 """
 
 import asyncio
@@ -33,21 +33,21 @@ log = logging.getLogger(__name__)
 
 EXPORTS: Final = "/exports/"
 LOW: Final = ("nice", "-n", "5")
-"""Below the gateway and the page, but not so low that a browser that draws leaves nothing."""
+"""Priority below the gateway and the page, but high enough next to a busy browser."""
 EXPORT_S: Final = 900.0
-"""Longest time for an export; a first start may compile for a minute of it."""
+"""Timeout of an export; at a first start, compiling may take a minute of it."""
 KEPT_S: Final = 600.0
-"""After which a file that was made and not fetched is deleted."""
+"""Time after which an exported file that was not fetched is deleted."""
 EXPORTS_OF_SESSION: Final = 2
 EXPORTS_OF_ROLE: Final = 4
-"""Exports that are being made, or wait for that: one of each role is made at a time."""
+"""Maximum running and waiting exports of a role, of which one runs at a time."""
 MAX_EXPORT: Final = 1 << 29
-"""Bytes of one export, its temporary files included; at most half of the free space."""
+"""Maximum bytes of one export with its temporary files; also at most half of the free space."""
 MAX_EXPORTED: Final = 1 << 29
-"""Bytes of files that were made for one role, and not fetched; the oldest are deleted. With the one
-that is being made, a role uses at most 1 GiB."""
+"""Maximum bytes of exported files of one role that were not fetched; the oldest are deleted. With
+the running export, a role uses at most 1 GiB."""
 MEASURED_S: Final = 0.25
-"""Between two measurements of an export that is being made."""
+"""Interval of measuring the size of a running export."""
 ANONYMISED: Final = "anonymised"
 INDEX_AGAIN_S: Final = 20.0
 """Shortest time between two indexings."""
@@ -66,19 +66,19 @@ CUTS: Final = {
     "cut": ("Cut to a tlog", ("convert", "-o"), ".tlog"),
     ANONYMISED: ("Anonymised tlog", ("convert", "--anonymise", "-o"), ".tlog"),
 }
-"""The same of tlogs that are made of a part of a recording."""
+"""The same for tlogs of a part of a recording."""
 EXTRACTS: Final = {
     "params": ("Parameters", ("extract", "--params"), ".param"),
     "plan": ("Mission, fence, rally", ("extract", "--mission"), ".plan"),
     "texts": ("Texts", ("extract", "--texts"), ".csv"),
     "events": ("Events", ("extract", "--events"), ".csv"),
 }
-"""The same of extracts of one vehicle."""
+"""The same for extracts of one vehicle."""
 KINDS: Final = FORMATS | CUTS | EXTRACTS
 
 
 class ExportError(Exception):
-    """A recording cannot be exported; the text says why."""
+    """A recording cannot be exported; the text gives the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,17 +90,17 @@ class Order:
     kind: str
     """One of `KINDS`."""
     options: tuple[str, ...] = ()
-    """Further ones of its command, checked by the caller."""
+    """Further options of its command, checked by the caller."""
 
 
 @dataclass(eq=False)
 class _Export:
-    """A file that is made, or was."""
+    """An exported file, or a running export."""
 
     role: Role | None
     task: "asyncio.Task[Path] | None" = None
     users: int = 0
-    """Requests for it whose file was not fetched yet."""
+    """Number of requests that have not fetched the file yet."""
     token: str = ""
     size: int = 0
 
@@ -110,7 +110,7 @@ class RecordingJobs:
 
     def __init__(self) -> None:
         self._exports: dict[Hashable, _Export] = {}
-        """By role, recording and kind, oldest first."""
+        """Exports by role, recording and kind, oldest first."""
         self._places: Places[Hashable] = Places(
             EXPORTS_OF_SESSION, EXPORTS_OF_ROLE, EXPORTS_OF_ROLE
         )
@@ -135,9 +135,9 @@ class RecordingJobs:
         self._indexing = asyncio.get_running_loop().create_task(self._index(folder))
 
     async def export(self, order: Order, holder: Holder = LOCAL) -> str:
-        """Export a recording, and return the address of the file; an equal one is used again.
+        """Export a recording, and return the address of the file; an equal export is reused.
 
-        Raises ExportError if it cannot be made; RecordingError if there is no such recording.
+        Raises ExportError if the export fails; RecordingError if there is no such recording.
         """
         recording = find_recording(order.folder, order.name)
         key = (holder.role, order, recording.size, recording.modified_s)
@@ -172,7 +172,7 @@ class RecordingJobs:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def serve(self, app: FastAPI) -> None:
-        """Serve the files that were made, each under an address that cannot be guessed."""
+        """Serve the exported files, each under an address that cannot be guessed."""
 
         @app.get(EXPORTS + "{token}")
         async def _fetch(token: str) -> Response:
@@ -199,7 +199,7 @@ class RecordingJobs:
                 work.mkdir()
                 target = await _make(work, order)
         except BaseException:
-            # Half a file of a large recording may take gigabytes.
+            # The unfinished file of a large recording may have gigabytes.
             if self._folder is not None:
                 shutil.rmtree(self._folder / token, ignore_errors=True)
             self._exports.pop(key, None)
@@ -243,7 +243,7 @@ async def _make(work: Path, order: Order) -> Path:
     # The name of a recording contains its date, and may contain its location.
     target = work / f"{ANONYMISED if kind == ANONYMISED else name}{suffix}"
     output = work / name if kind == "report" else target
-    # Settings with the folder of the recordings, which commands take names from.
+    # Settings with the folder of the recordings, in which the commands look up names.
     config = work / "settings.toml"
     config.write_text(f"[recording]\nfolder = {json.dumps(str(folder), ensure_ascii=False)}\n")
     arguments = ["--config", str(config), *order.options, *of_file, str(output), "--", name]
@@ -256,9 +256,9 @@ async def _make(work: Path, order: Order) -> Path:
 
 
 async def _run(command: list[str], work: Path | None = None) -> None:
-    """Run a command, whose files may be in a folder of its own.
+    """Run a command, with a separate folder for its files.
 
-    Raises ExportError with its last line, after the longest time, or if it writes too much.
+    Raises ExportError if it fails (with its last line), times out, or writes too much.
     """
     child = await asyncio.create_subprocess_exec(
         *LOW,

@@ -34,7 +34,7 @@ class RecordingFacts:
         self._found: frozenset[str] | None = None
         self._tracks: dict[str, str] = {}
         self.trouble = ""
-        """Why a search found nothing, or why nothing is known of the recordings."""
+        """The reason why a search found nothing, or why the recordings have no figures."""
 
     def look(self, folder: Path, search: str = "") -> None:
         """Reload the catalogue if it changed, and search; some tens of ms for thousands of rows.
@@ -60,7 +60,7 @@ class RecordingFacts:
             self.trouble, self._found = str(error), frozenset()
 
     def of(self, name: str) -> FlightFigures | str | None:
-        """Return the figures of the vehicle that a recording holds longest, or "broken"."""
+        """Return the figures of the longest recorded vehicle of a recording, or "broken"."""
         flown = self._figures.get(PurePath(name), {})
         longest = max(flown.values(), key=lambda figures: figures.duration, default=None)
         return "broken" if longest is None and name in self._broken else longest
@@ -77,7 +77,7 @@ class RecordingFacts:
 
 
 def _stamp(folder: Path) -> tuple[int, int] | None:
-    """Return a stamp that changes with the catalogue; None if there is none."""
+    """Return a value that changes with the catalogue; None without a catalogue."""
     try:
         found = (folder / CATALOGUE_NAME).stat()
     except OSError:
@@ -96,7 +96,7 @@ def _thumbnails(features: dict[str, Any]) -> dict[str, str]:
 
 
 def _line_of(geometry: dict[str, Any] | None) -> list[list[float]]:
-    """Return the positions of a line; a line that crosses the 180th meridian has several parts."""
+    """Return the positions of a line; one across the 180th meridian is stored in several parts."""
     if geometry is None:
         return []
     if geometry["type"] == "MultiLineString":

@@ -2,8 +2,8 @@
 
 File names from the browser are always checked: a recording must be one of the existing ones, and
 an upload gets a name that follows the rules of recordings. An upload is written to a temporary
-file, checked, and only then gets its name. A download is packed while it is sent, so it needs no
-space on the disk.
+file, checked, and then renamed. A download is packed while it is sent, so it needs no space on the
+disk.
 """
 
 import os
@@ -123,12 +123,12 @@ async def _store(
     folder.mkdir(parents=True, exist_ok=True)
     fresh = folder / f".upload-{secrets.token_hex(8)}"
     try:
-        # Not by `tempfile`, whose files have the mode 0600 whatever the umask is.
+        # Not by `tempfile`, whose files always have the mode 0600.
         with fresh.open("xb") as file:
             async for chunk in chunks:
                 file.write(chunk)
         target = folder / name_of(fresh)
-        # A file that was created meanwhile is never overwritten.
+        # A file that was created during the upload is never overwritten.
         target.touch(exist_ok=False)
         fresh.replace(target)
         return target
@@ -138,7 +138,7 @@ async def _store(
 
 
 def _recording_name(name: str, path: Path) -> str:
-    """Return the file name of an uploaded recording; raises ValueError if it is none."""
+    """Return the file name of an uploaded recording; raises ValueError for another file."""
     suffix = KINDS.get(_kind(path))
     if suffix is None:
         allowed = " and ".join(str(kind) for kind in KINDS)
@@ -147,7 +147,7 @@ def _recording_name(name: str, path: Path) -> str:
 
 
 def _kind(path: Path) -> str | None:
-    """Return the kind of an upload by its first bytes; None if it is no recording."""
+    """Return the kind of an upload by its first bytes; None if it is not a recording."""
     kind = format_of(path)
     with path.open("rb") as file:
         head = file.read(LOOKED_AT)

@@ -12,7 +12,7 @@ NO_SCRIPT_POLICY: Final = (
     "default-src 'none'; style-src 'self'; img-src 'self'; form-action 'self'; base-uri 'none'; "
     "frame-ancestors 'none'"
 )
-"""Content-Security-Policy of every response that sets none itself: `ScriptNonces`."""
+"""Content-Security-Policy of every response without its own one (see `ScriptNonces`)."""
 HEADERS: Final = {
     "x-frame-options": "DENY",
     "x-content-type-options": "nosniff",

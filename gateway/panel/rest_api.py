@@ -2,9 +2,9 @@
 
 All paths exist with and without `/v1` in front, and below `/mavlink2rest`. Viewers may not send.
 
-Each message is encoded once for all subscribers, and one that reads too slowly loses its own oldest
-messages. Regular expressions are those of Rust, as in mavlink2rest: pydantic brings that engine,
-which takes linear time for any expression, where Python's own takes exponential time for some.
+Each message is encoded once for all subscribers, and a slow subscriber loses its own oldest
+messages. Regular expressions are those of Rust, as in mavlink2rest: that engine, which pydantic
+includes, takes linear time for any expression, but Python's own takes exponential time for some.
 
 References
 ----------
@@ -39,21 +39,21 @@ from gateway.panel.uplink import Uplink
 from gateway.wire.mavlink_json import CLASSES, BadMessageError, from_json, template, to_json
 
 MAX_KINDS: Final = 8192
-"""Enough for some fifty aircraft; forged ids must not fill the memory."""
+"""Maximum entries: enough for some fifty aircraft; forged ids must not fill the memory."""
 MAX_KINDS_OF_SYSTEM: Final = 1024
-"""An aircraft and its components send some hundred."""
+"""Maximum entries of a system; an aircraft and its components send some hundred."""
 DROPPED_SHARE: Final = 8
-"""Divisor: part of a full table that is dropped at once, the entries updated longest ago."""
+"""Divisor for the share of a full table that is dropped at once, the oldest entries first."""
 
 Key = tuple[int, int, str]
 """System, component and name of the message."""
 MAX_WAITING_BYTES: Final = 1 << 20
-"""Of one subscriber: some seconds of one aircraft."""
+"""Maximum waiting bytes of one subscriber: some seconds of one aircraft."""
 MAX_PATTERN: Final = 300
-"""Letters; the longest expression is compiled in some milliseconds."""
+"""Maximum characters of an expression; the longest is compiled in some milliseconds."""
 EVERYTHING: Final = ".*"
 PIECE: Final = 1 << 15
-"""Bytes that are encoded before others get their turn; some ms."""
+"""Bytes that are encoded before others get their turn: some milliseconds."""
 JSON: Final = "application/json"
 API_VERSION: Final = 0
 """Version of the answers' format, as in mavlink2rest."""
@@ -105,7 +105,7 @@ class MessageBook:
         self._kinds: Counter[int] = Counter()
         """Entries by system."""
         self.dropped = 0
-        """Entries that made room for others."""
+        """Number of entries that were dropped to make room for others."""
 
     def add(self, message: Any, *, is_sent: bool = False) -> None:
         """Add one message, received or sent from here."""
@@ -136,14 +136,14 @@ class MessageBook:
             self.dropped += 1
 
     def has_heard(self, system_id: int, component_id: int) -> bool:
-        """Return whether anything came from a component."""
+        """Return whether a message was received from a component."""
         return (system_id, component_id) in self._heard
 
     def look_up(self, path: str, systems: SystemFilter = NO_FILTER) -> Any:
         """Return the value at a path such as `vehicles/1/components/1/messages/ATTITUDE`.
 
-        It is a JSON pointer without its first slash; empty is the whole tree, of the systems that
-        pass, whose entries `encode` converts. Raises KeyError if there is none.
+        It is a JSON pointer without its first slash; an empty one is the whole tree of the systems
+        that pass, whose entries `encode` converts. Raises KeyError if there is no value.
         """
         parts = path.split("/") if path else []
         node: Any = self._tree(parts, systems)
@@ -159,7 +159,7 @@ class MessageBook:
         return node.as_json() if isinstance(node, _Entry) else node
 
     def _tree(self, parts: list[str], systems: SystemFilter) -> dict[str, Any]:
-        """Build as much of the tree as a path needs."""
+        """Build the part of the tree that a path requires."""
         vehicles: dict[str, Any] = {}
         for (system_id, component_id, name), entry in self._chosen(parts):
             if not systems.has((system_id, component_id)):
@@ -194,7 +194,7 @@ class Subscriber:
         self._news = asyncio.Event()
 
     def push(self, data: str | bytes) -> None:
-        """Queue a text or bytes; the oldest entries make room for it."""
+        """Queue a text or bytes; the oldest entries are dropped to make room."""
         self._waiting.append(data)
         self._bytes += len(data)
         while self._bytes > MAX_WAITING_BYTES:
@@ -215,9 +215,9 @@ class Subscriber:
 def names_matching(pattern: str) -> frozenset[str]:
     """Return the names of messages in which a regular expression is found.
 
-    Raises ValueError if it is invalid; the text says why.
+    Raises ValueError with the reason if it is invalid.
     """
-    # Counts and classes such as \w, of all of Unicode, take megabytes and a long time to compile.
+    # Counts, and classes of all of Unicode such as \w, take megabytes and a long time to compile.
     if len(pattern) > MAX_PATTERN or not {*"{\\"}.isdisjoint(pattern):
         raise ValueError(f"filter: at most {MAX_PATTERN} letters, without {{}} and \\")
     try:
@@ -408,7 +408,7 @@ class RestApi:
             raise BadMessageError(f"systems= or components= excludes its target {target}")
         system_id, component_id = _sender(given.get("header"))
         if self._book.has_heard(system_id, component_id):
-            # Ids of a known system must not be used: the gateway would take that for a loop.
+            # Ids of a known system must not be used: the gateway would detect a loop.
             system_id = component_id = 0
         size = self._uplink.send(message, system_id, component_id)
         self._book.add(message, is_sent=True)
@@ -489,9 +489,9 @@ def _sender(header: Any) -> tuple[int, int]:
 
 
 async def encode_in_pieces(value: Any, turn: asyncio.Lock) -> AsyncIterator[bytes]:
-    """Encode a part of the tree piece by piece: all of it may have megabytes.
+    """Encode a part of the tree piece by piece, since the whole tree may have megabytes.
 
-    Of all answers that share a lock, one encodes a piece in a turn of the loop.
+    Of all answers that share a lock, only one encodes a piece in a turn of the loop.
     """
     parts, is_left = encode(value), True
     while is_left:

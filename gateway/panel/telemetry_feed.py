@@ -1,8 +1,8 @@
 """The page's telemetry: the newest `Instant` of every aircraft, and the path of each so far.
 
-The first comes over a separate WebSocket. Flow control by credits: the browser grants frames, and
-each one uses a grant. So a slow browser or network gets fewer frames but never old ones, and
-nothing queues up here.
+The `Instant` is sent over a separate WebSocket. Flow control is by credits: the browser grants
+frames, and each one uses a grant. So a slow browser or network gets fewer frames but never outdated
+ones, and no queue builds up here.
 """
 
 import asyncio
@@ -25,10 +25,10 @@ PATH: Final = "/telemetry"
 TRACKS_PATH: Final = "/path/{system_id}"
 HISTORY_PATH: Final = "/history/{system_id}"
 MAX_HISTORY: Final = 6000
-"""Moments of a history that a browser gets; of a longer one every n-th."""
+"""Maximum moments of a history that is sent to a browser; of a longer one every n-th is sent."""
 INTERVAL_S: Final = 0.033
-"""Up to 30 frames a second, a little more than sources send: at the same rate the two would beat,
-and a state could wait a whole interval. The browser interpolates."""
+"""Least interval of frames: 30 a second, a little more than sources send. At the same rate the two
+would beat, and a state could wait a whole interval. The browser interpolates."""
 IDLE_S: Final = 0.5
 """Interval of frames without new data, so that ages are updated."""
 GRANT: Final = "1"
@@ -100,8 +100,8 @@ class TelemetryFeed:
 def add_tracks(app: FastAPI, fleet: FleetState) -> None:
     """Serve `/path/1`: `track` and `fixes` as lists of latitude, longitude, height AMSL, and time.
 
-    And `/history/1`: the columns of `FlightHistory`. The endpoints are coroutines: they must run
-    on the loop, which changes what they read.
+    And `/history/1`: the columns of `FlightHistory`. The endpoints are coroutines, because they
+    must run on the loop, which changes the data that they read.
     """
 
     def vehicle_of(system_id: int) -> VehicleState:
@@ -125,7 +125,7 @@ def add_tracks(app: FastAPI, fleet: FleetState) -> None:
 
 
 def _streamed(columns: Mapping[str, Sequence[Any]]) -> Response:
-    """Answer with a JSON object, column by column: all of it may have a megabyte."""
+    """Answer with a JSON object, column by column, since it may have a megabyte."""
 
     async def pieces() -> AsyncIterator[bytes]:
         before = b"{"

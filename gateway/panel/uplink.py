@@ -1,10 +1,10 @@
 """The panel's connections: the gateway's control socket, and MAVLink as one more client.
 
 MAVLink uses the hub, with its transports and reconnection. With a URL it connects there. Without
-one it asks the gateway on this machine, over the control socket, for a separate listening port on
-loopback, and again whenever that falls silent: so a restarted gateway is found again. A second hub
-receives the frames of a player that the panel starts: they reach only the panel, and commands to a
-played aircraft reach its player.
+one it requests a separate listening port on loopback from the gateway on this machine, over the
+control socket, and again after each timeout of that port: so a restarted gateway is found again. A
+second hub receives the frames of a player that the panel starts: they reach only the panel, and
+commands to a played aircraft reach its player.
 """
 
 import asyncio
@@ -33,27 +33,27 @@ log = logging.getLogger(__name__)
 READING: Final = frozenset(
     {"status", "verbs", "clients.list", "record.status", "record.list", "play.status"}
 )
-"""Verbs that a viewer may use: they change nothing."""
+"""Verbs that a viewer may use, because they change nothing."""
 STATUS_S: Final = 1.0
 SYSTEM_ID: Final = 253
 FIRST_COMPONENT: Final = 25
 USER_COMPONENTS: Final = 75
-"""MAV_COMP_ID_USER1 and on: two panels of one gateway must not be taken for one."""
+"""Number of component ids from MAV_COMP_ID_USER1 on, by which panels of one gateway differ."""
 HEARTBEAT_S: Final = 1.0
 PROBE_S: Final = 0.2
-"""Between heartbeats while nothing is received: the first one may come before the socket is
+"""Interval of heartbeats while nothing is received: the first one may be sent before the socket is
 open."""
 SILENT_US: Final = 3 * US_PER_S
 ACK_TIMEOUT_S: Final = 1.5
 PROGRESS_TIMEOUT_S: Final = 20.0
-"""After an acknowledgement that it is being carried out: a busy disk may take that long."""
+"""Timeout after an acknowledgement that a command is in progress: a busy disk may take so long."""
 ATTEMPTS: Final = 3
 MAX_SENDERS: Final = 64
-"""Programs that send through the panel under their own ids."""
+"""Maximum programs that send through the panel with their own ids."""
 LOCAL_ADDRESS: Final = "udp-listen:127.0.0.1:0"
 LOCAL_URL: Final = f"{LOCAL_ADDRESS}?name=panel"
 PLAYBACK_URL: Final = "udp-listen:127.0.0.1:0?name=playback&trusted=yes"
-"""Where the panel's player sends its frames."""
+"""Endpoint that receives the frames of the panel's player."""
 
 
 class ControlClient:
@@ -86,7 +86,7 @@ class GatewayWatch:
         self._fleet = fleet
         self._task: asyncio.Task[None] | None = None
         self._asking = asyncio.Lock()
-        """An answer to an earlier question must not come after that to a later one."""
+        """Held during a request, so that an earlier answer cannot arrive after a later one."""
 
     def start(self) -> None:
         """Start polling; needs a running event loop."""
@@ -98,7 +98,7 @@ class GatewayWatch:
             self._task.cancel()
 
     async def refresh(self) -> None:
-        """Poll now; the status is not older than the call then."""
+        """Poll now, so that the status is not older than this call."""
         async with self._asking:
             try:
                 status = await self._control.ask("status")
@@ -126,7 +126,7 @@ def _spot_of(mark: dict[str, Any] | None) -> Location | None:
 
 
 class CommandFailedError(Exception):
-    """A command was refused, or not answered; the text says which."""
+    """A command was refused or not answered; the text gives the reason."""
 
 
 class Uplink:
@@ -225,7 +225,7 @@ class Uplink:
 
     def _make_hub(self, endpoints: tuple[str, ...], *, played: bool) -> Hub:
         def on_frame(incoming: Incoming) -> None:
-            # A broadcast arrives as foreign, too.
+            # A broadcast also arrives as a foreign frame.
             if not incoming.forwarded:
                 self._handle(incoming.frame, played=played)
 
@@ -237,7 +237,7 @@ class Uplink:
 
     def _handle(self, frame: bytes, *, played: bool) -> None:
         if (origin_of(frame)[0] in self._fleet.origins) is not played:
-            # Of two with the same id, the page uses the one that it assigned.
+            # If two have the same id, the page uses the one whose id it has assigned.
             return
         try:
             message = self._mav.decode(bytearray(frame))

@@ -4,10 +4,10 @@ A view is a file in `gateway/panel/views/` with a class or function that is call
 `ViewContext` and creates its NiceGUI elements, inside the tab's panel; `page.py` lists them. One
 `ViewContext` belongs to one open page (browser tab).
 
-There are two ways from the aircraft to the screen:
+Data of the aircraft reaches the screen in two ways:
 
 *Moving displays* are drawn in the browser. The page opens one WebSocket (`telemetry_feed.py`), over
-which the `Instant` of every aircraft comes up to 30 times a second, and passes it to
+which it receives the `Instant` of every aircraft up to 30 times a second, and passes it to
 `window.mavgate`:
 
     const stop = mavgate.subscribe((state) => { ... });   // state: newest Instant, by its names
@@ -18,7 +18,7 @@ which the `Instant` of every aircraft comes up to 30 times a second, and passes 
 
 so a Vue component (a JavaScript file in `gateway/panel/web/`, a Python class next to the view with
 `class Horizon(Element, component=WEB / "horizon.js")`) subscribes in `mounted()`, stops in
-`unmounted()`, and draws in `requestAnimationFrame`; nothing of it passes through NiceGUI.
+`unmounted()`, and draws in `requestAnimationFrame`; none of this data passes through NiceGUI.
 
 *Everything else* (tables, texts, buttons) is NiceGUI: read `context.vehicle` in a callback of
 `context.every(seconds, callback)`, which runs only while the view's tab is the one shown.
@@ -55,7 +55,7 @@ WEB: Final = Path(__file__).parent / "web"
 
 
 class NotAllowedError(Exception):
-    """A viewer asked for a change."""
+    """A viewer requested a change."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class PanelParts:
     samples: SampleMemory
     dialogues: Dialogues
     watch: GatewayWatch
-    """The gateway's status of the last second."""
+    """The gateway's status, updated every second."""
     jobs: RecordingJobs
     """The catalogue and the exports of recordings."""
     tiles: MapTiles
@@ -128,16 +128,16 @@ class ViewContext:
 
     @property
     def why_fixed(self) -> str:
-        """Why the user may not change the selected aircraft; empty if they may."""
+        """The reason why the user may not change the selected aircraft; empty if they may."""
         if not self.may_change:
             return "You are logged in as a viewer."
         if self.vehicle is None:
-            return "No aircraft is heard."
+            return "No aircraft is received."
         return "This aircraft is played from a recording." if self.is_playback else ""
 
     @property
     def now_us(self) -> int:
-        """The panel's clock, which all times here refer to."""
+        """Time of the panel's clock, to which all times here refer."""
         return self.parts.clock()
 
     @property
@@ -148,7 +148,7 @@ class ViewContext:
     async def command(self, number: int, *params: float, at: Location | None = None) -> None:
         """Send a MAV_CMD to the selected aircraft, with parameters or with a location.
 
-        Raises CommandFailedError if it is refused, or nobody answers; NotAllowedError for a viewer.
+        Raises CommandFailedError if it is refused or not answered; NotAllowedError for a viewer.
         """
         self.check_may_change()
         target = (self.system_id or 0, number)
@@ -158,7 +158,7 @@ class ViewContext:
     async def ask(self, verb: str, **params: Any) -> Any:
         """Send a request to the gateway's control socket; see docs/control.md.
 
-        Raises ControlError if there is none, or it refuses; NotAllowedError for a viewer who
+        Raises ControlError if there is no gateway, or it refuses; NotAllowedError for a viewer who
         requests a change.
         """
         if verb not in READING:
@@ -166,7 +166,7 @@ class ViewContext:
         return await self.parts.control.ask(verb, **params)
 
     def check_may_change(self) -> None:
-        """Raise NotAllowedError for a viewer: buttons may be hidden, requests can be forged."""
+        """Raise NotAllowedError for a viewer; hidden buttons do not prevent forged requests."""
         if not self.may_change:
             raise NotAllowedError("you are logged in as a viewer, with read-only access")
 

@@ -28,16 +28,16 @@ FAILURES: Final = (
     OSError,
 )  # fmt: skip
 WRITE: Final = 1.0
-"""PREFLIGHT_STORAGE_PARAMETER_ACTION."""
+"""Value of PREFLIGHT_STORAGE_PARAMETER_ACTION: store the parameters."""
 Cells = Sequence[str | tuple[str, ...]]
-"""Each cell's text alone, or its text, style class, icon and track; the class is `""`, `good`,
-`warn`, `bad`, `info` or `soft`; the icon is a name of a Material icon; the track, corners of a line
-in a box of 46 by 24, may be left out."""
+"""Each cell is a text, or a text with style class, icon and track. The class is `""`, `good`,
+`warn`, `bad`, `info` or `soft`; the icon is the name of a Material icon; the track, corners of a
+line in a box of 46 by 24, is optional."""
 REFRESH_S: Final = 0.5
 IDLE: Final = "idle"
 LOOKS: Final = {"recording": "bad", "opening": "warn", "blocked": "bad", "idle": ""}
 ANSWER_S: Final = 60.0
-"""Longest wait for the browser: drawing a picture takes seconds of a small or busy computer."""
+"""Timeout of the browser: drawing an image takes seconds on a small or busy computer."""
 Points = tuple[IntArray, FloatArray]
 """Times in ms since 1970, and values."""
 
@@ -66,7 +66,7 @@ def _show_upload(event: GenericEventArguments) -> None:
 
 @contextmanager
 def notify_failure(context: ViewContext) -> Iterator[None]:
-    """Show on the page why a request was not carried out."""
+    """Show on the page the reason why a request was not carried out."""
     try:
         yield
     except FAILURES as error:
@@ -79,9 +79,9 @@ def notify_failure(context: ViewContext) -> Iterator[None]:
 
 @contextmanager
 def asking(title: str, look: str = "") -> Iterator[ui.dialog]:
-    """Open a dialog of a title, the elements built in the block, and a button that cancels."""
+    """Open a dialog with a title, the elements built in the block, and a button that cancels."""
     dialog = ui.dialog()
-    # A screen reader announces it by its name.
+    # A screen reader announces the dialog by this name.
     dialog.props["aria-label"] = title
     with dialog, ui.card().classes("asks"):
         ui.label(printable(title)).classes("title").classes(look)
@@ -93,7 +93,7 @@ def asking(title: str, look: str = "") -> Iterator[ui.dialog]:
 
 @contextmanager
 def progress_shown(text: str) -> Iterator[None]:
-    """Show on the page that something takes its time."""
+    """Show a text on the page while the block runs."""
     note = ui.notification(printable(text), spinner=True, timeout=None, type="ongoing")
     try:
         yield
@@ -104,7 +104,7 @@ def progress_shown(text: str) -> Iterator[None]:
 def close_and(
     dialog: ui.dialog, act: Callable[[], Awaitable[Any]]
 ) -> Callable[[], Awaitable[None]]:
-    """Return a function that closes a dialog and then acts, for a button in it.
+    """Return a function for a button in a dialog, which closes the dialog and then acts.
 
     Its notifications appear on the page: the dialog is deleted before a slow link has answered.
     """
@@ -121,7 +121,7 @@ def close_and(
 def confirm(
     question: str, word: str, act: Callable[[], Awaitable[Any]], *, grave: bool = True
 ) -> None:
-    """Ask for confirmation, and then act; the button of a grave act is red."""
+    """Ask for confirmation, and then act; the button of a destructive action is red."""
     with asking(question) as dialog:
         button = ui.button(word, on_click=close_and(dialog, act)).props("no-caps")
         button.props("color=negative" if grave else "")
@@ -135,7 +135,7 @@ def allow(button: ui.button, reason: str = "") -> None:
 
 
 async def store_parameters(context: ViewContext, done: str) -> bool:
-    """Have the selected aircraft store its parameters; return whether it has."""
+    """Request the selected aircraft to store its parameters; return whether it has stored them."""
     try:
         await context.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, WRITE)
     except CommandFailedError as error:
@@ -192,7 +192,7 @@ class DataTable(Element, component=WEB / "data_table.js"):
 
 
 class RecorderControls:
-    """A line with the recorder's state and buttons, built at the current place of the page."""
+    """A line with the recorder's state and buttons, built at the current position in the page."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
@@ -263,7 +263,7 @@ class RecorderControls:
 
 
 def why_not(verb: str, recorder: Mapping[str, Any]) -> str:
-    """Return why the recorder cannot `start`, `stop`, `save` or `delete` now; empty if it can."""
+    """Return the reason why the recorder cannot `start`, `stop`, `save` or `delete` now, or ""."""
     is_idle = recorder["state"] == IDLE
     if verb == "start":
         is_under_way = recorder["state"] in ("recording", "opening")
@@ -291,7 +291,7 @@ class StripChart(ui.echart, component=WEB / "strip_chart.js"):
 
     def __init__(self) -> None:
         super().__init__({})
-        # The browser draws the chart by itself.
+        # Only the browser changes the content of the chart.
         self._update_method = None
 
     def set_fields(
@@ -310,7 +310,7 @@ class StripChart(ui.echart, component=WEB / "strip_chart.js"):
         self.run_method("pause", paused)
 
     def set_window(self, seconds: int) -> None:
-        """Set how much of the past is shown."""
+        """Set the length of the shown past."""
         self.run_method("set_window", seconds)
 
     async def span_ms(self) -> tuple[float, float]:
@@ -340,7 +340,7 @@ class LiveChart:
         self.reload()
 
     def reload(self) -> None:
-        """Send all data, as after another aircraft was selected."""
+        """Send all data, as after the selection of another aircraft."""
         if not self._is_ready:
             return
         self._sent_us = {}
@@ -352,7 +352,7 @@ class LiveChart:
         if not (self._is_ready and self.fields):
             return
         if any(name not in self._sent_us and self._unit(name)[1] for name in self.fields):
-            # The unit is known only since the first message of its kind came.
+            # The unit is known only after the first message of its kind.
             self.reload()
             return
         self.element.append(self._news(), unix_time_us() / 1000)
@@ -366,7 +366,7 @@ class LiveChart:
         return fields_csv(series, {name: self._unit(name)[1] for name in self.fields}, zero_us)
 
     def _unit(self, name: str) -> tuple[float, str]:
-        """Return the factor and the unit in which a field is shown."""
+        """Return the factor and the displayed unit of a field."""
         return shown_unit(self._context.parts.history.unit(self._context.system_id or 0, name))
 
     def _series(self, name: str, after_us: int, until_us: int | None = None) -> Points:
@@ -393,7 +393,7 @@ class LiveChart:
 
 
 def _plain(points: Points) -> tuple[list[int], list[float | None]]:
-    """Convert to JSON, which has no NaN; a 32-bit float has seven digits."""
+    """Convert to lists for JSON, without NaN, and with the seven digits of a 32-bit float."""
     time_ms, values = points
     return time_ms.tolist(), [
         float(f"{value:.7g}") if math.isfinite(value) else None for value in values.tolist()

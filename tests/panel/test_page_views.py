@@ -140,7 +140,7 @@ def test_gyroscope_calibration_is_stored_only_after_confirmation(desk: Desk) -> 
     view.locator(".step", has_text="Gyroscope").click()
     expect(view.locator(".now")).to_contain_text("do not touch it until this is done")
     view.get_by_role("button", name="Start").click()
-    expect(view.locator(".now")).to_contain_text("Keep it for good?")
+    expect(view.locator(".now")).to_contain_text("Store it?")
     rate = view.locator(".residuals tr", has_text="Rate at rest")
     before, after = (float(cell) for cell in rate.locator("td").all_inner_texts()[1:])
     assert before == pytest.approx(1.26, abs=0.1)
@@ -266,7 +266,7 @@ def test_field_is_plotted_paused_and_exported(desk: Desk, tmp_path: Path) -> Non
     assert len(rows) > 10
     assert picture.read_bytes().startswith(PNG)
     assert chart.get_attribute("data-points") == points
-    view.get_by_role("button", name="Go on").click()
+    view.get_by_role("button", name="Resume").click()
     expect(chart).to_have_attribute("data-paused", "false")
 
 

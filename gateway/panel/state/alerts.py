@@ -15,7 +15,7 @@ from gateway.units import US_PER_S
 SILENT_S: Final = 5.0
 FIX_OLD_US: Final = 5 * US_PER_S
 TEXT_ALERT_US: Final = 20 * US_PER_S
-"""How long a severe text of any vehicle is shown as an alert."""
+"""Time for which a severe text of any vehicle is shown as an alert."""
 
 SENSORS: Final = {
     mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO: "gyroscope",
@@ -32,18 +32,18 @@ _BEGINS: Final = (
     (re.compile(r"^(?:Recording (?:not started|stopped)|Cannot record): (.+)$"), "recording",
      "Recording failed", "{0}"),
 )  # fmt: skip
-"""Texts of the gateway that begin an alert, and its key, title and detail."""
+"""Texts of the gateway that begin an alert, with its key, title and detail."""
 _ENDS: Final = (
     (re.compile(r"^(.+) is back$"), "node {0}"),
-    # Also the text of a restarted gateway, which knows of no silent node.
+    # Also the first text of a restarted gateway, which has not detected any node timeout.
     (re.compile(r"^(Receiver connected\b)"), "receiver|node .+"),
     (re.compile(r"^(Recording (?!stopped:).+)$"), "recording"),
 )
-"""Texts that end alerts, and a regular expression of their keys."""
+"""Texts that end alerts, with a regular expression of their keys."""
 NODE_SILENT_US: Final = 3 * US_PER_S
 BLOCKED: Final = "blocked"
 OWN_KEYS: Final = ("node ", "receiver", "recording")
-"""Key prefixes of the alerts made here, which come from texts if there is no status."""
+"""Key prefixes of the alerts that come from the status, or from texts if there is no status."""
 
 
 class AlertLevel(IntEnum):
@@ -58,7 +58,7 @@ class Alert:
     """One present problem."""
 
     key: str
-    """Constant as long as it is the same problem."""
+    """Identifies the problem as long as it lasts."""
     level: AlertLevel
     title: str
     detail: str = ""
@@ -69,14 +69,14 @@ def alerts_of(vehicle: VehicleState, now_us: int) -> list[Alert]:
     silent_s = vehicle.silent_s(now_us)
     if silent_s > SILENT_S:
         since = f"no heartbeat for {silent_s:.0f} s" if silent_s < 1e6 else "no heartbeat yet"
-        # Everything else would be outdated.
+        # All other alerts would be outdated.
         return [Alert("silent", AlertLevel.CRITICAL, "Aircraft silent", since)]
     found = [*_gps(vehicle, now_us), *_sensors(vehicle), *_texts(vehicle, now_us)]
     return sorted(found, key=lambda alert: -alert.level)
 
 
 def _gps(vehicle: VehicleState, now_us: int) -> list[Alert]:
-    """Return an alert for a GPS that lost its fix; one that never had one is still searching."""
+    """Return an alert for a GPS that lost its fix; without a first fix it is still searching."""
     if not vehicle.fixes:
         return []
     age_us = vehicle.state.age_us(now_us, "GPS_RAW_INT")
@@ -144,7 +144,7 @@ def with_status(
 
 def _link(report: Mapping[str, Any], vehicle_id: int, roles: Mapping[int, str]) -> list[Alert]:
     if not report["connected"]:
-        # Without it every node is silent; that needs no alert.
+        # Without the receiver all nodes time out, which needs no alert.
         return [Alert("receiver", AlertLevel.CRITICAL, "Receiver lost", report["port"])]
     found = []
     for link in report["nodes"]:

@@ -27,16 +27,16 @@ _FACES: Final = (
 )  # fmt: skip
 MILLI: Final = 1e-3
 NO_ANSWER_US: Final = 4 * US_PER_S
-"""After the last message of a vehicle that never answered the command."""
+"""Timeout of the answer to the command, from the last message of the vehicle."""
 GIVEN_UP_US: Final = 200 * US_PER_S
 AFTER_US: Final = 2 * US_PER_S
-"""How long the samples after the calibration are evaluated."""
+"""Time for which samples are evaluated after the calibration."""
 WINDOW: Final = 25
-"""Samples for a position: half a second at the requested rate."""
+"""Samples for one of the six sides: half a second at the requested rate."""
 MAX_SAMPLES: Final = 3000
 MIN_FIT: Final = 30
 SIDES: Final = ("down", "up", "left", "right", "front", "back")
-"""Which side of the aircraft lies below, as in the `[cal]` texts; down is level."""
+"""Lower side of the aircraft, as in the `[cal]` texts; down is level."""
 SIDE_NAMES: Final = {
     "down": "level",
     "up": "upside down",
@@ -52,10 +52,10 @@ ORIENTATIONS: Final = {
         ("the nose", 0.0), ("the right wing", 90.0), ("the tail", 180.0), ("the left wing", -90.0),
     )
 }  # fmt: skip
-"""Roll, pitch and yaw from the sensor's axes to the body's, deg, by how the board lies in the
-aircraft; its x arrow is printed next to the chips."""
+"""Roll, pitch and yaw from the sensor's axes to the body's, deg, by the orientation of the board
+in the aircraft; its x arrow is printed next to the chips."""
 _POSES: Final = (("back", "front"), ("left", "right"), ("up", "down"))
-"""By axis of body FRD: the side that lies below while gravity is felt along it, and against it."""
+"""Lower sides by axis of body FRD: with the reaction to gravity along the axis, and against it."""
 SIDE_SHARE: Final = 0.85
 _STARTED: Final = re.compile(r"^\[cal\] calibration started: \d+ (\w+)")
 _PROGRESS: Final = re.compile(r"^\[cal\] progress <(\d+)>")
@@ -93,7 +93,7 @@ _MIDDLES: Final = np.array([_unit(cell.sum(axis=0)) for cell in CELLS])
 
 
 def seen_cells(vectors: FloatArray) -> list[bool]:
-    """Return which of `CELLS` vectors from the origin, shape (n, 3), point into.
+    """Return, for each of `CELLS`, whether one of the vectors, shape (n, 3), points into it.
 
     They may have any length but zero; rows that are not finite are ignored.
     """
@@ -109,7 +109,7 @@ class CalibrationStep(StrEnum):
     """The calibrations, in the recommended order."""
 
     MOUNTING = "mounting"
-    """Set by parameters; the others are measured by the aircraft."""
+    """Set by parameters; the aircraft measures the others."""
     GYRO = "gyro"
     ACCEL = "accel"
     LEVEL = "level"
@@ -122,7 +122,7 @@ PARAMS: Final[dict[CalibrationStep, tuple[float, ...]]] = {
     CalibrationStep.ACCEL: (0.0, 0.0, 0.0, 0.0, 1.0),
     CalibrationStep.LEVEL: (0.0, 0.0, 0.0, 0.0, 2.0),
 }
-"""Of the command."""
+"""Parameters of the command."""
 
 
 class RunState(StrEnum):
@@ -131,7 +131,7 @@ class RunState(StrEnum):
     ASKED = "asked"
     RUNNING = "running"
     CHECKING = "checking"
-    """Done, and the remaining error is being measured."""
+    """Done; the remaining error is being measured."""
     DONE = "done"
     FAILED = "failed"
 
@@ -143,7 +143,7 @@ class RunState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Residual:
-    """One measure of a sensor's quality, before and after."""
+    """One measure of a sensor's error, before and after."""
 
     name: str
     unit: str
@@ -166,12 +166,12 @@ class CalibrationRun:
         self.step = step
         self.state = RunState.ASKED
         self.progress = 0
-        """In percent, as reported by the vehicle."""
+        """Progress in percent, as reported by the vehicle."""
         self.trouble = ""
-        """Why it failed."""
+        """The reason why it failed."""
         self.sides_done: list[str] = []
         self.side_now: str | None = None
-        """The side that lies below at this moment, if any clearly does."""
+        """The present lower side, if it is unambiguous."""
         self._before, self._after = _Samples(), _Samples()
         self._side_means: dict[str, FloatArray] = {}
         self._began_us = self._heard_us = now_us
@@ -202,7 +202,7 @@ class CalibrationRun:
         if self.state is RunState.ASKED and now_us - self._heard_us > NO_ANSWER_US:
             self._fail("the aircraft does not answer")
         elif self.state is RunState.RUNNING and now_us - self._began_us > GIVEN_UP_US:
-            self._fail("nothing more was heard of it")
+            self._fail("no result was received")
         elif self.state is RunState.CHECKING and now_us - self._done_us > AFTER_US:
             self.state = RunState.DONE
 
@@ -212,14 +212,14 @@ class CalibrationRun:
         return np.array(self._before.mag).reshape(-1, 3)
 
     def sphere(self) -> tuple[_Vector, float]:
-        """Return centre and radius of the magnetic field's sphere, uT, as far as known."""
+        """Return centre and radius of the sphere of the magnetic field, uT; NaN if unknown."""
         points = self.field_points
         if not len(points):
             return (0.0, 0.0, 0.0), NAN
         if len(points) >= MIN_FIT:
             centre, radius = fit_sphere(points)
             spread = float(np.ptp(points, axis=0).max())
-            # A small patch fits a sphere of any size; until then use the mean.
+            # A small patch fits a sphere of any size: use the middle until it is larger.
             if math.isfinite(radius) and radius < spread:
                 return centre, radius
         x, y, z = (points.min(axis=0) + points.max(axis=0)).tolist()
@@ -227,7 +227,7 @@ class CalibrationRun:
         return middle, float(np.linalg.norm(points - middle, axis=1).max())
 
     def cover(self) -> list[bool]:
-        """Return which cells of `CELLS` the magnetic field was seen in."""
+        """Return, for each of `CELLS`, whether the magnetic field was measured in it."""
         if not self._before.mag:
             return [False] * len(CELLS)
         centre, _ = self.sphere()
@@ -266,7 +266,7 @@ class CalibrationRun:
 
     def _handle_text(self, text: str, now_us: int) -> None:
         if match := _FAILED.match(text):
-            # The acknowledgement, which gives no reason, comes before it.
+            # The acknowledgement, which has no reason, arrives before this text.
             self.state, self.trouble = RunState.FAILED, match[1]
         if self.state.is_over:
             return
@@ -309,7 +309,7 @@ class CalibrationRun:
             self._note_side()
 
     def _note_side(self) -> None:
-        """Note which side lies below, and the gravity measured there."""
+        """Note the lower side, and the gravity measured on it."""
         recent = np.array(self._before.accel[-WINDOW:])
         mean = recent.mean(axis=0)
         axis = int(np.abs(mean).argmax())

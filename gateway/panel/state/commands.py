@@ -1,4 +1,4 @@
-"""Commands to an aircraft as messages, and their results in words."""
+"""Commands to an aircraft as messages, and their results as text."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from gateway.vehicle.plan import Location
 
 
 def result_text(result: int) -> str:
-    """Return a MAV_RESULT in words."""
+    """Return the text of a MAV_RESULT."""
     known = mavlink.enums["MAV_RESULT"].get(result)
     if known is None:
         return f"result {result}"

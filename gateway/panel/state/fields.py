@@ -16,34 +16,34 @@ IntArray = NDArray[np.int64]
 
 SPAN_US: Final = 300 * US_PER_S
 MAX_RATE_HZ: Final = 50
-"""Faster messages are thinned out: no strip chart of minutes has more columns."""
+"""Maximum rate; faster messages are thinned, since no strip chart of minutes has more columns."""
 LEAST_GAP_US: Final = US_PER_S * 3 // (4 * MAX_RATE_HZ)
-"""Shorter than the interval, so that jitter does not thin out messages at that rate."""
+"""Least interval, shorter than that of the rate, so that jitter does not drop messages at it."""
 MAX_ROWS: Final = SPAN_US // LEAST_GAP_US
 ANGLES: Final = {"rad": (math.degrees(1.0), "°"), "rad/s": (math.degrees(1.0), "°/s")}
 SHOWN_UNITS: Final = ANGLES | {
     "degE7": (DEG_PER_DEGE7, "°"), "cdeg": (1e-2, "°"), "cm/s": (1e-2, "m/s"),
     "gauss": (100.0, "µT"), "cdegC": (1e-2, "°C"), "us": (1e-6, "s"), "ms": (1e-3, "s"),
 }  # fmt: skip
-"""Factor and unit in which a field is shown, by the unit that MAVLink gives it."""
+"""Factor and displayed unit of a field, by its MAVLink unit."""
 UNIT_TEXTS: Final = {
     "deg": "°", "deg/s": "°/s", "m/s/s": "m/s²", "m/s2": "m/s²", "m/s^2": "m/s²", "uT": "µT",
     "degC": "°C", "us": "µs", "m2": "m²",
 }  # fmt: skip
 FIRST_ROWS: Final = 256
 MAX_KINDS: Final = 200
-"""Messages of one aircraft, instances counted apart; more are forged."""
+"""Maximum messages of one aircraft, each instance counted; more are forged."""
 MAX_ARRAY: Final = 32
-"""Longer arrays are files and logs, not quantities."""
+"""Maximum length of an array; longer ones contain files and logs, not quantities."""
 
 
 def parameter_unit(unit: str) -> tuple[float, str]:
-    """Return the factor and the unit in which a parameter is shown: angles in degrees."""
+    """Return the factor and the displayed unit of a parameter: degrees for angles."""
     return ANGLES.get(unit, (1.0, UNIT_TEXTS.get(unit, unit)))
 
 
 def shown_unit(unit: str) -> tuple[float, str]:
-    """Return the factor and the unit in which a field of a MAVLink unit is shown."""
+    """Return the factor and the displayed unit of a field with a MAVLink unit."""
     return SHOWN_UNITS.get(unit) or parameter_unit(unit)
 
 
@@ -82,10 +82,10 @@ class FieldHistory:
     def series(
         self, system_id: int, name: str, after_us: int = -1, until_us: int | None = None
     ) -> tuple[IntArray, FloatArray]:
-        """Return the times, on the panel's clock, and values of a field; empty if it never came.
+        """Return the times, on the panel's clock, and values of a field; empty if never received.
 
         Its name is that of message and field, such as `BATTERY_STATUS[0].voltages[1]`. The values
-        are as the message has them, after the first time and not after the second.
+        have the unit of the message, and times after the first and up to the second limit.
         """
         kind, _, field = name.partition(".")
         columns = self._vehicles.get(system_id, {}).get(kind)
@@ -105,7 +105,7 @@ class _Columns:
         self._time_us = np.zeros(FIRST_ROWS, np.int64)
         self._values = np.zeros((FIRST_ROWS, len(self._readers)))
         self._count = 0
-        """The newest row is at `(count - 1) % capacity`, the oldest of a full ring behind it."""
+        """The newest row is at `(count - 1) % capacity`, the oldest of a full ring after it."""
 
     def unit(self, field: str) -> str:
         return self._units.get(field.partition("[")[0], "")
@@ -155,7 +155,7 @@ class _Columns:
 
 
 def _readers_of(message: Any) -> dict[str, Callable[[Any], float]]:
-    """Return how to read each number in a message, by its name."""
+    """Return functions that read each number in a message, by its name."""
     found: dict[str, Callable[[Any], float]] = {}
     for field in message.fieldnames:
         value = getattr(message, field)
@@ -181,7 +181,7 @@ def _kind_of(message: Any) -> str:
 def fields_csv(
     series: Mapping[str, tuple[IntArray, FloatArray]], units: Mapping[str, str], zero_unix_us: int
 ) -> str:
-    """Write fields side by side."""
+    """Write fields as columns."""
     heads = [f"{name} ({units[name]})" if units.get(name) else name for name in series]
     lines = [",".join(["time_unix_s", *heads])]
     columns = [dict(zip(t.tolist(), v.tolist(), strict=True)) for t, v in series.values()]

@@ -10,7 +10,7 @@ from gateway.panel.state.vehicle import VehicleState
 from gateway.recordings.newest import VehicleComponents
 
 MAX_VEHICLES: Final = 32
-"""More are forged; each may take some MB."""
+"""Maximum aircraft: more are forged, and each may take some MB."""
 
 Listener = Callable[[int, Any, int], None]
 """Called with system id, decoded message and time in µs on the panel's clock."""
@@ -23,9 +23,9 @@ class Origin:
     word: str
     """`recorded` or `fused again`."""
     recorded_id: int
-    """Its recorded system id."""
+    """System id in the recording."""
     page: str = ""
-    """Id of the page that plays it, the only one that shows it."""
+    """Id of the page that plays it; no other page shows it."""
 
 
 class FleetState:
@@ -34,7 +34,7 @@ class FleetState:
     def __init__(self) -> None:
         self.vehicles: dict[int, VehicleState] = {}
         self.origins: dict[int, Origin] = {}
-        """Of played aircraft, by their played system ids."""
+        """Origins of played aircraft, by their played system ids."""
         self.version = 0
         """Counts the messages, so that a reader can detect new data."""
         self._components = VehicleComponents()

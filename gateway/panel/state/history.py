@@ -6,7 +6,7 @@ from typing import Final
 from gateway.panel.state.instant import Instant
 
 MAX_TRACK: Final = 20_000
-"""Moments of the history: more than an hour at 5 Hz; the oldest are dropped."""
+"""Maximum moments of the history: more than an hour at 5 Hz; the oldest are dropped."""
 TRACK_INTERVAL_US: Final = 200_000
 HISTORY_COLUMNS: Final = {
     "lat_deg": "d", "lon_deg": "d",
@@ -20,7 +20,7 @@ HISTORY_COLUMNS: Final = {
         "f",
     ),
 }  # fmt: skip
-"""Columns of a history and their type: fields of `Instant`, `.n` for one of several numbers."""
+"""Columns of a history and their types: fields of `Instant`, with `.n` for one of its numbers."""
 
 
 class FlightHistory:
@@ -47,7 +47,7 @@ class FlightHistory:
             value = getattr(now, field)
             column.append(value[int(index)] if index else value)
         if len(self.time_us) > self._limit:
-            # A quarter at once, so that moving the rest is seldom.
+            # A quarter at once, so that the rest is seldom moved.
             for column in (self.time_us, *self.columns.values()):
                 del column[: self._limit // 4]
 

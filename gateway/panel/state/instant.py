@@ -8,12 +8,12 @@ from gateway.vehicle.plan import Location
 class Instant(msgspec.Struct, frozen=True, kw_only=True):
     """State of an aircraft at one moment.
 
-    Everything is the newest from MAVLink, of any sender; NaN (null in the browser) means unknown.
+    All values are the newest from MAVLink, of any sender; NaN (null in the browser) means unknown.
     """
 
     system_id: int
     time_us: int
-    """When the newest attitude or position came, on the panel's clock."""
+    """When the newest attitude or position was received, on the panel's clock."""
     title: str
     """Displayed name."""
     model: str
@@ -21,9 +21,9 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     origin: str
     """`live`, `recorded` or `fused again`."""
     generation: int
-    """How often its path was restarted."""
+    """Number of restarts of its path."""
     silent_s: float
-    """Since the newest heartbeat."""
+    """Time since the newest heartbeat."""
     q_nb: tuple[float, float, float, float]
     """Attitude, scalar first, body FRD to NED."""
     rate_b_radps: tuple[float, float, float]
@@ -31,11 +31,11 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     lon_deg: float
     alt_amsl_m: float
     alt_home_m: float
-    """Above home."""
+    """Height above home."""
     vel_n_mps: tuple[float, float, float]
     groundspeed_mps: float
     airspeed_mps: float
-    """Unknown where the vehicle sends its ground speed for want of a sensor."""
+    """Unknown if the vehicle has no airspeed sensor and sends its ground speed instead."""
     climb_mps: float
     heading_deg: float
     pos_std_m: float
@@ -43,7 +43,7 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     fix_type: int
     """GPS_FIX_TYPE; 0 without a GPS."""
     satellites: float
-    """Unknown where the receiver does not count them."""
+    """Unknown if the receiver does not report it."""
     fix: Location | None
     """Newest GPS fix of two dimensions or more."""
     home: Location | None
@@ -54,7 +54,7 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     battery_percent: float
     armed: bool
     attitude_s: float
-    """Age of the newest attitude, as the others below."""
+    """Age of the newest attitude; the ages below are of other data."""
     position_s: float
     hud_s: float
     gps_s: float

@@ -25,16 +25,16 @@ from gateway.vehicle.services.ftp import ACK, MAX_DATA, NAK, FtpError, Opcode, P
 from gateway.vehicle.services.parameters import INTEGER_CODES, decode_value
 
 RETRY_US: Final = US_PER_S // 2
-"""After the first attempt, and twice as long after each further one."""
+"""Timeout of the first attempt; it doubles with each further one."""
 MAX_READS: Final = 6
-"""Half a minute: a radio link may be silent for so long."""
+"""Maximum attempts: half a minute, the length of a radio outage."""
 MAX_FILE: Final = 4_000_000
-"""Metadata of the largest autopilots has two; more is refused."""
+"""Maximum bytes of a file: metadata of the largest autopilots has 2 MB."""
 GENERAL_PATHS: Final = ("/general.json", "/etc/extras/component_general.json.xz")
 """Default paths of the general metadata file."""
 TYPE_PARAMETER: Final = 1
 MAX_PLAIN: Final = 16_000_000
-"""Limit of an unpacked metadata file, against decompression bombs."""
+"""Maximum bytes of an unpacked metadata file, against decompression bombs."""
 RENAMED: Final = {
     "short": "shortDesc", "long": "longDesc", "unit": "units", "low": "min", "high": "max",
     "choices": "values",
@@ -43,7 +43,7 @@ QUIET_US: Final = US_PER_S
 MISSING_AT_ONCE: Final = 20
 MAX_ATTEMPTS: Final = 5
 MAX_PARAMETERS: Final = 5000
-"""Large autopilots have some 1500; more are forged."""
+"""Maximum parameters: large autopilots have some 1500; more are forged."""
 NOT_REQUESTED: Final = 65_535
 """The index of a value that was not requested by its index."""
 AUTOPILOT: Final = mavlink.MAV_COMP_ID_AUTOPILOT1
@@ -139,7 +139,7 @@ class FileClient:
                 self.refused.add(reading.path)
             if reading.session is not None:
                 found += self._ask(Opcode.TERMINATE_SESSION, reading.session, 0, b"", now_us)
-                # Whether it arrived does not matter: the server makes room by itself.
+                # Not repeated if it is lost: the server closes old sessions by itself.
                 self._asked = None
         return found + self._next(now_us)
 
@@ -184,11 +184,11 @@ class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True, rename=RENAMED):
     low: float = NAN
     high: float = NAN
     choices: tuple[ParameterChoice, ...] = ()
-    """The only values; any number if there are none."""
+    """The allowed values; empty allows any number."""
 
 
 def parameter_path(general: bytes) -> str | None:
-    """Return the path of the parameters' file on the vehicle, by the general file."""
+    """Return the path of the parameters' file on the vehicle, from the general file."""
     for kind in _items(_parsed(general), "metadataTypes"):
         uri = str(kind.get("uri", ""))
         if kind.get("type") == TYPE_PARAMETER and uri.startswith("mftp://"):
@@ -251,7 +251,7 @@ class _Change:
 
 
 def is_same_value(value: float, other: float) -> bool:
-    """Compare to the digits of a parameter on the wire, which has 32 bits."""
+    """Compare with the precision of a transmitted parameter, which has 32 bits."""
     return math.isclose(value, other, rel_tol=1e-6, abs_tol=1e-12)
 
 
@@ -265,7 +265,7 @@ class ParameterClient:
         """Number of parameters, as reported by the vehicle."""
         self.entries: dict[str, ParameterEntry] = {}
         self.refused: dict[str, str] = {}
-        """Why the last change of a parameter failed, until it is changed again."""
+        """The reasons why last changes failed, by parameter, until it is changed again."""
         self.bytewise = False
         """Whether integers are encoded byte-wise (PX4) and not as numbers (ArduPilot)."""
         self._indices: set[int] = set()
@@ -279,13 +279,13 @@ class ParameterClient:
         return frozenset(self._changes)
 
     def load(self, now_us: int) -> list[Any]:
-        """Request all of them; return the messages to send."""
+        """Request all parameters; return the messages to send."""
         self.state, self._attempts = ListState.LOADING, 0
         self._due_us = now_us + QUIET_US
         return [mavlink.MAVLink_param_request_list_message(self.system_id, AUTOPILOT)]
 
     def change(self, name: str, value: float, now_us: int) -> list[Any]:
-        """Set one; return the messages to send now: none while its last change is not answered.
+        """Set a parameter; return the messages to send now, none until its last change is answered.
 
         Raises ValueError if there is no such parameter, or the value is not a number that fits.
         """
@@ -303,7 +303,7 @@ class ParameterClient:
         return [message]
 
     def handle(self, message: Any, now_us: int) -> None:
-        """Handle one message of the vehicle; only those about parameters matter."""
+        """Handle one message of the vehicle; others than those about parameters are ignored."""
         match message.get_type():
             case "PARAM_VALUE":
                 self._handle_value(message, now_us)
@@ -343,7 +343,7 @@ class ParameterClient:
                 self.state, self._due_us = ListState.COMPLETE, None
 
     def _answered(self, name: str, now_us: int) -> float | None:
-        """Return the value that was answered; None if none was awaited or a newer one follows."""
+        """Return the answered value; None if no answer was due or a newer value follows."""
         change = self._changes.pop(name, None)
         if change is None:
             return None

@@ -10,7 +10,7 @@ from gateway.wire.mavlink_splitter import message_id_of
 
 SPAN_US: Final = 180 * US_PER_S
 MAX_FRAMES: Final = 40_000
-"""Three minutes at 200 a second; less at a higher rate."""
+"""Maximum frames: three minutes at 200 a second; less at a higher rate."""
 
 SENSOR_MESSAGES: Final = frozenset(
     {
@@ -23,7 +23,7 @@ SENSOR_MESSAGES: Final = frozenset(
 )
 
 TimedFrames = list[tuple[int, bytes]]
-"""When each came, in µs on the panel's clock, and the frame."""
+"""Frames with the time at which each was received, µs on the panel's clock."""
 
 
 class SampleMemory:

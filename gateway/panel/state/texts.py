@@ -9,7 +9,7 @@ from gateway.recordings.status_texts import JoinedText, TextJoiner
 
 MAX_TEXTS: Final = 500
 MAX_LETTERS: Final = 2_000
-"""Longer texts are cut there."""
+"""Maximum characters; longer texts are cut."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +19,7 @@ class TimedText:
     number: int
     """Counts up from 1, so that a page can find the new ones."""
     time_us: int
-    """On the panel's clock."""
+    """Time on the panel's clock."""
     severity: int
     """MAV_SEVERITY: 0 emergency to 7 debug."""
     text: str
@@ -34,7 +34,7 @@ class StatusTexts:
         self._joiner = TextJoiner()
 
     def feed(self, message: Any, now_us: int) -> None:
-        """Add one STATUSTEXT; the chunks of a long one go into one entry, blanks into none."""
+        """Add one STATUSTEXT; chunks of a long text share an entry, blank texts are ignored."""
         self._add(self._joiner.feed(bytes(message.get_msgbuf()), now_us))
 
     def poll(self, now_us: int) -> None:

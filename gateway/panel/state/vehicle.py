@@ -26,23 +26,23 @@ OTHERS: Final = {4: "heli", 7: "balloon", 8: "balloon", 10: "rover", 11: "boat",
 
 
 class VehicleState:
-    """Everything known about one system."""
+    """State of one system."""
 
     def __init__(self, system_id: int, origin: str = LIVE, number: int | None = None) -> None:
         self.system_id = system_id
         self.origin = origin
         self.number = system_id if number is None else number
         self.generation = 0
-        """How often the path was restarted."""
+        """Number of restarts of the path."""
         self.state = NewestState()
-        """The newest messages of its autopilot, and when each came on the panel's clock."""
+        """The newest messages of its autopilot, with their times on the panel's clock."""
         self.history = FlightHistory()
-        """Its states so far, a few a second."""
+        """Its past states, a few a second."""
         self.fixes: deque[TrackPoint] = deque(maxlen=MAX_TRACK)
         """GPS fixes."""
         self.texts = StatusTexts()
         self.exact_mark: Location | None = None
-        """The mark from the gateway's control socket, exact where MAVLink is rounded."""
+        """The exact mark from the gateway's control socket; that from MAVLink is rounded."""
 
     def update(self, message: Any, now_us: int) -> None:
         """Update the state by one decoded message of this system's autopilot."""
@@ -58,13 +58,13 @@ class VehicleState:
 
     @property
     def name(self) -> str:
-        """Its kind and its number."""
+        """Its kind and number."""
         kind = "Aircraft" if self.model == "none" else self.model.capitalize()
         return f"{kind} {self.number}"
 
     @property
     def title(self) -> str:
-        """Displayed name, which indicates where it is not live."""
+        """Displayed name, with its origin if it is not live."""
         return self.name if self.is_live else f"{self.name}, {self.origin}"
 
     @property
@@ -80,12 +80,12 @@ class VehicleState:
 
     @property
     def _moved_us(self) -> int:
-        """When the newest attitude or position came; 0 before the first."""
+        """When the newest attitude or position was received; 0 before the first."""
         heard_us = (self.state.heard_us.get(name, 0) for name in ATTITUDES)
         return max(*heard_us, self.state.position_us, 0)
 
     def silent_s(self, now_us: int) -> float:
-        """Return how long no heartbeat came; infinite if none ever did."""
+        """Return the time since the newest heartbeat; infinite before the first."""
         return self.state.age_us(now_us, "HEARTBEAT") / US_PER_S
 
     @property
@@ -152,7 +152,7 @@ class VehicleState:
         )
 
     def _age_s(self, now_us: int, *names: str) -> float:
-        """Return the age of the newest of some messages; NaN if none came."""
+        """Return the age of the newest of some messages; NaN if none was received."""
         age_us = self.state.age_us(now_us, *names)
         return NAN if math.isinf(age_us) else age_us / US_PER_S
 

@@ -1,4 +1,4 @@
-"""View 5: each sensor calibrated step by step; nothing is stored without a yes."""
+"""View 5: each sensor calibrated step by step; storing needs a confirmation."""
 
 import math
 from functools import partial
@@ -28,7 +28,7 @@ MIN_CELLS: Final = 60
 MNT_NAMES: Final = tuple(f"CAL_MNT_{axis}" for axis in ("ROLL", "PIT", "YAW"))
 MAG_MNT_NAMES: Final = tuple(f"CAL_MAG_MNT_{axis}" for axis in ("ROLL", "PIT", "YAW"))
 ANGLE_DEG: Final = 3.0
-"""Angles of less difference are those of a level that was calibrated."""
+"""Maximum difference of angles: that of a level calibration on top of an orientation."""
 MEASURED: Final = "another one, as measured"
 GUIDE: Final = {
     CalibrationStep.MOUNTING: "When: first of all, and when the board was turned. Any other angle "
@@ -61,7 +61,7 @@ INSTRUCTIONS: Final = {
 
 
 class FieldSphere(Element, component=WEB / "field_sphere.js"):
-    """The magnetometer's samples on a sphere that can be turned, and directions not covered yet."""
+    """The magnetometer's samples on a sphere that can be turned, with uncovered directions."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class CalibrationView:
         self._refresh()
 
     def _run(self) -> CalibrationRun | None:
-        """Return the newest calibration, if it is of the shown step."""
+        """Return the newest calibration if it belongs to the shown step."""
         dialogue = self._context.dialogue
         run = None if dialogue is None else dialogue.calibration
         return run if run is not None and run.step is self._step else None
@@ -117,7 +117,7 @@ class CalibrationView:
                 card.props(remove="aria-current")
             outcome, look = self._outcomes.get(step, ("", ""))
             state.classes(look, replace="state").set_text(outcome)
-        # Not for each state of a run: buttons that are replaced would lose clicks and the focus.
+        # Not for each state of a run, since replaced buttons would lose clicks and the focus.
         if (self._step, run) != self._drawn:
             self._drawn = (self._step, run)
             self._build_guide()
@@ -127,7 +127,7 @@ class CalibrationView:
             self._refresh_guide(run, ready=ready)
 
     def _build_step(self, step: CalibrationStep) -> tuple[ui.element, ui.label]:
-        """Build a button once: one that is replaced would lose clicks and the focus."""
+        """Build the button of a step, once: a replaced one would lose clicks and the focus."""
         title, icon, short = TITLES[step]
         with ui.element("button").classes("card step") as card:
             ui.icon(icon)
@@ -201,7 +201,7 @@ class CalibrationView:
                     card.props["title"] = f"Choose {name}"
                     picture = ui.element("img").classes("pose-picture")
                     picture.props["src"] = f"/web/mounting.svg#way{number}"
-                    # The name below it says the same.
+                    # Empty, because the name below it has the same text.
                     picture.props["alt"] = ""
                     ui.label(name)
                     angles = f"roll {roll_deg:.0f}°, pitch {pitch_deg:.0f}°, yaw {yaw_deg:.0f}°"
@@ -221,7 +221,7 @@ class CalibrationView:
         self._refresh()
 
     def _refresh_mounting(self, *, ready: bool) -> None:
-        # Set once alone: a refresh must not change a choice that is not used yet.
+        # Set only once: a refresh must not change a choice that is not applied yet.
         if ready and self._choice.value is None:
             self._choice.set_value(self._orientation())
         for name, card in self._pictures.items():
@@ -232,7 +232,7 @@ class CalibrationView:
             allow(button, self._why_not(ready=ready))
 
     def _orientation(self) -> str:
-        """Return which of the orientations the parameters have."""
+        """Return the orientation that corresponds to the parameters."""
         dialogue = self._context.dialogue
         entries = {} if dialogue is None else dialogue.parameters.entries
         now = [entries[name].value for name in MNT_NAMES if name in entries]
@@ -263,13 +263,13 @@ class CalibrationView:
         )
 
     def _why_not(self, *, ready: bool) -> str:
-        """Return why nothing can be calibrated now; empty if it can."""
+        """Return the reason why no calibration is possible now; empty if it is."""
         return self._context.why_fixed or ("" if ready else "The parameters are being read.")
 
     def _instruction(self, run: CalibrationRun | None, *, ready: bool) -> str:
         vehicle = self._context.vehicle
         if vehicle is None:
-            return "No aircraft is heard."
+            return "No aircraft is received."
         if not vehicle.is_live:
             return "This aircraft is played from a recording. Choose a live one to calibrate it."
         if run is None or run.state is RunState.ASKED:
@@ -280,7 +280,7 @@ class CalibrationView:
         if run.state is RunState.CHECKING:
             return "Done. Measuring the remaining error; leave it as it is for a moment."
         if run.state is RunState.DONE:
-            return "Calibrated, and in use until the gateway ends. Keep it for good?"
+            return "Calibrated, and in use until the gateway ends. Store it?"
         return INSTRUCTIONS[self._step]
 
     def _build_poses(self) -> None:
@@ -379,7 +379,7 @@ class CalibrationView:
         self._refresh()
 
     def _has_other_unanswered(self) -> bool:
-        """Return whether another calibration is neither stored nor undone, and say so."""
+        """Return, and show, whether another calibration is neither stored nor undone."""
         other = self._context.dialogue.unanswered if self._context.dialogue else None
         if other is None or other is self._step:
             return False

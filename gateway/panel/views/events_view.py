@@ -16,11 +16,11 @@ REFRESH_S: Final = 0.5
 SEVERITIES: Final = (
     "Emergency", "Alert", "Critical", "Error", "Warning", "Notice", "Info", "Debug",
 )  # fmt: skip
-"""By MAV_SEVERITY."""
-SHOWN: Final = {7: "everything", 5: "notice and graver", 4: "warning and graver", 2: "critical"}
+"""Names by MAV_SEVERITY."""
+SHOWN: Final = {7: "everything", 5: "notice and above", 4: "warning and above", 2: "critical"}
 LOOKS: Final = ("bad", "bad", "bad", "bad", "warn", "info", "info", "soft")
 ICONS: Final = {"bad": "error", "warn": "warning", "info": "info", "soft": "bug_report"}
-"""Each kind has its own icon, because colour alone is not accessible to everybody."""
+"""Icon of each look, because colour alone is not accessible to everybody."""
 
 
 def build_banner(context: ViewContext) -> None:

@@ -17,9 +17,9 @@ from gateway.vehicle.plan import Location
 
 STYLES_S: Final = 2.0
 LEAFLET: Final = ui.leaflet
-"""The map library is that of NiceGUI's own map, whose import registers it with the page."""
+"""NiceGUI's own map: its import registers the map library with the page."""
 THREE: Final = ui.scene
-"""The 3D library is that of NiceGUI's own scene, whose import registers it with the page."""
+"""NiceGUI's own scene: its import registers the 3D library with the page."""
 
 
 class FlightMap(Element, component=WEB / "flight_map.js"):
@@ -68,7 +68,7 @@ async def _at(
 
 
 def _ground_m(context: ViewContext) -> float:
-    """Return home's height as that of the ground: there is no terrain data."""
+    """Return the height of home for that of the ground, since there is no terrain data."""
     vehicle = context.vehicle
     if vehicle is None:
         return math.nan
@@ -117,11 +117,11 @@ class FlightScene(Element, component=WEB / "flight_scene.js"):
 
 
 class NumberStrip(Element, component=WEB / "number_strip.js"):
-    """The flight in numbers, each with its unit and, once it is old, its age."""
+    """The flight in numbers, each with its unit and, if it is old, its age."""
 
 
 class FlightTimeline(Element, component=WEB / "flight_timeline.js"):
-    """The current flight over time, in which the page can go back."""
+    """The current flight over time, with a handle to show the past."""
 
 
 def build_flight(context: ViewContext) -> None:

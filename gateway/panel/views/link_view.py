@@ -33,7 +33,7 @@ LOOPBACK_ONLY: Final = (
 SILENT_US: Final = 2 * US_PER_S
 LOSS_WARN: Final = 5.0
 LOSS_BAD: Final = 20.0
-"""Percent of payloads: above it the estimators mostly extrapolate."""
+"""Loss of payloads, percent, above which the estimators mostly extrapolate."""
 
 NODE_COLUMNS: Final = (
     "Node", "Rate", "Received", "Lost", "Loss", "Restarts", "Clock", "Age", "Chips"
@@ -57,7 +57,7 @@ class LinkView:
                     self._build_serial()
                 self._nodes = DataTable(
                     NODE_COLUMNS,
-                    "No node was heard.",
+                    "No node was received.",
                 ).props("data-role=nodes")
             with ui.element("div").classes("card padded wide"):
                 heading("Clients")
@@ -71,7 +71,7 @@ class LinkView:
                 heading("Aircraft over MAVLink")
                 self._vehicles = DataTable(
                     ("Aircraft", "Heartbeat", "Attitude", "Position", "Messages"),
-                    "No aircraft was heard.",
+                    "No aircraft was received.",
                 )
         context.every(REFRESH_S, self.refresh)
         self.refresh()
@@ -150,7 +150,7 @@ class LinkView:
         }
         options["auto"] = AUTO
         if options != self._port.options:
-            # A port that is about to be chosen stays chosen while it exists.
+            # A port that the user has selected stays selected while it exists.
             kept = self._port.value if self._was_shown else status["wanted"]
             self._port.set_options(options, value=kept if kept in options else "auto")
         self._was_shown = True
@@ -179,7 +179,7 @@ class LinkView:
 
     def _ask_remove(self, name: str) -> None:
         remove = partial(self._ask, "clients.remove", name=name)
-        confirm(f"Remove the client {name}? It gets nothing more.", "Remove", remove)
+        confirm(f"Remove the client {name}? It will receive no more data.", "Remove", remove)
 
     def refresh(self) -> None:
         """Show the newest status."""

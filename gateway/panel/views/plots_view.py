@@ -55,7 +55,7 @@ class PlotsView:
 
     def _add(self, fields: tuple[str, ...]) -> None:
         if len(self._strips) >= MAX_STRIPS:
-            ui.notify(f"{MAX_STRIPS} charts are the most", type="warning")
+            ui.notify(f"at most {MAX_STRIPS} charts", type="warning")
             return
         with self._column:
             strip = _Strip(self, self._context, fields)
@@ -68,7 +68,7 @@ class PlotsView:
 
     def _set_paused(self, *, paused: bool) -> None:
         self._paused = paused
-        self._pause.set_text("Go on" if paused else "Pause")
+        self._pause.set_text("Resume" if paused else "Pause")
         self._pause.props["icon"] = "play_arrow" if paused else "pause"
         for strip in self._strips:
             strip.chart.element.pause(paused=paused)

@@ -36,7 +36,7 @@ from gateway.units import counted
 REFRESH_S: Final = 1.0
 IDLE: Final = "idle"
 MUCH_LOST: Final = 0.05
-"""A share of lost samples that a pilot should see."""
+"""Share of lost samples above which the loss is highlighted."""
 ARMED_OPTIONS: Final = ("--while=armed", "--margin=10")
 FACTS: Final = ("Duration", "Distance", "Height", "Loss")
 
@@ -83,7 +83,7 @@ class RecordingsView:
         parts = self._context.parts
         facts, search = self._facts, (self._search.value or "").strip()
         folder = self._context.parts.recordings_folder
-        # Querying a catalogue of thousands would block the page too long.
+        # In a thread: querying a catalogue of thousands would block the page too long.
         await asyncio.to_thread(facts.look, folder, search)
         self._trouble.set_text(facts.trouble)
         recordings = list_recordings(folder)
@@ -104,7 +104,7 @@ class RecordingsView:
         )
 
     def _ask_delete(self, name: str) -> None:
-        confirm(f"Delete the recording {name} for ever?", "Delete", partial(self._delete, name))
+        confirm(f"Delete the recording {name} permanently?", "Delete", partial(self._delete, name))
 
     async def _delete(self, name: str) -> None:
         context = self._context
@@ -127,12 +127,12 @@ class RecordingsView:
                 ui.button(label, on_click=export).props("no-caps outline")
 
     def _ask_part(self, name: str) -> None:
-        """Ask for a part of a recording: a cut or anonymised tlog, or what is extracted."""
+        """Ask for a part of a recording: a cut or anonymised tlog, or an extract."""
         with asking(f"Cut or extract {name}") as dialog:
             with ui.element("div").classes("line"):
                 begin = ui.input("From", placeholder="1:20").props("dense outlined")
                 end = ui.input("To", placeholder="2026-06-11T14:25:30Z").props("dense outlined")
-            armed = ui.checkbox("Only while armed, and 10 s around")
+            armed = ui.checkbox("Only while armed, and 10 s before and after")
 
             def cut_options() -> tuple[str, ...]:
                 limits = (("--from", begin.value), ("--to", end.value))

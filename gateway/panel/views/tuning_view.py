@@ -33,10 +33,10 @@ QUANTITIES: Final = {
     "yaw_deg": ("Heading", "°", "ATTITUDE.yaw", math.degrees(1.0)),
     "alt_amsl_m": ("Altitude", "m", "VFR_HUD.alt", 1.0),
 }
-"""Title, unit, and the aircraft's own field with its factor, by field of `Estimate`."""
+"""Title, unit, and the aircraft's field with its factor, by field of `Estimate`."""
 REFRESH_S: Final = 0.25
 MAX_ROWS: Final = 120
-"""More would be confusing; the search finds the others."""
+"""Maximum rows, since more would be confusing; the search finds the others."""
 ALL: Final = "all groups"
 EFFECTS: Final = {
     "attitude": ("ATTITUDE.roll", "ATTITUDE.pitch"),
@@ -48,11 +48,11 @@ EFFECTS: Final = {
     "field": ("HIGHRES_IMU.xmag", "HIGHRES_IMU.ymag", "HIGHRES_IMU.zmag"),
     "accuracy": ("ESTIMATOR_STATUS.pos_horiz_accuracy", "ESTIMATOR_STATUS.pos_vert_accuracy"),
 }
-"""Plots in which a change may show, by the label of the choice."""
+"""Plots that may show the effect of a change, by the label of the choice."""
 
 
 class ParameterRow:
-    """A row, built at the current place of the page."""
+    """A row, built at the current position in the page."""
 
     def __init__(self, context: ViewContext, dialogue: Dialogue, meta: ParameterMeta) -> None:
         self._context = context
@@ -62,7 +62,7 @@ class ParameterRow:
         self._factor, self._unit = parameter_unit(meta.unit)
         value = self._in_shown_unit(dialogue.parameters.entries[meta.name].value)
         self._settled: float | None = value
-        """Value of the field while nothing else is typed."""
+        """Value of the field while it is not being edited."""
         self.has_focus = False
         with ui.element("div").classes("parameter") as self._row:
             self._row.props["data-name"] = meta.name
@@ -90,7 +90,7 @@ class ParameterRow:
         self._row.classes(add="changed" if changed else "", remove="" if changed else "changed")
         if pending:
             return
-        # What is typed and not sent yet stays; what is the same needs no writing over.
+        # Text that is typed and not sent yet stays; an equal value is not written again.
         settled = self._settled
         is_shown = settled is not None and is_same_value(settled, value)
         if self._field.value == settled and not is_shown:
@@ -98,7 +98,7 @@ class ParameterRow:
             self._field.set_value(value)
 
     def _in_shown_unit(self, value: float) -> float:
-        # With the digits that a 32-bit float has: the rest is the conversion's.
+        # Rounded to the digits of a 32-bit float: further ones come from the conversion.
         return value if self._factor == 1.0 else float(f"{value * self._factor:.7g}")
 
     def _build_field(self, value: float) -> Any:
@@ -157,7 +157,7 @@ def range_of(meta: ParameterMeta) -> str:
 
 
 class ComparisonCard:
-    """A card, built at the current place of the page."""
+    """A card, built at the current position in the page."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
@@ -189,7 +189,7 @@ class ComparisonCard:
         self._refresh()
 
     def _collect(self) -> None:
-        """Request the samples when the view is opened, and not when they are needed."""
+        """Request the samples when the view is opened, before they are needed."""
         system_id = self._context.system_id
         if system_id is not None and self._context.may_change:
             self._context.parts.dialogues.ask_for_samples(system_id)
@@ -333,7 +333,7 @@ class TuningView:
         self._state.set_text(_state_of(dialogue))
         complete = dialogue.parameters.state is ListState.COMPLETE
         state = (system_id, len(dialogue.parameters.entries), len(dialogue.metas))
-        # The list waits while a field is edited, which would lose its text and the focus.
+        # Not while a field is edited, which would lose its text and the focus.
         is_edited = any(row.has_focus for row in self._rows.values())
         if complete and state != self._grouped and not is_edited:
             self._grouped = state
@@ -347,7 +347,7 @@ class TuningView:
             row.refresh(dialogue)
 
     def _draw(self, _: Any = None) -> None:
-        """Build the visible rows; leave them as they are, with typed text, if none changes."""
+        """Build the visible rows; keep the present ones, with typed text, if they are the same."""
         dialogue = self._context.dialogue
         names = [] if dialogue is None else self._wanted(dialogue)
         metas = {} if dialogue is None else {name: dialogue.metas.get(name) for name in names}
@@ -360,7 +360,7 @@ class TuningView:
         self._rows = {}
         if dialogue is None:
             with self._list:
-                ui.label("No aircraft is heard.").classes("empty")
+                ui.label("No aircraft is received.").classes("empty")
             return
         last = ""
         with self._list:

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A table of texts. Rows keep their elements while their key stays. Where a table of many columns has
-// no room, each row is a block in which the columns' names stand before the cells.
+// A table of texts. Rows keep their elements while their key stays. If a table of many columns is
+// too wide, each row is a block with the name of the column before each cell.
 export default {
   template: `
     <div class="table-frame" tabindex="0">

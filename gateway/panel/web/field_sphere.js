@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The magnetic field as it was measured, on the sphere that a calibrated compass would draw. Cells
-// that were seen are filled, the others only outlined and hatched: by shape, not colour alone.
-// It turns slowly by itself, and by hand or the arrow keys.
+// The measured magnetic field, on the sphere that a calibrated compass would give. Covered cells
+// are filled, the others only outlined and hatched, so that they differ not by colour alone. The
+// sphere turns slowly by itself, and by pointer or arrow keys.
 
 const TILT = 0.42;
 const TURN = 0.25; // rad/s
@@ -46,7 +46,7 @@ export default {
     cancelAnimationFrame(this.frame);
   },
   methods: {
-    // points: [[x, y, z]...] in radii of the sphere, its centre taken off; seen: by cell.
+    // points: [[x, y, z]...] from the centre of the sphere, in its radii; seen: by cell.
     show(points, seen) {
       this.points = points;
       this.seen = seen;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// The primary flight display. The page's feed brings a moment some 25 times a second; between two of
-// them the attitude turns on by the body's rates and the other values glide, so that the picture
-// moves at the screen's own rate. Nothing is drawn while nothing moves.
+// The primary flight display. The page's feed sends a state some 25 times a second; between two of
+// them the attitude is extrapolated by the body rates and the other values are smoothed, so that
+// the display moves at the screen's own rate. It is drawn only while it changes.
 
 const RAD = 180 / Math.PI;
 const FULL_CLIMB = { metric: 6, imperial: 20, aviation: 1200 };
@@ -122,7 +122,7 @@ export default {
       const h = canvas.height / this.ratio;
       if (w < 40 || h < 40) return;
       const s = this.shown;
-      // A moment of the past, which somebody chose, is never old.
+      // A state of the past that the user has chosen is never stale.
       const chosen = mavgate.past_us !== null;
       const stale = !this.goal || (!chosen && ((now - this.cameAt) / 1000 > STALE_S || this.goal.silent_s > 5));
       const [roll, pitch, yaw] = s.q ? mavgate.euler_deg(s.q) : [];
@@ -133,7 +133,7 @@ export default {
       this.horizon(box, angles);
       this.rollArc(box, angles);
       const [of_speed, of_height, of_climb] = ["speed", "altitude", "climb"].map(mavgate.scale);
-      // What glides to zero never is it.
+      // A value that is smoothed towards zero never reaches it.
       const has_airspeed = known(s.airspeed_mps) && this.goal?.airspeed_mps > 0;
       const speed = has_airspeed ? s.airspeed_mps : s.groundspeed_mps;
       const speedName = has_airspeed ? "AS" : "GS";
@@ -329,7 +329,7 @@ export default {
       const middle = h / 2;
       const full = FULL_CLIMB[this.units];
       const reach = Math.min(middle - top, bottom - middle) - Math.max(5.2 * u, 12);
-      // A root scale: small rates are those that are flown by.
+      // A square-root scale, since small rates matter most in flight.
       const at = (v) => -Math.sign(v) * Math.sqrt(Math.min(Math.abs(v) / full, 1)) * reach;
       g.fillStyle = "rgba(9,15,22,0.72)";
       g.fillRect(x, 0, width, bottom);
@@ -448,7 +448,7 @@ export default {
   },
 };
 
-// Without the sign of a zero.
+// A number as text, without the sign of a zero.
 const plain = (value, digits) => value.toFixed(digits).replace(/^-(0(\.0*)?)$/, "$1");
 
 function triangle(g, x, y, half, height) {
@@ -460,10 +460,10 @@ function triangle(g, x, y, half, height) {
   g.fill();
 }
 
-// Of the scale of climb, whose longest mark is 1200 ft/min; the smallest letters need 34 pixels.
+// Width of the climb scale, whose longest label is 1200 ft/min; the smallest font needs 34 pixels.
 const climbWidth = (u) => Math.max(7 * u, 34);
 
-// How much of a tape is seen, and its ticks: read at a glance in every unit.
+// The visible span of a tape, and its ticks, legible at a glance in every unit.
 function niceSpan(factor, isSpeed) {
   if (isSpeed) return factor > 1.5 ? { across: 40, minor: 2, each: 5 } : { across: 20, minor: 1, each: 5 };
   return factor > 1.5 ? { across: 200, minor: 10, each: 5 } : { across: 60, minor: 5, each: 2 };

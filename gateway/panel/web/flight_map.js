@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The map: fused track and GPS fixes apart, home, mark, accuracy; below them tiles, or a coarse map
-// of the world, or a metric grid.
+// The map: separate fused track and GPS fixes, home, mark, accuracy; below them tiles, or a coarse
+// map of the world, or a metric grid.
 import { leaflet as L } from "nicegui-leaflet";
 
 const EARTH_M = 6378137;
@@ -22,7 +22,7 @@ const look_of = (state) => (ORIGINS[state.origin] ?? ORIGINS.live)[0];
 const icon = (html, size) => L.divIcon({ html, className: "map-icon", iconSize: [size, size], iconAnchor: [size / 2, size / 2] });
 const at = (spot) => [spot.lat_deg, spot.lon_deg];
 
-// A canvas over the whole map, which is drawn again whenever the map moves.
+// A canvas over the whole map, which is redrawn whenever the map moves.
 const CanvasLayer = L.Layer.extend({
   onAdd(map) {
     this.canvas = L.DomUtil.create("canvas", this.options.className, map.getPane(this.options.pane));
@@ -60,7 +60,7 @@ const MetricGrid = CanvasLayer.extend({
     if (!this.origin || map.getZoom() < this.least_zoom) return;
     const [lat, lon] = this.origin;
     const here = map.latLngToContainerPoint(this.origin);
-    // Not by points of the container, which are rounded.
+    // Projected, because points of the container are rounded.
     const degree = map.project([lat, lon + 1]).x - map.project([lat, lon]).x;
     const per_m = degree / (rad * Math.cos(lat * rad) * EARTH_M);
     const quantity = LINE_GAP / per_m < 1000 ? "length" : "distance";
@@ -93,7 +93,7 @@ const MetricGrid = CanvasLayer.extend({
   },
 });
 
-// The names of towns, the most important first, as far as they do not overlap.
+// The names of towns that do not overlap, the most important first.
 const TownNames = CanvasLayer.extend({
   options: { pane: "base", className: "map-towns" },
   towns: [],
@@ -219,13 +219,13 @@ export default {
     map.on("move zoom resize", () => this.asked && this.place_question());
     map.on("dragstart", () => (this.follow = false));
     this.$watch("style", () => this.set_style());
-    // A map that was added is shown where there was none.
+    // An added map is shown if there was none.
     this.$watch("styles", (now) => {
       if (this.offline || !this.tiles) this.style = now.length - 1;
     });
     this.$watch("offline", () => this.set_base());
     map.on("zoomend", () => this.set_base());
-    // Further out the sign of home would cover names.
+    // At a lower zoom the symbol of home would cover names.
     map.on("zoomend", () => (this.$el.dataset.far = map.getZoom() < FAR_ZOOM));
     this.set_style();
     this.paint();
@@ -259,7 +259,7 @@ export default {
       const style = this.styles[this.style];
       this.set_base();
       if (!style) return;
-      // A tile that cannot be had is an error; its owner is named only where one is shown.
+      // A missing tile is an error; the owner is named only if a tile is shown.
       const options = { maxZoom: 22, maxNativeZoom: style.max_zoom, errorTileUrl: "" };
       let loaded = 0;
       this.tiles = L.tileLayer(`/tiles/${this.style}/{z}/{x}/{y}`, options);
@@ -275,7 +275,7 @@ export default {
       this.tiles.on("tileerror", () => (this.offline = loaded === 0));
       this.tiles.addTo(this.map);
     },
-    // Show the coarse map where there are no tiles, unless the grid was chosen.
+    // Show the coarse map if there are no tiles, unless the grid was chosen.
     async set_base() {
       const has_none = () => this.base && this.style >= 0 && (this.offline || !this.styles.length);
       const wanted = () => has_none() && this.map.getZoom() < NEAR_ZOOM;
@@ -319,13 +319,13 @@ export default {
       };
       return one;
     },
-    // Bring the drawn path up to date with that of the telemetry.
+    // Update the drawn path from that of the telemetry.
     draw_track(id, one) {
       const track = mavgate.track(id);
       const flat = ([lat, lon]) => [lat, lon];
       if (one.version !== track.version) {
         one.version = track.version;
-        // A recorded path is interrupted where the recording is.
+        // A recorded path has the gaps of the recording.
         const parts = [[]];
         track.points.forEach((point, n) => {
           if (track.breaks?.has(n)) parts.push([]);
@@ -378,7 +378,7 @@ export default {
       if (!state || state.lat_deg === null) return;
       const here = at(state);
       this.toggle(this.home, state.home, () => this.home.setLatLng(at(state.home)));
-      // Where an antenna at home points.
+      // The direction of an antenna at home.
       this.toggle(this.antenna, state.home, () => this.antenna.setLatLngs([at(state.home), here]));
       this.sight = state.home ? `from home ${Math.round(mavgate.bearing_deg(at(state.home), here)) % 360}°` : "";
       const origin = state.home ? at(state.home) : (this.grid.origin ?? here);
@@ -427,7 +427,7 @@ export default {
       this.located.setStyle({ color: this.mark_colour }).setLatLng(at(this.entered)).addTo(this.map);
       this.map.setView(at(this.entered), Math.max(this.map.getZoom(), 15), { animate: false });
     },
-    // Ask next to a position what to do there.
+    // Show the possible actions next to a position.
     ask(spot) {
       const state = mavgate.state;
       if (!state) return;
@@ -453,7 +453,7 @@ export default {
       try {
         await navigator.clipboard.writeText(this.position);
       } catch {
-        // Without TLS a browser gives no clipboard but by way of a selection.
+        // Without TLS a browser allows copying only from a selection.
         const box = Object.assign(document.createElement("textarea"), { value: this.position });
         document.body.append(box);
         box.select();

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// A whole flight in one page: the panel's instruments, moved by a slider instead of by telemetry.
+// A whole flight in one page: the panel's widgets, moved by a slider instead of by telemetry.
 import display from "./flight_display.js";
 import scene from "./flight_scene.js";
 import map from "./flight_map.js";
@@ -34,7 +34,7 @@ function columns_of(packed) {
   return columns;
 }
 
-// Roll and pitch of every row, which the plots show.
+// Roll and pitch of every row, for the plots.
 function add_angles(columns) {
   const [w, x, y, z] = [0, 1, 2, 3].map((n) => columns[`q_nb.${n}`]);
   const angles = { roll_deg: [], pitch_deg: [] };

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Plots of a flight over time, with one time axis: wheel and drag zoom all of them, a click goes
-// to a moment.
+// Plots of a flight over time, with one time axis: wheel and drag zoom all of them, a click moves
+// to a time.
 const LIGHT = ["#0072b2", "#d55e00", "#009e73", "#a3337a", "#9a6400", "#3d4a57"];
 const DARK = ["#56b4e9", "#f09a3e", "#3ec9a0", "#e38ac0", "#f0e442", "#c3ced8"];
 const DASHES = [[], [7, 4], [2, 3], [8, 3, 2, 3], [12, 4], [2, 6]];
@@ -164,7 +164,7 @@ function range_of(series, from, to) {
   return [low - margin, high + margin];
 }
 
-// The path of a series, interrupted at a larger leap; of many points in one column of pixels only
+// The path of a series, interrupted at a larger step; of many points in one column of pixels only
 // the extremes are drawn.
 function path_of({ time_s, values }, from, to, x, y, width, leap) {
   const path = new Path2D();
@@ -186,7 +186,7 @@ function path_of({ time_s, values }, from, to, x, y, width, leap) {
       continue;
     }
     for (const m of low < high ? [low, high] : low === high ? [low] : [high, low]) {
-      // An angle that goes on from 360 to 0 degrees is no line across the plot.
+      // No line across the plot where an angle wraps from 360 to 0 degrees.
       if (is_open && Math.abs(values[m] - last) <= leap) path.lineTo(x(time_s[m]), y(values[m]));
       else path.moveTo(x(time_s[m]), y(values[m]));
       is_open = true;

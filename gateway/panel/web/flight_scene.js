@@ -2,7 +2,7 @@
 // The aircraft in 3D from two viewpoints: one world, drawn twice.
 //
 // World: metres, x east, y north, z up; its origin is home, or the first reported position.
-// Aircraft models stand in x forward, y left, z up.
+// Aircraft models have x forward, y left, z up.
 import { THREE } from "nicegui-scene";
 
 const EARTH_M = 6378137;
@@ -12,17 +12,17 @@ const GAP_M = 1e9; // farther than any point
 const AHEAD_S = 0.25; // poses are extrapolated no further
 const FRAME_MS = 30;
 const SLOWEST_MS = 400;
-const LATE_MS = 45; // between two turns of the browser's own
+const LATE_MS = 45; // interval of the browser's frames above which drawing is too slow
 const VIEWS = { chase: "Chase", ground: "From the ground", cockpit: "Cockpit", above: "From above", side: "From the side" };
-const SPAN_M = 2; // of the models
-const STRONG_US = 90e6; // the path of this long before the shown moment stands out
-const FAINT = 0.2; // of the opacity of the rest, which would hide the aircraft
+const SPAN_M = 2; // wing span of the models
+const STRONG_US = 90e6; // the path of this time before the shown state is highlighted
+const FAINT = 0.2; // factor for the opacity of the rest, which would hide the aircraft
 const LEAST_HEIGHT_M = 0.3;
 const HEIGHT_ERROR_M = 5;
 const COLOURS = { recorded: "recorded", "fused again": "fused-again" };
 const rad = Math.PI / 180;
 
-// Whether the machine's processor draws, which has instruments to draw and perhaps a gateway to run.
+// Whether the processor draws without a GPU; it also draws the other widgets and may run a gateway.
 function in_software() {
   const gl = document.createElement("canvas").getContext("webgl");
   const extension = gl?.getExtension("WEBGL_debug_renderer_info");
@@ -42,7 +42,7 @@ function box(group, size, at, colour) {
   return mesh;
 }
 
-// A tapered, swept surface between two chords, thin.
+// A thin, tapered, swept surface between two chords.
 function surface(group, root, tip, colour) {
   const thick = 0.018;
   const [rx, ry, rz, rc] = root;
@@ -126,7 +126,7 @@ function dart(main) {
 
 const MODELS = { plane, copter, heli: copter };
 
-// A line of some pixels' width, which WebGL's own lines do not have: a flat strip that faces the eye.
+// A line several pixels wide, unlike WebGL's own lines: a flat strip that faces the camera.
 const LINE_SHADER = `
   uniform vec2 resolution;
   uniform float width;
@@ -142,7 +142,7 @@ const LINE_SHADER = `
     strength = number >= strong.x && number < strong.y ? 1.0 : FAINT;
     vec4 from = projectionMatrix * modelViewMatrix * vec4(begin, 1.0);
     vec4 to = projectionMatrix * modelViewMatrix * vec4(end, 1.0);
-    // What lies behind the eye is cut off at the near plane, where w is small but positive.
+    // The part behind the camera is cut off at the near plane, where w is small but positive.
     float near = 0.05;
     if (from.w < near && to.w < near) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); return; }
     if (from.w < near) from = mix(from, to, (near - from.w) / (to.w - from.w));
@@ -156,7 +156,7 @@ const LINE_SHADER = `
     gl_Position = corner;
   }`;
 
-// Soft edges, also where the machine's processor draws without antialiasing.
+// Soft edges, even if the processor draws without antialiasing.
 const LINE_COLOUR = `
   uniform vec3 colour;
   uniform float opacity;
@@ -175,7 +175,7 @@ class WideLine {
     geometry.setIndex([0, 1, 2, 0, 2, 3]);
     this.buffer = new THREE.InstancedInterleavedBuffer(this.positions, 3, 1);
     geometry.setAttribute("begin", new THREE.InterleavedBufferAttribute(this.buffer, 3, 0));
-    // The same numbers one point later.
+    // The same array, offset by one point.
     this.later = new THREE.InstancedInterleavedBuffer(this.positions.subarray(3), 3, 1);
     geometry.setAttribute("end", new THREE.InterleavedBufferAttribute(this.later, 3, 0));
     this.material = new THREE.ShaderMaterial({
@@ -217,13 +217,13 @@ class Path {
   resize(width, height) {
     for (const line of this.lines) line.material.uniforms.resolution.value.set(width, height);
   }
-  // Bring the drawn path up to date with that of the telemetry, and with the shown moment.
+  // Update the drawn path from that of the telemetry, and to the shown time.
   update(track, place, now_us) {
     this.extend(track, place);
     const [from, to] = [now_us - STRONG_US, now_us].map((time_us) => this.row_at(time_us));
     for (const line of [this.line, this.shadow]) line.material.uniforms.strong.value.set(from, to);
   }
-  // The first row that is not before a moment.
+  // The first row that is not before a time.
   row_at(time_us) {
     let [low, high] = [0, this.count];
     while (low < high) {
@@ -242,7 +242,7 @@ class Path {
     if (this.read === track.points.length) return;
     for (; this.read < track.points.length; this.read++) {
       const point = track.points[this.read];
-      // A recorded path is interrupted where the recording is.
+      // A recorded path has the gaps of the recording.
       if (this.count && track.breaks?.has(this.read)) this.add(GAP, point[3]);
       this.add(place(...point), point[3]);
     }
@@ -255,7 +255,7 @@ class Path {
       if (Math.hypot(point.x - x, point.y - y, point.z - z) < STEP_M) return;
     }
     if (this.count === TAIL) {
-      // The older half goes, so that moving it is seldom.
+      // The older half is dropped at once, so that the rest is seldom moved.
       for (const line of [this.line, this.shadow]) line.positions.copyWithin(0, (TAIL / 2) * 3);
       this.time_us.copyWithin(0, TAIL / 2);
       this.count = TAIL / 2;
@@ -271,8 +271,8 @@ class Path {
   }
 }
 
-// The height above home at which something is drawn. The error of a height near the ground must not
-// hide an aircraft in it; a field that really lies below home is seen through the ground.
+// The height above home at which an object is drawn. The error of a height near the ground must not
+// hide an aircraft in it; an airfield that really is below home is seen through the ground.
 function drawn_height(height) {
   if (height >= LEAST_HEIGHT_M) return height;
   return height > -HEIGHT_ERROR_M ? LEAST_HEIGHT_M : height + HEIGHT_ERROR_M + LEAST_HEIGHT_M;
@@ -297,7 +297,7 @@ export default {
     try {
       this.renderer = new THREE.WebGLRenderer({ canvas: this.canvas, antialias: !in_software() });
     } catch {
-      this.trouble = "This browser draws no 3D (WebGL is off).";
+      this.trouble = "This browser cannot show 3D (WebGL is off).";
       return;
     }
     this.renderer.setPixelRatio(in_software() ? 0.75 : Math.min(window.devicePixelRatio, 1.5));
@@ -317,7 +317,7 @@ export default {
     this.resize();
     const draw = (now_ms) => {
       this.handle = requestAnimationFrame(draw);
-      // A machine that draws in software falls behind: then the 3D gives way to the instruments.
+      // If drawing in software is too slow, the 3D view is drawn less often than the other widgets.
       const late = now_ms - this.asked_ms > LATE_MS;
       this.asked_ms = now_ms;
       this.pace_ms = Math.min(SLOWEST_MS, Math.max(FRAME_MS, this.pace_ms * (late ? 1.25 : 0.97)));
@@ -454,7 +454,7 @@ export default {
         const [p, q, r] = state.rate_b_radps.map((rate) => (rate ?? 0) * turned_s);
         const angle = Math.hypot(p, q, r);
         if (angle > 1e-6) q_nb.multiply(new THREE.Quaternion().setFromAxisAngle(new THREE.Vector3(p, q, r).normalize(), angle));
-        // FRD to NED becomes x forward, y left, z up to east, north, up.
+        // Converts FRD to NED into x forward, y left, z up to east, north, up.
         const to_enu = new THREE.Quaternion(Math.SQRT1_2, Math.SQRT1_2, 0, 0);
         const to_frd = new THREE.Quaternion(1, 0, 0, 0);
         group.quaternion.copy(to_enu.multiply(q_nb).multiply(to_frd));
@@ -495,8 +495,8 @@ export default {
       this.$el.dataset.model = craft?.model ?? "none";
       this.$el.dataset.frames = Number(this.$el.dataset.frames ?? 0) + 1;
     },
-    // A model two metres wide would vanish a kilometre away; it is drawn larger there: at least this
-    // share of the picture's height. The sign of home is always smaller than an aircraft.
+    // A model two metres wide would be invisible a kilometre away; it is drawn larger there: at
+    // least this share of the view's height. The symbol of home is always smaller than an aircraft.
     scale(group, camera, share) {
       const distance = camera.position.distanceTo(group.position);
       const apparent = (2 * Math.tan((camera.fov * rad) / 2) * distance) / SPAN_M;
@@ -528,7 +528,7 @@ export default {
         camera.position.set(position.x, position.y, position.z + 160);
         camera.lookAt(position);
       } else {
-        // A person ten metres south of home, with a field glass that shows some ground.
+        // A person ten metres south of home, with binoculars whose view includes some ground.
         camera.position.set(0, -10, 1.7);
         const distance = camera.position.distanceTo(position);
         camera.fov = Math.min(60, Math.max(9, (2 * Math.atan(40 / distance)) / rad));

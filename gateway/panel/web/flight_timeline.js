@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The current flight over time: its height, and a handle that goes back in it, and to the present.
+// The current flight over time: its height, and a handle that shows the past or the present.
 const RELOAD_MS = 5000;
 
 export default {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The flight in numbers: each with its unit, and its age once it is old.
+// The flight in numbers: each with its unit, and its age if it is old.
 const OLD_S = 1.5;
 const EVERY_MS = 200;
 const rad = Math.PI / 180;
@@ -15,7 +15,7 @@ export default {
     </dl>`,
   data: () => ({ items: [], limit: OLD_S }),
   mounted() {
-    // At most a few times a second, and always once more after the last change.
+    // At most a few times a second, and always once after the last change.
     const update = () => {
       this.timer = undefined;
       this.items = mavgate.state ? items_of(mavgate.state) : [];
@@ -37,7 +37,7 @@ function items_of(state) {
   const heading = Number.isFinite(angles[2]) ? angles[2] : state.heading_deg;
   const here = [state.lat_deg, state.lon_deg];
   const item = (name, text, unit, age_name) => ({ name, text, unit, age_s: age(age_name) });
-  // Latitude and longitude are one item, which no line break parts.
+  // Latitude and longitude are one item, without a line break between them.
   const position = (name, lat, lon) => ({ ...item(name, Number.isFinite(lat) ? `${lat.toFixed(6)}, ${lon.toFixed(6)}` : "—", "°", "position_s"), is_wide: true });
   const quantity = (name, kind, value, age_name, digits = 1) => item(name, ...mavgate.show(kind, value, digits), age_name);
   const way = (name, spot, distance_m, bearing_deg) => {
@@ -47,7 +47,7 @@ function items_of(state) {
     const bearing = Math.round(bearing_deg ?? mavgate.bearing_deg(here, to)) % 360;
     return [item(name, text, `${unit} ${bearing}°`, "position_s")];
   };
-  // Where an antenna at home points: the Earth's curvature lowers the line of sight by half the arc.
+  // Direction of an antenna at home; the Earth's curvature lowers the line by half the arc.
   const sight = (home) => {
     const rise_m = state.alt_amsl_m - home?.alt_amsl_m;
     if (!Number.isFinite(rise_m) || !Number.isFinite(here[0]) || home.alt_amsl_m === null || state.alt_amsl_m === null) return [];

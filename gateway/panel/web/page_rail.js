@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The choice of views, and the page's keys. Views change here at once; the server fills a view that
-// is shown for the first time.
+// The choice of views, and the page's keys. Views change here at once; the server builds a view
+// when it is shown for the first time.
 const FIRST = 5; // views that a narrow screen shows; the others are under "More"
 const TYPING = "input, select, textarea, [contenteditable=true]";
 

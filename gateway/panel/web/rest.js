@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The page of the REST API: its paths, each to be tried.
+// The page of the REST API: its paths, each of which can be tried.
 const element = (tag, text, parent) => {
   const made = document.createElement(tag);
   made.textContent = text;

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-// A strip chart of several fields over the last minutes. Python appends what came since; following
-// the present, pausing, zooming and the picture to save are done here, where the pixels are.
+// A strip chart of several fields over the last minutes. Python appends new data; following the
+// present, pausing, zooming and saving an image are done here, in the browser.
 import { echarts } from "nicegui-echart";
 
 const KEPT_MS = 300_000;
 const FOLLOW_MS = 200;
 const LIGHT = ["#0072b2", "#d55e00", "#009e73", "#a3337a", "#9a6400", "#3d4a57"];
 const DARK = ["#56b4e9", "#f09a3e", "#3ec9a0", "#e38ac0", "#f0e442", "#c3ced8"];
-// The gateway's clock less the browser's, and so the same time axis, for all charts of a page.
+// The gateway's clock minus the browser's: all charts of a page have the same time axis.
 let offset_ms = 0;
 const DASHES = ["solid", "dashed", "dotted", [8, 3, 2, 3], [12, 4], [2, 6]];
 
@@ -64,7 +64,7 @@ export default {
       if (paused) this.pausedAt = this.now();
       this.layOut();
     },
-    // The wheel and a drag zoom or move the chart, which must not scroll meanwhile.
+    // While wheel and drag zoom or move the chart, it must not scroll.
     pauseByHand() {
       if (this.paused || !this.fields.length) return;
       this.pause(true);
@@ -133,7 +133,7 @@ export default {
           animation: false,
           color: dark ? DARK : LIGHT,
           textStyle: { fontFamily: "system-ui, Roboto, sans-serif" },
-          // The same margins in every chart, so that times stand below each other.
+          // The same margins in every chart, so that times are aligned.
           grid: { left: 62, right: 56 + 48 * Math.max(0, right - 1), top: 30, bottom: 26 },
           legend: {
             show: this.fields.length > 0, top: 2, left: 84, type: "scroll", itemWidth: 22, itemHeight: 8,

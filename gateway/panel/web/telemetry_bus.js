@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The page's telemetry: the newest state of every aircraft, its path, its past, and who subscribes.
+// The page's telemetry: the newest state, path and past of every aircraft, and the subscribers.
 //
 // A page of the panel calls connect(), after which states come over one WebSocket; a page that
 // contains a whole flight sets `histories` and calls seek() instead.
@@ -38,7 +38,7 @@
       bus.selected = system_id === null ? null : String(system_id);
       bus.seek(null);
     },
-    // Value of SI in the page's units: [text, unit].
+    // An SI value in the page's units: [text, unit].
     show(quantity, value, digits = 1) {
       if (!Number.isFinite(value)) return ["—", FACTORS[bus.units][quantity][1]];
       if (quantity === "distance" && Math.abs(value) < FAR_M) [quantity, digits] = ["length", 0];
@@ -46,7 +46,7 @@
       return [(value / factor).toFixed(digits), unit];
     },
     factor: (quantity) => FACTORS[bus.units][quantity][0],
-    // The page's unit of a quantity: how many of it one of SI is, and its name.
+    // The page's unit of a quantity: its number per SI unit, and its name.
     scale: (quantity) => [1 / FACTORS[bus.units][quantity][0], FACTORS[bus.units][quantity][1]],
     wrap_deg,
     mixed,
@@ -63,20 +63,20 @@
       for (const point of points) pen.lineTo(...point);
       pen.stroke();
     },
-    // A moment of a flight: 3:12, 1:03:12.
+    // A time of a flight: 3:12, 1:03:12.
     clock(seconds) {
       const [h, m, s] = parts_of(seconds);
       const two = (n) => String(n).padStart(2, "0");
       return h ? `${h}:${two(m)}:${two(s)}` : `${m}:${two(s)}`;
     },
-    // A span of time, which must not read as a time of day: 14 min 42 s.
+    // A duration, which must not look like a time of day: 14 min 42 s.
     duration(seconds) {
       const [h, m, s] = parts_of(seconds);
       return h ? `${h} h ${m} min` : m ? `${m} min ${s} s` : `${s} s`;
     },
-    // A colour of the style sheet, as canvas and WebGL want it.
+    // A colour of the style sheet, in the form for canvas and WebGL.
     colour: (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`).trim(),
-    // Clears a canvas whose pixels are those of the screen; returns its pen and its size in CSS pixels.
+    // Clears a canvas at screen resolution; returns its context and its size in CSS pixels.
     pen_of(canvas, most = Infinity) {
       const { clientWidth: width, clientHeight: height } = canvas ?? {};
       if (!width) return null;
@@ -88,12 +88,12 @@
       pen.clearRect(0, 0, width, height);
       return { pen, width, height };
     },
-    // The share of an element's width at which a pointer is.
+    // The position of a pointer as a share of an element's width.
     share_of(event, element) {
       const box = element.getBoundingClientRect();
       return Math.min(1, Math.max(0, (event.clientX - box.left) / box.width));
     },
-    // The seconds by which a key moves a slider over time, and stops the key; undefined for others.
+    // The seconds by which a key moves a time slider, after stopping the event; else undefined.
     step_of(event, ends = {}) {
       const step = { ArrowLeft: -5, ArrowRight: 5, PageDown: -60, PageUp: 60, ...ends }[event.key];
       if (step === undefined) return undefined;
@@ -101,7 +101,7 @@
       event.stopPropagation();
       return step;
     },
-    // Calls back when the page turns dark or light, not when another class of its body is set again.
+    // Calls back when the page becomes dark or light, not at other changes of the body's classes.
     watch_theme(callback) {
       const is_dark = () => document.body.classList.contains("body--dark");
       let dark = is_dark();
@@ -113,14 +113,14 @@
       observer.observe(document.body, { attributes: true, attributeFilter: ["class"] });
       return () => observer.disconnect();
     },
-    // The state of an aircraft that is shown: the present one, or that of the moment chosen.
+    // The shown state of an aircraft: the present one, or that of the chosen time.
     shown(id) {
       if (bus.past_us === null) return bus.vehicles[id];
       if (id === bus.selected) return bus.state;
       return bus.histories[id] ? state_at(bus.histories[id], bus.past_us, bus.vehicles[id]) : bus.vehicles[id];
     },
-    // The path of an aircraft: `points` and `fixes`, which begin with [lat, lon, alt, time_us]. They
-    // only grow at their end while `version` stays.
+    // The path of an aircraft: `points` and `fixes`, whose items begin with [lat, lon, alt,
+    // time_us]. They only grow at their end while `version` stays.
     track: (id) => (tracks[id] ??= new_track()),
     clear_tracks() {
       for (const track of Object.values(tracks)) reset(track);
@@ -136,7 +136,7 @@
       const x = Math.cos(lat * rad) * Math.sin(to_lat * rad) - Math.sin(lat * rad) * Math.cos(to_lat * rad) * Math.cos(turn);
       return (Math.atan2(y, x) / rad + 360) % 360;
     },
-    // Shows a moment of the past of the selected aircraft; null is the present.
+    // Shows a past time of the selected aircraft; null is the present.
     seek(time_us) {
       bus.past_us = time_us;
       choose_state();
@@ -159,7 +159,7 @@
     return ((((angle + 180) % 360) + 360) % 360) - 180;
   }
 
-  // A quaternion between two, by a share of the way.
+  // Interpolates between two quaternions.
   function mixed(p, q, share) {
     const sign = p.reduce((sum, v, n) => sum + v * q[n], 0) < 0 ? -1 : 1;
     const sum = p.map((v, n) => v + (sign * q[n] - v) * share);
@@ -188,7 +188,7 @@
     bus.state = bus.past_us === null || !history ? now : state_at(history, bus.past_us, now);
   }
 
-  // The state at a moment of a history, between its rows; what it does not contain is of `now`.
+  // The state at a time of a history, interpolated; missing fields are taken from `now`.
   function state_at(history, time_us, now) {
     const times = history.time_us;
     let low = 0;
@@ -235,7 +235,7 @@
       track.generation = state.generation;
     }
     if (state.lat_deg === null) return;
-    // Also after another view was shown: the server has what came meanwhile.
+    // Also after another view was shown: the server has the points received since.
     if (track.time_us === null || bus.now_us - track.time_us > GAP_US) fill(id, track);
     track.time_us = bus.now_us;
     add(track, [state.lat_deg, state.lon_deg, state.alt_amsl_m ?? 0, bus.now_us]);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// A slider through a recording that is played, with the altitudes of its aircraft drawn in it: that of
-// the chosen one filled, those of the others as lines.
+// A slider through a played recording, which shows the altitudes of its aircraft: that of the
+// chosen one filled, those of the others as lines.
 export default {
   template: `
     <div class="flight-timeline spring">

@@ -188,7 +188,7 @@ class FtpService(TransferService):
         return number, struct.pack("<I", len(content))
 
     def _make_room(self, request: Request) -> None:
-        """Close a session if there are too many: an own one, or for a trusted client an untrusted."""
+        """Close a session if there are too many: its own, or for a trusted one another."""
         own = [n for n, s in self._sessions.items() if s.client_id == request.client_id]
         if len(own) >= MAX_SESSIONS_OF_ONE:
             self._drop(own[0])
