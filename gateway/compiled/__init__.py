@@ -1,9 +1,9 @@
-"""Numeric functions that machine code is compiled from; called from Python they run as Python.
+"""Numeric functions that are compiled to machine code; called from Python they run as Python.
 
 A function marked by `compiled` is in numba's nopython subset. `tools/build_kernels.py` compiles the
 entry points (see `entry_point`) and all functions that they call into one library. Compiled code is
 strict IEEE 754 and gives the same bits everywhere; Python gives the same except for some units in
-the last digit, because its powers and `hypot` are rounded differently.
+the last place, because its powers and `hypot` are rounded differently.
 """
 
 import ctypes
@@ -33,8 +33,8 @@ def is_compiled(function: object) -> bool:
 def array_at(address: int, shape: tuple[int, ...], kind: Any) -> Any:
     """View the memory at an address as a contiguous array, without a copy.
 
-    The caller keeps that memory alive. `kind` is the numpy.dtype of the items, in compiled code a
-    constant of its module.
+    The caller must keep that memory alive. `kind` is the numpy.dtype of the items, in compiled code
+    a constant of its module.
     """
     memory = (ctypes.c_char * (prod(shape) * kind.itemsize)).from_address(int(address))
     return np.frombuffer(memory, kind).reshape(shape)
@@ -43,15 +43,15 @@ def array_at(address: int, shape: tuple[int, ...], kind: Any) -> Any:
 def record_at(address: int, layout: Any) -> Any:
     """View the record at an address, without a copy; its fields are attributes.
 
-    The caller keeps that record alive. `layout` is a numpy.dtype with fields `f8`, `i8` or arrays
-    of `f8`, in compiled code a constant of its module.
+    The caller must keep that record alive. `layout` is a numpy.dtype with fields `f8`, `i8` or
+    arrays of `f8`, in compiled code a constant of its module.
     """
     memory = (ctypes.c_char * layout.itemsize).from_address(address)
     return np.frombuffer(memory, layout)[0]
 
 
 def address_of(array: Any) -> int:
-    """Return where an array or a record lies in memory; valid as long as the object lives."""
-    # Not by `__array_interface__`: to describe each field of a record takes longer than a sample.
+    """Return the memory address of an array or a record, valid as long as the object exists."""
+    # Not by `__array_interface__`: describing each field of a record takes longer than a sample.
     address: int = np.frombuffer(array, np.uint8).ctypes.data
     return address

@@ -21,7 +21,7 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 """The folder that contains the package `gateway`."""
 LIBRARY: Final = Path(__file__).with_name("kernels.so")
 SOURCES_SYMBOL: Final = "mavgate_sources"
-"""A string in the library: the lines of `stamp_of` for each of its sources."""
+"""Name of a string in the library: the lines of `stamp_of` for each of its sources."""
 BUILD_COMMAND: Final = "make kernels"
 C_TYPES: Final[dict[Any, Any]] = {int: ctypes.c_int64, float: ctypes.c_double}
 
@@ -48,13 +48,13 @@ class LibraryError(OSError):
 class EntryPoint(Generic[Parameters]):
     """A function that is called as machine code; use it as a decorator.
 
-    The function itself, which `__wrapped__` is, runs as Python.
+    `__wrapped__` is the function itself, which runs as Python.
 
     Parameters
     ----------
     function : callable
-        At module level, in numba's nopython subset; takes `int` (addresses of arrays and records
-        too) and `float`, and returns nothing. It must not allocate. Its module must be listed in
+        At module level, in numba's nopython subset; takes `int` (also addresses of arrays and
+        records) and `float`, and returns None. It must not allocate. Its module must be listed in
         `KERNEL_MODULES` of `tools/build_kernels.py`.
     """
 
@@ -66,16 +66,16 @@ class EntryPoint(Generic[Parameters]):
         ENTRY_POINTS.append(self)
 
     def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
-        """Call it; raises LibraryError if the library cannot be used."""
+        """Call the function; raises LibraryError if the library cannot be used."""
         if self._loaded is None:
             self.load()
         self._loaded(*args, **kwargs)  # type: ignore[misc]
 
     def load(self, path: Path | None = None) -> None:
-        """Load it before it is called, from another library if a path is given.
+        """Load the function before it is called, from another library if a path is given.
 
-        Raises LibraryError if the library is missing, lacks this function, or, unless it is another
-        one, was built from other sources.
+        Raises LibraryError if the library is missing or lacks this function, or if the installed
+        library was built from other sources.
         """
         library = open_checked_library() if path is None else open_library(path)
         try:
@@ -87,14 +87,15 @@ class EntryPoint(Generic[Parameters]):
         self._loaded, self._library = loaded, library
 
     def bound(self, *arguments: int) -> Callable[[], None]:
-        """Return a call with fixed integers, which are converted once, for steps in a hot loop.
+        """Return a call with fixed integers, which are converted once, for a hot loop.
 
-        The caller keeps the memory that is passed by address. Raises LibraryError as `load`.
+        The caller must keep alive the memory that is passed by address. Raises LibraryError like
+        `load`.
         """
         if self._loaded is None:
             self.load()
         assert self._library is not None
-        # A function of its own, without argument types: they would be converted at every call.
+        # A separate function without argument types, which would be converted at every call.
         function = self._library[self.symbol]
         function.restype = None
         return partial(function, *map(ctypes.c_int64, arguments))
@@ -114,7 +115,7 @@ def load_entry_points() -> None:
 def open_library(path: Path) -> ctypes.PyDLL:
     """Open a library of kernels; raises LibraryError if there is none."""
     try:
-        # PyDLL keeps the interpreter's lock: a live step is shorter than giving it up.
+        # PyDLL keeps the interpreter's lock: a live step is shorter than releasing it.
         return ctypes.PyDLL(str(path))
     except OSError as error:
         reason = f"cannot be loaded ({error})" if path.exists() else "is missing"
@@ -142,7 +143,7 @@ def changed_source(stamp: str) -> str | None:
         name, content, code = line.split()
         path = ROOT / name
         source = path.read_bytes() if path.exists() else b""
-        # Comments and docstrings change no code; it takes long to leave them out.
+        # Comments and docstrings do not matter, but removing them takes long.
         if _digest(source) != content and code_digest(source) != code:
             return name
     return None

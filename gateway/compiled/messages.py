@@ -1,7 +1,7 @@
 """Send many datagrams, or a stretch of a stream, by one system call.
 
-An *outbox* names the parts to send by address and size, in memory of the caller. Each part is one
-datagram. Linux 4.18 and later cuts a message of several parts of one size into their datagrams
+An *outbox* lists the parts to send by address and size, in memory of the caller. Each part is one
+datagram. Linux 4.18 and later splits a message of several parts of one size into datagrams
 (`UDP_SEGMENT`), which costs a fraction of sending each. The structures are those of 64-bit
 machines.
 """
@@ -15,16 +15,16 @@ from gateway.compiled import address_of, array_at, compiled
 from gateway.compiled.system_calls import send_many, send_one
 
 ROOM: Final = 64
-"""Most parts of an outbox, and datagrams that the system cuts a message into."""
+"""Maximum parts of an outbox, and maximum datagrams of a message that the system splits."""
 DATAGRAMS: Final = 0
 SEGMENTS: Final = 1
 STREAM: Final = 2
-"""How to send: each part as a datagram, parts of one size as one message, or as a stream."""
+"""Modes of sending: each part as a datagram, parts of one size as one message, or as a stream."""
 
 PARTS, GROUPS, LAST_SIZE, PARTS_AT, PLAIN_AT, GROUPS_AT, CONTROL_AT, WHOLE_AT = range(8)
-"""Words of an outbox: the number of its parts and of groups of one size; the bytes of a stream that
-were sent last; addresses of the parts, of headers for each part and for each group, of the groups'
-control data, and of a header of all parts."""
+"""Words of an outbox: the number of its parts, and of its groups of one size; the last number of
+bytes of a stream that were sent; addresses of the parts, of headers for each part and for each
+group, of the groups' control data, and of a header of all parts."""
 OUTBOX_WORDS: Final = 8
 HEADER_WORDS: Final = 8
 FIRST_AT, COUNT, CONTROL, CONTROL_SIZE, LENGTH = 2, 3, 4, 5, 7
@@ -33,17 +33,17 @@ data; the bytes received or sent."""
 CONTROL_WORDS: Final = 4
 SEGMENT_SIZE, FIRST = 2, 3
 """Words of control data: the size of the datagrams; the first part of the group, which the system
-does not read."""
+ignores."""
 SOL_UDP: Final = 17
 UDP_SEGMENT: Final = 103
 _CONTROL_BYTES: Final = 24
 _CONTROL_LENGTH: Final = 18
-"""Of a header of 16 bytes and a number of two, with and without padding."""
+"""Sizes of control data, a header of 16 bytes and a number of two: with and without padding."""
 _INT: Final = np.dtype(np.int64)
 
 
 class Outbox:
-    """The memory of an outbox; `words` has its address and `parts` is to be filled."""
+    """The memory of an outbox; `words` is passed by address and `parts` is to be filled."""
 
     def __init__(self) -> None:
         self.parts = np.zeros((ROOM, 2), np.int64)
@@ -58,7 +58,7 @@ class Outbox:
 
 
 def headers_of(parts: Any) -> Any:
-    """Return a header for each part; the caller keeps them."""
+    """Return a header for each part; the caller must keep the parts alive."""
     headers = np.zeros((len(parts), HEADER_WORDS), np.int64)
     headers[:, FIRST_AT] = address_of(parts) + np.arange(len(parts)) * parts.strides[0]
     headers[:, COUNT] = 1
@@ -66,7 +66,7 @@ def headers_of(parts: Any) -> Any:
 
 
 def way_to_send(sock: socket.socket) -> int:
-    """Return whether the system cuts messages of a datagram socket: `SEGMENTS` or `DATAGRAMS`."""
+    """Return `SEGMENTS` if the system splits messages of a datagram socket, else `DATAGRAMS`."""
     try:
         is_known = sock.getsockopt(SOL_UDP, UDP_SEGMENT) == 0
     except OSError:
@@ -76,7 +76,7 @@ def way_to_send(sock: socket.socket) -> int:
 
 @compiled
 def group(outbox: Any) -> None:
-    """Join following parts of one size to groups."""
+    """Join successive parts of one size into groups."""
     parts = array_at(outbox[PARTS_AT], (ROOM, 2), _INT)
     headers = array_at(outbox[GROUPS_AT], (ROOM, HEADER_WORDS), _INT)
     control = array_at(outbox[CONTROL_AT], (ROOM, CONTROL_WORDS), _INT)
@@ -95,10 +95,10 @@ def group(outbox: Any) -> None:
 
 @compiled
 def send_parts(outbox: Any, file: int, way: int) -> int:
-    """Send all parts, which are grouped; return how many were sent, or a negative error number.
+    """Send all parts, which are grouped; return the number sent, or a negative error number.
 
-    An error after some parts were sent is lost. The part of a stream that follows those that were
-    sent may have been sent up to `LAST_SIZE`.
+    An error after some parts were sent is not reported. In a stream, the next part may have been
+    sent up to `LAST_SIZE`.
     """
     if way == STREAM:
         return _send_stream(outbox, file)

@@ -1,4 +1,4 @@
-"""System calls that compiled code makes; called from Python they are made by ctypes.
+"""System calls for compiled code; called from Python they use ctypes.
 
 Each returns its result, or the negative error number. The structures are those of Linux on 64-bit
 machines; addresses are integers.
@@ -11,7 +11,7 @@ from typing import Any, Final
 MSG_DONTWAIT: Final = 0x40
 MSG_NOSIGNAL: Final = 0x4000
 MSG_EOR: Final = 0x80
-"""Of a stream: what is sent next begins another segment."""
+"""Flag of a stream: the next data begins another segment."""
 
 
 def receive_many(file: int, headers: int, count: int) -> int:

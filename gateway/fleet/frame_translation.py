@@ -1,10 +1,10 @@
 """Translate the frames of a site to the system ids of its vehicles here, and back.
 
 The translation changes the sender in the header, the system that a message addresses, and systems
-that it names in a parameter: the vehicle to follow, the target of a camera. Then it computes the
-checksum again. A signature covers all of that: with the site's passphrase it is checked first and
-renewed with the same link and timestamp; without the passphrase a signed frame passes only if
-nothing changes.
+in its parameters, such as the vehicle to follow or the target of a camera. Then it computes the
+checksum again. A signature covers all of these: with the site's passphrase it is checked first and
+renewed with the same link and timestamp; without the passphrase a signed frame passes only
+unchanged.
 """
 
 from collections import Counter, deque
@@ -22,13 +22,13 @@ from gateway.wire.system_ids import rename_systems
 
 SEQUENCE_MASK: Final = 0xFF
 RATE_MARKS: Final = 6
-"""Marks a second apart: rates are averaged over five seconds."""
+"""Number of marks, one a second: rates are averaged over five seconds."""
 MAX_LOST: Final = 128
-"""A larger step of the sequence number is a restart rather than a loss."""
+"""A larger step of the sequence number is a restart, not a loss."""
 MAX_OVERTAKEN: Final = 32
-"""Texts and answers have a higher priority on the way: frames that they overtake arrive late."""
+"""Maximum lateness in frames: texts and answers have a higher priority and overtake others."""
 MAX_SENDERS: Final = 1024
-"""Components of a site whose sequence numbers are remembered; more are forged."""
+"""Maximum components of a site whose sequence numbers are stored; more are forged."""
 
 
 @dataclass(slots=True)
@@ -37,10 +37,10 @@ class VehicleTraffic:
 
     frames: int = 0
     lost: int = 0
-    """By the gaps in its sequence numbers."""
+    """Lost frames, from the gaps in its sequence numbers."""
     received_us: int = 0
     marks: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=RATE_MARKS))
-    """Times of the last seconds, and the number of frames until then."""
+    """Times of the last seconds, each with the number of frames until then."""
 
     def rate_hz(self, now_us: int) -> float:
         """Return the average rate of the last seconds, in frames a second."""
@@ -67,12 +67,12 @@ class FrameTranslation:
         """Dropped frames by cause.
 
         `unmapped`: no id is left for their vehicle. `unknown`: an unknown message, whose checksum
-        cannot be computed. `signed`: it would have to change, and there is no passphrase.
-        `unsigned`, `forged` and `replayed` have not passed the check of the site's passphrase.
+        cannot be computed. `signed`: it must be changed, and there is no passphrase.
+        `unsigned`, `forged` and `replayed` did not pass the check with the site's passphrase.
         `looped`: sent from here, and returned through the site.
         """
         self.traffic: dict[int, VehicleTraffic] = {}
-        """By system id at the site."""
+        """Traffic of each vehicle by its system id at the site."""
 
     def mark(self, now_us: int) -> None:
         """Record the counts for the rates; called about once a second."""
@@ -80,9 +80,9 @@ class FrameTranslation:
             traffic.marks.append((now_us, traffic.frames))
 
     def from_site(self, frame: MavFrame, now_us: int, *, is_own: bool = False) -> MavFrame | None:
-        """Return a frame of the site with the ids of this side; None if it is dropped.
+        """Return a frame of the site with the fleet's ids; None if it is dropped.
 
-        `is_own` if the site's gateway made it, so that it cannot have been here before.
+        `is_own` if the site's gateway created it, so that it cannot be a returned frame.
         """
         if self._signatures is not None and (rejection := self._signatures.check(frame, now_us)):
             self.counters[rejection] += 1
@@ -105,17 +105,17 @@ class FrameTranslation:
         return given
 
     def to_site(self, frame: MavFrame, now_us: int) -> tuple[int, MavFrame] | None:
-        """Return the system at the site that a frame is for (0: all) and the frame for it.
+        """Return the system at the site to which a frame is addressed (0: all), and its frame.
 
-        None for one that cannot be translated, or is for an id that no vehicle of this site has
-        (any more): the hub's routes outlive a reassignment, and at the site that id may be a
-        third vehicle's, or that of an excluded one.
+        None for a frame that cannot be translated, or whose target id no vehicle of this site has
+        (any more): the hub's routes outlive a reassignment, and at the site the id may belong to
+        a third vehicle, or to an excluded one.
         """
         sender, target = self._id_there(frame.origin[0]), frame.target[0]
         if target and (self._ids.vehicle_of(target) or ("",))[0] != self._site:
             return None
         signatures = self._signatures
-        # The site itself checks for replays: it knows all its streams.
+        # The site checks for replays itself, because it has all its streams.
         if signatures is not None and frame.signed and not signatures.is_genuine(frame):
             self.counters["forged"] += 1
             return None
@@ -126,7 +126,7 @@ class FrameTranslation:
         return self._id_there(target), changed
 
     def id_of(self, system_id: int) -> int | None:
-        """Return the id that a system of the site has here, if it has one."""
+        """Return the id of a system of the site in the fleet, if it has one."""
         return self._ids.known_id(self._site, system_id)
 
     def _id_here(self, system_id: int) -> int:

@@ -1,6 +1,6 @@
-"""System ids of the vehicles of all sites, and the file that keeps them.
+"""System ids of the vehicles of all sites, and the file that stores them.
 
-Two sites may both have an aircraft 1, so each vehicle gets a system id of its own at the fleet.
+Two sites may both have an aircraft 1, so each vehicle gets a unique system id in the fleet.
 """
 
 import logging
@@ -20,18 +20,18 @@ log = logging.getLogger(__name__)
 
 FIRST_ID: Final = 1
 LAST_ID: Final = 249
-"""Ids from 250 on are of ground stations."""
+"""Largest id of a vehicle; those from 250 on are of ground stations."""
 MAX_WAITING: Final = 4096
-"""Vehicles without an id that are remembered and listed."""
+"""Maximum listed vehicles without an id."""
 LEFT_OUT: Final = 0
-"""Instead of an id: a vehicle that is excluded."""
+"""Value instead of an id for an excluded vehicle."""
 
 Vehicle = tuple[str, int]
-"""Site and system id there."""
+"""Site, and system id at the site."""
 
 
 class Handover(NamedTuple):
-    """An id that was passed to another vehicle."""
+    """An id that was reassigned to another vehicle."""
 
     own_id: int
     former: Vehicle
@@ -39,11 +39,11 @@ class Handover(NamedTuple):
 
 
 class IdMap:
-    """System ids assigned once and kept as long as there are enough.
+    """System ids, each assigned once and kept as long as there are enough.
 
     A vehicle keeps the id that it has at its site if that is free here, else it gets the lowest
     free one. No site gets more than `per_site`, nor do all sites of one client together; and none
-    gets more than are left for the others. Where none is left, `make_room` finds a vehicle that is
+    gets more than are left for the others. When none is left, `make_room` finds a vehicle that is
     no longer received.
     """
 
@@ -58,7 +58,7 @@ class IdMap:
         self.left_out: set[Vehicle] = set()
         """Vehicles excluded by the operator."""
         self.clients: dict[str, str] = {}
-        """Client of each site, if known; else a site is a client of its own."""
+        """Client of each site, if known; otherwise each site counts as a separate client."""
         for vehicle, own_id in (known or {}).items():
             if own_id == LEFT_OUT:
                 self.left_out.add(vehicle)
@@ -86,10 +86,10 @@ class IdMap:
     def make_room(
         self, received_us: Mapping[Vehicle, int], idle_since_us: int
     ) -> "Handover | None":
-        """Pass an id of a vehicle that is no longer received to one that waits for an id.
+        """Reassign an id of a vehicle that is no longer received to one that waits for an id.
 
         The former vehicle is of the same site, or of a site that has more ids. A vehicle that is
-        received keeps its id: ground stations would command another vehicle by it.
+        received keeps its id: otherwise ground stations would command another vehicle by it.
         """
         shares = self._shares()
         idle = [each for each in self._ids if received_us.get(each, 0) < idle_since_us]
@@ -107,7 +107,7 @@ class IdMap:
         return None
 
     def set_client(self, site: str, client: str) -> None:
-        """Set the client whose quota a site shares; waiting vehicles get ids by later frames."""
+        """Set the client whose quota a site shares; waiting vehicles get ids with later frames."""
         if self.clients.get(site) != client:
             self.clients[site] = client
             self.unmapped.clear()
@@ -139,13 +139,13 @@ class IdMap:
             self.id_of(*holder)
 
     def leave_out(self, site: str, system_id: int) -> None:
-        """Exclude a vehicle for good; the next waiting one gets its id."""
+        """Exclude a vehicle permanently; the next waiting one gets its id."""
         vehicle = (site, system_id)
         own_id = self._ids.pop(vehicle, None)
         if own_id is not None:
             del self._vehicles[own_id]
         self.left_out.add(vehicle)
-        # A waiting vehicle asks again with its next frame.
+        # A waiting vehicle gets its id with its next frame.
         self.unmapped.clear()
         self.version += 1
 
@@ -179,14 +179,14 @@ class IdsFile:
 
     def __init__(self, file: Path, per_site: int = LAST_ID) -> None:
         self.file = file
-        """Its path."""
+        """Path of the file."""
         self.ids = IdMap(_read(file), per_site)
         self._kept = self.ids.version
         self._worker = begin_worker("ids")
         self._trouble = ""
 
     async def keep(self) -> str:
-        """Write changed ids to the disk; return why not, which is logged and retried."""
+        """Write changed ids to the disk; return the reason of a failure, which is also logged."""
         version = self.ids.version
         if version != self._kept:
             reason = await done_by(self._worker, self._write, self._text())

@@ -1,10 +1,10 @@
 """Detect frames that a fleet sent to its stations and that return through a site that they feed.
 
-Frames pass a hub byte for byte, so a frame of a vehicle that equals one sent recently for another
-vehicle has most likely gone round. Two aircraft of one type send equal frames too: heartbeats
+Hubs forward frames unchanged, so a frame of a vehicle that equals one sent recently for another
+vehicle has most likely returned. Two aircraft of one type also send equal frames: heartbeats
 differ only in the sequence number, and many aircraft have the same system id. So equal frames of
-vehicles with equal ids prove nothing, and a vehicle that has an id loses no frame before a whole
-run of its frames has been here. Frames marked as made by the site's own gateway are not checked.
+vehicles with equal ids prove nothing, and frames of a vehicle that has an id are dropped only after
+a whole run of returned ones. Frames marked as created by the site's own gateway are not checked.
 """
 
 from typing import Final
@@ -17,13 +17,13 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
 
 SPAN_US: Final = 3 * US_PER_S
-"""Longest way through a site and back, over two slow links."""
+"""Longest time of the way through a site and back, over two slow links."""
 MAX_FRAMES: Final = 1 << 15
-"""Frames of a span: 200 aircraft at 50 messages/s; two spans take some 20 MB."""
+"""Maximum frames of a span: 200 aircraft at 50 messages/s; two spans take some 20 MB."""
 MAX_CHANCE: Final = 8
-"""A longer run of frames is not equal to those of another vehicle by chance."""
+"""Maximum run of frames that may equal those of another vehicle by chance."""
 MAX_KINDS: Final = 1 << 14
-"""Messages times vehicles that are remembered; more are forged."""
+"""Maximum stored kinds, messages times vehicles; more are forged."""
 NO_SITE: Final = ""
 """Site of the ground stations here."""
 
@@ -34,27 +34,27 @@ class _Sent(msgspec.Struct, frozen=True, gc=False):
     time_us: int
     vehicle: Vehicle
     is_proof: bool
-    """Whether no other vehicle sends the same by itself."""
+    """Whether no other vehicle may send the same frame by itself."""
 
 
 class LoopDetection:
-    """Frames sent recently to either side, and vehicles that return nothing else."""
+    """Frames sent recently in both directions, and vehicles that only return such frames."""
 
     def __init__(self) -> None:
         self._given: FrameMemory[_Sent] = FrameMemory(SPAN_US, MAX_FRAMES)
         self._sent: FrameMemory[int] = FrameMemory(SPAN_US, MAX_FRAMES)
-        """Frames changed for a site, and until when they may return."""
+        """Frames changed for a site, with the time until which they may return."""
         self._newest: dict[tuple[Vehicle, int, int], bytes] = {}
         """Newest payload of each message of each component of a vehicle."""
         self._runs: dict[Vehicle, int] = {}
-        """Number of its last frames in a row that had been here."""
+        """Number of successive returned frames of each vehicle."""
         self._proven: set[Vehicle] = set()
-        """Vehicles proven to return frames, until they send one of their own."""
+        """Vehicles proven to return frames, until they send a new one."""
         self.looped = 0
-        """Frames sent to a site that a client here returned."""
+        """Number of frames sent to a site that a client here has returned."""
 
     def record_given(self, frame: MavFrame, vehicle: Vehicle, now_us: int) -> None:
-        """Remember a frame of a vehicle sent to the ground stations here."""
+        """Store a frame of a vehicle that is sent to the ground stations here."""
         kind, payload = (vehicle, frame.origin[1], frame.message_id), frame.payload
         before = self._newest.get(kind)
         if before is None and len(self._newest) >= MAX_KINDS:
@@ -64,7 +64,7 @@ class LoopDetection:
         self._given.put(frame.data, _Sent(now_us, vehicle, before not in (None, payload)))
 
     def record_sent(self, frame: MavFrame, changed: MavFrame, now_us: int) -> None:
-        """Remember a frame of a client here, as received and as sent to a site."""
+        """Store a frame of a client here, as received and as sent to a site."""
         station = (NO_SITE, frame.origin[0])
         self.record_given(frame, station, now_us)
         if changed.data != frame.data:
@@ -85,7 +85,7 @@ class LoopDetection:
         is_proven = vehicle in self._proven
         if has_id:
             return is_proven and run > MAX_CHANCE
-        # Two vehicles with the same id may send the same; not if one id was changed.
+        # Two vehicles with the same id may send equal frames, unless one id was changed.
         was_changed = known.vehicle[1] != vehicle[1] or known.vehicle[0] == NO_SITE
         return is_proven or was_changed or run <= MAX_CHANCE
 

@@ -1,8 +1,8 @@
 """Fetch a recording of a site in pieces, through the running fleet.
 
-A partial file is kept next to the target as `.NAME.part` until it is complete and its SHA-256 is
-that of the site's file: an incomplete file never looks complete. An existing partial file is
-continued, if it is the beginning of the site's file.
+A partial file is stored next to the target as `.NAME.part` until it is complete and its SHA-256 is
+that of the site's file, so an incomplete file never looks complete. An existing partial file is
+continued if it is the beginning of the site's file.
 """
 
 import base64
@@ -20,22 +20,22 @@ from gateway.recordings.index import is_file_name
 
 SMALLEST: Final = 4 << 10
 LARGEST: Final = 128 << 10
-"""Largest piece of one answer."""
+"""Largest piece in one answer, bytes."""
 FAST_S: Final = 0.05
 SLOW_S: Final = 0.2
 RETRY_S: Final = 1.0
 SITE_TIMEOUT_S: Final = 60.0
-"""Longest wait for a disconnected site."""
+"""Timeout of a disconnected site."""
 DIGEST_WAIT_S: Final = 330.0
 PIECE_WAIT_S: Final = 20.0
 READ_SIZE: Final = 1 << 20
 
 Ask = Callable[[str, dict[str, Any], float], Any]
-"""Asks a fleet: the verb, its parameters, the longest wait in seconds."""
+"""Sends a request to a fleet: verb, parameters, and timeout in seconds."""
 
 
 class FetchError(Exception):
-    """A file that cannot be fetched; the text says why, and what to do."""
+    """A file cannot be fetched; the text gives the reason and the remedy."""
 
 
 class RecordingFetch:
@@ -56,10 +56,10 @@ class RecordingFetch:
         self._force = force
         self._wait = wait
         self.piece_size = SMALLEST
-        """Adapted so that a piece takes about a tenth of a second: telemetry waits behind it."""
+        """Adapted so that a piece, which delays telemetry, takes about a tenth of a second."""
 
     def fetch(self, name: str, size: int, advance: Callable[[int], None]) -> bool:
-        """Fetch one file, or the rest of it; return whether anything had to be fetched."""
+        """Fetch one file, or the rest of it; return whether it was incomplete."""
         if not is_file_name(name):
             raise FetchError(f"the site lists {name!r}, which is not a file of a recording")
         target, part = self._folder / name, self._folder / f".{name}.part"
@@ -93,7 +93,7 @@ class RecordingFetch:
             return self._digest(name, file.tell()) == digest
 
     def _fill(self, file: BinaryIO, name: str, size: int, advance: Callable[[int], None]) -> None:
-        """Fetch until the file is whole and is the site's."""
+        """Fetch until the file is complete and equals the site's."""
         digest = _digest_of(file)
         have = file.seek(0, os.SEEK_END)
         if have and (have > size or digest.hexdigest() != self._digest(name, have)):
@@ -110,7 +110,7 @@ class RecordingFetch:
             advance(len(piece))
         if digest.hexdigest() != self._digest(name, size):
             file.truncate(0)
-            raise FetchError(f"{name} has changed at the site meanwhile; fetch it again")
+            raise FetchError(f"{name} has changed at the site; fetch it again")
 
     def _piece(self, name: str, offset: int, size: int) -> bytes:
         params = {"file": name, "offset": offset, "size": size}
@@ -121,7 +121,7 @@ class RecordingFetch:
             self.piece_size = min(self.piece_size * 2, LARGEST)
         elif took_s > SLOW_S:
             self.piece_size = max(self.piece_size // 2, SMALLEST)
-        # Leave the other half of the time to telemetry.
+        # Leave half of the time to telemetry.
         self._wait(min(took_s, SLOW_S))
         return data
 
@@ -130,7 +130,7 @@ class RecordingFetch:
         return self._persist("fleet.digest", params, "sha256", DIGEST_WAIT_S)
 
     def _persist(self, verb: str, params: dict[str, Any], key: str, wait_s: float) -> str:
-        """Retry until there is an answer: links break and come back."""
+        """Retry until there is an answer, since links may fail for a while."""
         end_s = time.monotonic() + SITE_TIMEOUT_S
         while True:
             answer: str | None = self._ask(verb, {"site": self._site, **params}, wait_s)[key]

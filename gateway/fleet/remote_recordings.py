@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 LIST_TIMEOUT_S: Final = 5.0
 PIECE_TIMEOUT_S: Final = 8.0
-"""4 KiB on a line of 10 kbit/s; less than the timeout of the control socket's client."""
+"""Timeout of a piece: 4 KiB at 10 kbit/s; less than that of the control socket's client."""
 
 
 class RemoteRecordings:
@@ -72,7 +72,7 @@ class RemoteRecordings:
 
 
 def _lists_in(answers: list[tuple[str, bytes]]) -> dict[str, list[RemoteRecording]]:
-    """Decode the lists of sites; malformed ones, and names, are left out with a warning."""
+    """Decode the lists of sites; malformed lists and names are left out with a warning."""
     found = {}
     for site, data in answers:
         try:
@@ -87,7 +87,7 @@ def _lists_in(answers: list[tuple[str, bytes]]) -> dict[str, list[RemoteRecordin
 
 
 def _has_sound_names(recording: RemoteRecording) -> bool:
-    """Return whether all names follow the rules of an upload: they become names of files here."""
+    """Return whether all names follow the rules of an upload, since they become file names here."""
     try:
         check_name(recording.name)
         for file in recording.files:

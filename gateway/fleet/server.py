@@ -1,6 +1,6 @@
 """`mavgate fleet`: the vehicles of many sites, shown to ground stations by one hub.
 
-A site is one client of that hub, with its vehicles behind it under ids of this side.
+A site is one client of that hub; its vehicles have ids of the fleet.
 """
 
 import asyncio
@@ -37,24 +37,24 @@ from gateway.wire.mavlink_splitter import MavFrame, SplitFault, frame_of, split_
 log = logging.getLogger(__name__)
 
 NO_BROADCASTS: Final = frozenset({1 << 24})
-"""No message has this number. No site receives the telemetry of another: it gets frames addressed
-to its vehicles, and broadcasts of ground stations."""
+"""A number that no message has, as the only allowed one: no site receives the telemetry of another,
+but only frames addressed to its vehicles, and broadcasts of ground stations."""
 NO_CLIENT: Final = ""
-"""Client of all sites without a session of their own."""
+"""Client of all sites without their own session."""
 MAX_SESSIONS: Final = 16
-"""Sessions under the name of one site that are remembered; more are forged."""
+"""Maximum stored sessions under the name of one site; more are forged."""
 
 
 CAUSES: Final = ("unknown", "signed", "unsigned", "forged", "replayed", "looped")
-"""Why frames of a site are dropped; see `FrameTranslation.counters`."""
+"""Reasons for which frames of a site are dropped; see `FrameTranslation.counters`."""
 POLL_S: Final = 1.0
-"""Interval of writing changed ids, updating rates, and looking for the router."""
+"""Interval of writing changed ids, updating rates, and retrying the router."""
 ONBOARD: Final = 191
 """MAV_COMP_ID_ONBOARD_COMPUTER: its sequence numbers are independent of the autopilot's."""
 MAX_SITES: Final = 2000
-"""Site names that are remembered; more are forged."""
+"""Maximum stored site names; more are forged."""
 ABANDONED_US: Final = 3600 * US_PER_S
-"""After so long without a frame a vehicle may lose its id, and a site is removed."""
+"""Time without a frame after which a vehicle may lose its id, and a site is removed."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -64,12 +64,12 @@ class SiteClient(Client):
     session: FleetSession
     translation: FrameTranslation
     tokens: set[str] = field(default_factory=set)
-    """Its sessions by Zenoh's liveliness; more than one are sites of the same name."""
+    """Its sessions by Zenoh's liveliness; more than one means several sites of the same name."""
     may_return = False
 
     @property
     def is_here(self) -> bool:
-        """Whether a session of it is present."""
+        """Whether one of its sessions is present."""
         return bool(self.tokens)
 
     def handle_presence(self, token: str, is_here: bool) -> bool:
@@ -114,7 +114,7 @@ class SiteClient(Client):
             self.counters.dropped += 1
 
     def describe(self, now_us: int) -> dict[str, Any]:
-        """Return the site and its vehicles as they are now."""
+        """Return the present state of the site and its vehicles."""
         round_trip_us, dropped = self.round_trip_us, self.translation.counters
         return {
             "name": self.endpoint.site,
@@ -140,13 +140,13 @@ class SiteClient(Client):
 
     @property
     def queued(self) -> int:
-        """Frames of all sites that wait for a congested link."""
+        """Number of frames of all sites that wait for a congested link."""
         publishers = self.session.publishers
         return 0 if publishers is None else publishers.queued
 
 
 def site_endpoint(site: str) -> Endpoint:
-    """Return the endpoint that stands for a site in tables."""
+    """Return the endpoint that represents a site in tables."""
     url = f"site:{site}"
     return Endpoint(
         url=url, kind="site", host=site, port=0, location=url, name=site, allow=NO_BROADCASTS,
@@ -183,7 +183,7 @@ class FleetServer:
         self._metrics_port = hub_settings.metrics_port
         self._sites: dict[str, SiteClient] = {}
         self._site_of_session: dict[str, str] = {}
-        """The site that each linked session has announced first."""
+        """The first site that each linked session has announced."""
         self._bad_names = 0
         self._task: asyncio.Task[None] | None = None
         own: Verbs = {"fleet.status": self.status, "fleet.id": self._set_id}
@@ -200,7 +200,7 @@ class FleetServer:
 
     @property
     def locator(self) -> str:
-        """Locator of the router, or where this one listens as the router."""
+        """Locator of the router, or at which this fleet listens as the router."""
         return self._session.locator
 
     async def start(self) -> None:
@@ -286,10 +286,10 @@ class FleetServer:
             await asyncio.sleep(POLL_S)
 
     def _find_clients(self) -> None:
-        """Note which client each site belongs to, so that no client takes all ids by many names.
+        """Note the client of each site, so that no client gets all ids by using many names.
 
-        A site belongs to the linked session that announces it, which may announce no other one.
-        All sites without a session of their own share the quota of one client.
+        A site belongs to the linked session that announces it, and a session has only one site.
+        All sites without their own session share the quota of one client.
         """
         if (clients := self._session.clients()) is None:
             return
@@ -301,19 +301,19 @@ class FleetServer:
                 t for t in site.tokens & clients.keys() if sessions.setdefault(t, name) == name
             )
             owners = {clients[token] for token in tokens}
-            # Several sessions that announce one site do not take it from one another.
+            # A site stays with the first of several sessions that announce it.
             if owners and self._ids.clients.get(name) not in owners:
                 self._ids.set_client(name, min(owners))
 
     def _make_room(self, now_us: int) -> None:
-        """Pass on the id of one abandoned vehicle, and remove abandoned sites."""
+        """Reassign the id of one abandoned vehicle, and remove abandoned sites."""
         if self._ids.unmapped:
             received_us = {
                 (name, system_id): traffic.received_us
                 for name, site in self._sites.items()
                 for system_id, traffic in site.translation.traffic.items()
             }
-            # One at a time: it takes some milliseconds when many wait.
+            # One at a time, which takes some milliseconds if many vehicles wait.
             if done := self._ids.make_room(received_us, now_us - ABANDONED_US):
                 text = "id %d of %s/%d, not received for an hour, is now of %s/%d"
                 log.warning(text, done.own_id, *done.former, *done.holder)

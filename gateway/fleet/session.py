@@ -39,13 +39,13 @@ log = logging.getLogger(__name__)
 
 PATTERN: Final = re.compile(r"[A-Za-z0-9_.*-]{1,64}")
 MAX_KEYS: Final = 4096
-"""Declared keys: more than there are vehicles that can have an id."""
+"""Maximum declared keys: more than the vehicles that can have an id."""
 PING_TIMEOUT_S: Final = 5.0
-"""Longest round trip that is measured."""
+"""Longest measured round trip."""
 MAX_ANSWER: Final = 256 << 10
-"""Bytes of one answer of a site: a list of some 2500 recordings, or a piece of one."""
+"""Maximum bytes of one answer of a site: a list of some 2500 recordings, or a piece of one."""
 MAX_ANSWERS: Final = 16 << 20
-"""Bytes of the answers of all sites to one query."""
+"""Maximum bytes of the answers of all sites to one query."""
 ANSWER_OVERHEAD: Final = 64
 """Bytes counted for an answer in addition to its payload, so that empty ones are bounded too."""
 VERIFIED: Final = ("tls", "quic")
@@ -57,19 +57,19 @@ class SessionEvents:
     """Callbacks of a session, called on the loop."""
 
     frames: Callable[[str, Payload, bool], None]
-    """Site, what it has published, and whether that is of its gateway's own vehicles."""
+    """Site, published message, and whether that is of the vehicles of the site's gateway."""
     presence: Callable[[str, str, bool], None]
-    """Site, one of its sessions, and whether that is here or gone."""
+    """Site, one of its sessions, and whether that session is present."""
     round_trip: Callable[[str, int], None]
     """Site, and the round trip in microseconds."""
 
 
 class NoAnswerError(Exception):
-    """No site answered a query: the site, or the router, is not there."""
+    """No site answered a query: the site or the router is not connected."""
 
 
 class QueryRefusedError(Exception):
-    """A site refused a query; the text says why."""
+    """A site refused a query; the text gives the reason."""
 
 
 class FleetSession:
@@ -87,7 +87,7 @@ class FleetSession:
         mode = "router" if self.is_router else "client"
         self._config = session_config(self.locator, settings.zenoh_config, mode)
         self.warning = ""
-        """Why it is unsafe to listen as configured; empty if it is safe."""
+        """The reason why it is unsafe to listen as configured; empty if it is safe."""
         if self.is_router and (lack := missing_authentication(self.locator, self._config)):
             if not settings.insecure:
                 raise ValueError(
@@ -126,7 +126,7 @@ class FleetSession:
         return sum(each.dropped for each in self._subscriptions)
 
     def clients(self) -> dict[str, str] | None:
-        """Return the certificate name of each linked session, or its id; None if not the router."""
+        """Return the certificate name, or else the id, of each linked session; None in a client."""
         if self._connection is None or not self.is_router:
             return None
         links = self._connection.session.info.links()
@@ -148,7 +148,7 @@ class FleetSession:
         self._declare(self._connection)
 
     def close(self) -> None:
-        """End the session; a thread closes it, which may take a moment."""
+        """End the session; a thread closes it, which may take some time."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -178,8 +178,8 @@ class FleetSession:
     async def query(self, key: str, payload: bytes, timeout_s: float) -> dict[str, bytes]:
         """Query the sites of a key at the lowest priority; return the first answer of each.
 
-        None is above `MAX_ANSWER`. Raises NoAnswerError if there is none, QueryRefusedError if all
-        are refusals.
+        An answer above `MAX_ANSWER` counts as a refusal. Raises NoAnswerError without an answer,
+        QueryRefusedError if all are refusals.
         """
         if self._connection is None:
             raise NoAnswerError(f"{self.locator}: no session")
@@ -210,7 +210,7 @@ class FleetSession:
 def _declare_key(
     session: "zenoh.Session", key: str, declared: "dict[str, zenoh.KeyExpr | None]"
 ) -> None:
-    """Resolve a key once: else Zenoh would search the tokens of all sites for every message."""
+    """Declare a key once: otherwise Zenoh would search all sites' tokens for every message."""
     import zenoh
 
     with suppress(zenoh.ZError):
@@ -218,14 +218,14 @@ def _declare_key(
 
 
 def key_pattern(site: str) -> str:
-    """Return a pattern of sites as Zenoh writes it in a key; raises ValueError."""
+    """Return a pattern of sites in the form of a Zenoh key; raises ValueError."""
     if not PATTERN.fullmatch(site) or "**" in site:
         raise ValueError(f"site {site!r}: letters, digits, . _ - and single * only")
     return site if site == "*" else site.replace("*", "$*")
 
 
 def missing_authentication(locator: str, config: "zenoh.Config") -> str:
-    """Return why a router that listens here would admit everyone; empty if it does not."""
+    """Return the reason why a router that listens here admits everyone; empty if it does not."""
     if is_local(locator):
         return ""
     protocol = locator.partition("/")[0]

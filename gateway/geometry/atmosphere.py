@@ -5,7 +5,7 @@ from typing import Final
 
 SEA_LEVEL_PA: Final = 101_325.0
 SCALE_M: Final = 44_330.769
-"""Where the formula ends, 288.15 K / 0.0065 K/m: no pressure belongs to a greater height."""
+"""Height at which the formula ends, 288.15 K / 0.0065 K/m: there is no pressure above it."""
 EXPONENT: Final = 0.190263
 """Gas constant of air times the lapse rate, over gravity."""
 
@@ -13,7 +13,7 @@ EXPONENT: Final = 0.190263
 def pressure_altitude_m(pressure_pa: float) -> float:
     """Convert a static pressure to the height above the 1013.25 hPa level, in m, positive up.
 
-    NaN for no pressure.
+    NaN for a pressure of zero or less.
     """
     if not pressure_pa > 0.0:
         return math.nan
@@ -23,7 +23,7 @@ def pressure_altitude_m(pressure_pa: float) -> float:
 def pressure_at_height(alt_m: float, zero_pa: float = SEA_LEVEL_PA) -> float:
     """Convert a height above the level of a pressure, in m, to the static pressure in Pa.
 
-    NaN for a height beyond the formula.
+    NaN for a height outside the formula.
     """
     if not alt_m < SCALE_M:
         return math.nan

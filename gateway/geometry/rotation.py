@@ -7,17 +7,17 @@ from gateway.records import Vec3
 Matrix3 = tuple[Vec3, Vec3, Vec3]
 
 _GIMBAL_LOCK = 1e-9
-"""Cosine of a pitch at which roll and yaw turn about the same axis."""
+"""Cosine of the pitch below which roll and yaw count as rotations about the same axis."""
 
 
 def matrix_from_euler_deg(roll_pitch_yaw_deg: Vec3) -> Matrix3:
-    """Build a matrix from yaw, then pitch, then roll, each about the axes already turned (Z-Y-X).
+    """Build a matrix from intrinsic Z-Y-X angles: yaw, then pitch, then roll.
 
-    It takes vectors of the turned axes to those turned from; whole quarters of a turn give exact
+    It transforms vectors from the rotated to the original axes; multiples of 90 degrees give exact
     zeros and ones.
     """
     (cr, sr), (cp, sp), (cy, sy) = (_cos_sin(angle) for angle in roll_pitch_yaw_deg)
-    # Adding zero makes a plain zero of a negative one.
+    # Adding zero changes a negative zero to a positive one.
     return (
         (cy * cp + 0.0, cy * sp * sr - sy * cr + 0.0, cy * sp * cr + sy * sr + 0.0),
         (sy * cp + 0.0, sy * sp * sr + cy * cr + 0.0, sy * sp * cr - cy * sr + 0.0),
@@ -28,8 +28,8 @@ def matrix_from_euler_deg(roll_pitch_yaw_deg: Vec3) -> Matrix3:
 def euler_deg_from_matrix(matrix: Matrix3) -> Vec3:
     """Return the angles of `matrix_from_euler_deg`, the pitch from -90 to 90.
 
-    Where the pitch is a right angle, only the sum or difference of roll and yaw is determined, and
-    the roll is zero.
+    At a pitch of 90 degrees, only the sum or difference of roll and yaw is determined, and the roll
+    is set to zero.
     """
     (xx, xy, _), (yx, yy, _), (zx, zy, zz) = matrix
     level = math.hypot(xx, yx)
@@ -42,15 +42,15 @@ def euler_deg_from_matrix(matrix: Matrix3) -> Vec3:
 
 
 def determinant(matrix: Matrix3) -> float:
-    """Return the volume of the box that the rows span; negative if they are left-handed."""
+    """Return the determinant; negative if the rows are left-handed."""
     (a, b, c), (d, e, f), (g, h, i) = matrix
     return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
 
 
 def is_rotation(matrix: Matrix3) -> bool:
-    """Return whether the rows are of length one, at right angles and right-handed.
+    """Return whether the rows are orthonormal and right-handed.
 
-    To a thousandth in every product of two: a person may have rounded them.
+    The tolerance is a thousandth in every product of two rows, which may be rounded by a user.
     """
     products = (
         (sum(a * b for a, b in zip(matrix[m], matrix[n], strict=True)), float(m == n))

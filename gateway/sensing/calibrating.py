@@ -3,10 +3,11 @@
 Samples of an operator's poses and turns become the parameters of a `NodeCalibration`, with the
 residual that shows how well they fit. `mavgate calibrate`, a recording and the commands of a ground
 station use the same steps. Samples are raw, in sensor axes, or calibrated already, in body axes:
-then the steps start from `IN_BODY_AXES`, and `corrected_by` joins the two calibrations.
+then the steps start from `IN_BODY_AXES`, and `corrected_by` combines the two calibrations.
 
-A quiet sensor is not at rest for certain. In a steady turn the gyroscope is as quiet as on a table,
-and its mean is the turn rate; but then the magnetic field turns, and GPS shows the movement.
+A sensor with low noise is not necessarily at rest. In a steady turn the gyroscope has as little
+noise as on a table, and its mean is the turn rate; but then the magnetic field rotates, and GPS
+measures the motion.
 
 References
 ----------
@@ -44,70 +45,71 @@ FloatArray = NDArray[np.float64]
 SAME_POSE_DEG: Final = 20.0
 MIN_POSES: Final = 6
 POSES_FOR_SKEW: Final = 9
-"""With at least this many poses, axes that are not orthogonal can be fitted."""
+"""Least number of poses for a fit of axes that are not orthogonal."""
 MIN_TILT_DEG: Final = 15.0
 MIN_SPREAD: Final = 1.2
-"""Least extent of the samples along every axis, in radii; 2 is all round."""
+"""Least extent of the samples along every axis, in radii; 2 is full coverage."""
 FIT_STEPS: Final = 50
 FIT_STEP: Final = 1e-9
-"""A relative step of the fit's parameters that is smaller ends it."""
+"""Relative step of the parameters below which the fit ends."""
 MIN_MAG_SAMPLES: Final = 100
 
-# No intact sensor of this kind has larger errors: the poses were wrong.
+# Larger errors mean wrong poses: no intact sensor of this kind has them.
 MAX_ACCEL_BIAS_MPS2: Final = 2.0
-"""Twice the limit of the MPU6050's data sheet, since soldering adds to it."""
+"""Twice the limit of the MPU6050's data sheet, since soldering increases the bias."""
 MAX_ACCEL_SCALE_OFF: Final = 0.15
 MAX_ACCEL_RESIDUAL_MPS2: Final = 0.5
 FIELD_UT: Final = (15.0, 100.0)
-"""Strength of the field: the Earth's is 22 to 67 uT, the sensor's scale may be off by a third."""
+"""Accepted field strength: the Earth's is 22 to 67 uT, and the scale may be wrong by a third."""
 MAX_HARD_IRON_UT: Final = 200.0
 IRON_ADVICE: Final = "keep away from steel and currents"
 MAX_SOFT_IRON: Final = 2.0
-"""Longest axis of the ellipsoid over the shortest."""
+"""Maximum ratio of the longest axis of the ellipsoid to the shortest."""
 MAX_MAG_RESIDUAL: Final = 0.1
-"""Share of the field's strength."""
+"""Maximum residual as a share of the field strength."""
 
 
 STILL_S: Final = 1.0
 STILL_GYRO_RADPS: Final = 0.02
 STILL_ACCEL_MPS2: Final = 0.3
-"""Greatest standard deviation of an axis within a still window: ten times the MPU6050's noise."""
+"""Maximum standard deviation of an axis in a still window: ten times the MPU6050's noise."""
 MIN_WINDOW_SAMPLES: Final = 5
 
 MAX_GYRO_BIAS_RADPS: Final = 20.0 * RAD_PER_DEG
-"""The MPU6050's limit of its bias: a larger rate is a rotation."""
+"""Maximum bias according to the MPU6050's data sheet: a larger rate is a rotation."""
 MAX_FORCE_OFF_MPS2: Final = 1.5
-"""At rest the specific force is gravity, bias and scale of a sensor never calibrated aside."""
+"""Maximum deviation from gravity at rest, by bias and scale of an uncalibrated sensor."""
 REST_WINDOWS: Final = 3
-"""This many still windows in a row are a rest: in fewer a slow turn cannot be detected."""
+"""Least number of successive still windows of a rest: in fewer, a slow turn is not detected."""
 MAX_FIELD_DRIFT_UTPS: Final = 0.2
-"""The field of a node that turns by 0.6 °/s at mid latitudes; noise makes a third of it."""
+"""Maximum change of the field at rest: that of a turn of 0.6 °/s at mid latitudes, and three times
+that of noise."""
 MIN_FIELD_SAMPLES: Final = 20
 MAX_RESTS_APART_RADPS: Final = 0.02
-"""Rests of one log are this much alike, unless one of them was a turn."""
+"""Maximum difference of the mean rates of rests in one log; more means that one was a turn."""
 
-NOT_STILL: Final = "the node did not lie still: lay it down and do not touch it"
+NOT_STILL: Final = "the node was not at rest: lay it down and do not touch it"
 
 FIELD_SIDES: Final = 24
 FIELD_SPREAD: Final = 0.7
-"""Least to greatest extent of readings on the axes; soft iron stretches them by some 20 %."""
+"""Least ratio of the extents of readings on the axes; soft iron stretches them by some 20 %."""
 SIDE_SHARE: Final = 0.8
-"""Share of gravity that one axis must carry: 37 deg of tilt."""
+"""Least share of gravity on one axis: 37 deg of tilt."""
 MAX_TILT_RAD: Final = 30.0 * RAD_PER_DEG
-"""A level that is further off is not the mounting's."""
+"""Maximum tilt of the mounting; a larger one means that the aircraft was not level."""
 
 IN_BODY_AXES: Final = NodeCalibration(mounting=IDENTITY3, mag_mounting=IDENTITY3)
-"""Calibration of samples that are calibrated already."""
+"""Calibration of samples that are already calibrated."""
 _PARTS: Final = (
     ("mounting", "accel_matrix", "accel_bias_mps2", "accel_residual_mps2"),
     ("mounting", "", "gyro_bias_radps", "gyro_residual_radps"),
     ("mag_mounting", "mag_soft_iron", "mag_hard_iron_ut", "mag_residual_ut"),
 )
-"""Rotation, matrix, bias and residual of each sensor."""
+"""Names of rotation, matrix, bias and residual of each sensor."""
 
 
 class CalibrationError(ValueError):
-    """Measurements that do not determine the calibration; the text says what to do."""
+    """Measurements that do not determine the calibration; the text gives the remedy."""
 
 
 class MoreNeeded(CalibrationError):  # noqa: N818 - not an error while samples are collected
@@ -121,7 +123,7 @@ class SphereFit:
     bias: Vec3
     matrix: Matrix3
     residual: float
-    """RMS of the radius after the correction, in the unit of the samples."""
+    """RMS error of the radius after the correction, in the unit of the samples."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +141,7 @@ class NodeSamples:
     mag: FloatArray
     """Shape (m, 3), uT."""
     moving: NDArray[np.bool_]
-    """Shape (n,), where the node moves according to GPS."""
+    """Shape (n,), True where the node moves according to GPS."""
 
 
 def node_samples(records: Sequence[ImuRaw], moving: Sequence[bool] | None = None) -> NodeSamples:
@@ -162,7 +164,7 @@ def node_samples(records: Sequence[ImuRaw], moving: Sequence[bool] | None = None
 
 
 def distinct_poses(accel: FloatArray, windows: list[slice]) -> FloatArray:
-    """Average the specific force of each pose that the node was laid in."""
+    """Average the specific force of each pose of the node."""
     poses: list[list[FloatArray]] = []
     for window in windows:
         mean = np.asarray(accel[window].mean(axis=0))
@@ -176,7 +178,7 @@ def distinct_poses(accel: FloatArray, windows: list[slice]) -> FloatArray:
 
 
 def solve_accelerometer(poses: FloatArray) -> SphereFit:
-    """Fit bias and scale so that every pose reads one gravity [1]_."""
+    """Fit bias and scale so that every pose measures one gravity [1]_."""
     if len(poses) < MIN_POSES:
         found = counted(len(poses), "pose")
         raise MoreNeeded(f"{found} where {MIN_POSES} are needed, one on each side")
@@ -191,14 +193,14 @@ def solve_accelerometer(poses: FloatArray) -> SphereFit:
 
 
 def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> SphereFit:
-    """Fit hard and soft iron so that the field has one strength all round [2]_.
+    """Fit hard and soft iron so that the field has the same strength in all directions [2]_.
 
     Parameters
     ----------
     field : ndarray, shape (n, 3)
-        uT, sensor axes, while the aircraft was turned about all its axes.
+        Field in sensor axes, uT, while the aircraft was turned about all its axes.
     strength_ut : float, optional
-        Strength to scale to; the mean of the samples about their centre if not known.
+        Strength to scale to; by default the mean of the samples about their centre.
 
     Raises
     ------
@@ -210,7 +212,7 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
         raise MoreNeeded(f"{found} where {MIN_MAG_SAMPLES} are needed")
     centre, _ = _sphere(field)
     radius = float(np.linalg.norm(field - centre, axis=1).mean())
-    # At rest the fit's radius is that of the noise, which is as wide as itself.
+    # At rest the radius of the fit would be that of the noise alone.
     least_ut = max(radius, FIELD_UT[0])
     _check_spread(field, least_ut, "turn the aircraft about all its axes, upside down too")
     advice = f"{IRON_ADVICE}, and turn it further"
@@ -226,12 +228,12 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
 
 
 def solve_mounting(level: Vec3, nose_up: Vec3) -> Matrix3:
-    """Find how the node is mounted from two poses of the aircraft."""
+    """Find the mounting of the node from two poses of the aircraft."""
     up = np.array(level) / np.linalg.norm(level)
     raised = np.array(nose_up) / np.linalg.norm(nose_up)
     if _angle_deg(up, raised) < MIN_TILT_DEG:
         raise CalibrationError(f"raise the nose by more than {MIN_TILT_DEG:.0f}°")
-    # With the nose up the specific force leans forward in the body.
+    # With the nose up the specific force has a forward component in the body.
     forward = raised - up * (up @ raised)
     x = forward / np.linalg.norm(forward)
     z = -up
@@ -278,8 +280,8 @@ def _symmetric(x: FloatArray) -> FloatArray:
 def fit_sphere(points: FloatArray) -> tuple[Vec3, float]:
     """Fit a sphere by linear least squares: `|p|^2 = 2 c.p + (r^2 - |c|^2)`.
 
-    Returns centre and radius of at least four points, shape (n, 3); the radius is NaN where they
-    lie on no sphere.
+    Returns centre and radius of at least four points, shape (n, 3); the radius is NaN if they are
+    not on a sphere.
     """
     centre, rest = _sphere(points)
     square = rest + float(centre @ centre)
@@ -294,12 +296,12 @@ def _sphere(points: FloatArray) -> tuple[FloatArray, float]:
 
 def _check_spread(points: FloatArray, radius: float, advice: str) -> None:
     if np.ptp(points, axis=0).min() < MIN_SPREAD * radius:
-        raise MoreNeeded(f"not all directions were seen: {advice}")
+        raise MoreNeeded(f"not all directions were measured: {advice}")
 
 
 def _check_bound(what: str, found: float, bound: float, unit: str, advice: str) -> None:
     if not found <= bound:
-        raise CalibrationError(f"{what} {found:.2f}{unit}, where {bound:.2f} is the most: {advice}")
+        raise CalibrationError(f"{what} {found:.2f}{unit} is above {bound:.2f}: {advice}")
 
 
 def _length(v: Vec3) -> float:
@@ -316,7 +318,7 @@ def _angle_deg(a: FloatArray, b: FloatArray) -> float:
 
 
 def _tilt(force: Vec3) -> tuple[float, float]:
-    """Return roll and pitch of a body at rest by its specific force."""
+    """Return roll and pitch of a body at rest from its specific force."""
     x, y, z = force
     return math.atan2(-y, -z), math.atan2(x, math.hypot(y, z))
 
@@ -330,7 +332,7 @@ def _matrix(m: FloatArray) -> Matrix3:
 
 
 def still_windows(samples: NodeSamples) -> list[slice]:
-    """Find the spans of a log in which the node lay still."""
+    """Find the spans of a log in which the node was still."""
     time_s = samples.time_s
     if len(time_s) == 0:
         return []
@@ -340,7 +342,7 @@ def still_windows(samples: NodeSamples) -> list[slice]:
 
 
 def rest_spans(samples: NodeSamples) -> list[slice]:
-    """Find the spans in which the node lay still and did not turn either."""
+    """Find the spans in which the node was still and did not turn."""
     spans = []
     for run in _runs(still_windows(samples)):
         for begin in range(0, len(run) - REST_WINDOWS + 1, REST_WINDOWS):
@@ -352,7 +354,7 @@ def rest_spans(samples: NodeSamples) -> list[slice]:
 
 
 def gyro_at_rest(samples: NodeSamples) -> FloatArray:
-    """Return the gyroscope's samples at rest, which show only its bias."""
+    """Return the gyroscope's samples at rest, whose mean is its bias."""
     spans = rest_spans(samples)
     if not spans:
         raise CalibrationError(f"no {REST_WINDOWS * STILL_S:.0f} s of rest: {NOT_STILL}")
@@ -379,7 +381,7 @@ def _is_still(samples: NodeSamples, window: slice) -> bool:
 
 
 def _runs(windows: list[slice]) -> list[list[slice]]:
-    """Join windows that follow one another."""
+    """Join successive windows."""
     runs: list[list[slice]] = []
     for window in windows:
         if runs and runs[-1][-1].stop == window.start:
@@ -390,7 +392,7 @@ def _runs(windows: list[slice]) -> list[list[slice]]:
 
 
 def _turns(samples: NodeSamples, span: slice) -> bool:
-    """Return whether the field turned; False without a magnetometer."""
+    """Return whether the field rotated; False without a magnetometer."""
     begin_s, end_s = samples.time_s[span.start], samples.time_s[span.stop - 1]
     within: NDArray[np.bool_] = (samples.mag_time_s >= begin_s) & (samples.mag_time_s <= end_s)
     if int(within.sum()) < MIN_FIELD_SAMPLES:
@@ -400,7 +402,7 @@ def _turns(samples: NodeSamples, span: slice) -> bool:
 
 
 def calibrate_gyro(samples: NodeSamples, calibration: NodeCalibration) -> NodeCalibration:
-    """Take the mean rate at rest as the gyroscope's bias."""
+    """Use the mean rate at rest as the gyroscope's bias."""
     gyro = gyro_at_rest(samples)
     return msgspec.structs.replace(
         calibration,
@@ -412,7 +414,7 @@ def calibrate_gyro(samples: NodeSamples, calibration: NodeCalibration) -> NodeCa
 def calibrate_accelerometer(
     samples: Sequence[NodeSamples], calibration: NodeCalibration
 ) -> NodeCalibration:
-    """Fit the accelerometer to the poses in the samples, each part one or more of them."""
+    """Fit the accelerometer to the poses in the samples; each part has one or more poses."""
     poses = _poses_of(samples)
     fit = solve_accelerometer(distinct_poses(poses, [slice(k, k + 1) for k in range(len(poses))]))
     return msgspec.structs.replace(
@@ -426,7 +428,7 @@ def calibrate_accelerometer(
 def calibrate_magnetometer(
     samples: NodeSamples, calibration: NodeCalibration, strength_ut: float | None = None
 ) -> NodeCalibration:
-    """Fit hard and soft iron to a field that was seen from all sides."""
+    """Fit hard and soft iron to a field that was measured in all directions."""
     return with_magnetometer(calibration, solve_magnetometer(samples.mag, strength_ut))
 
 
@@ -443,9 +445,9 @@ def with_magnetometer(calibration: NodeCalibration, fit: SphereFit) -> NodeCalib
 def calibrate_mounting(
     level: NodeSamples, nose_up: NodeSamples, calibration: NodeCalibration
 ) -> NodeCalibration:
-    """Find the mounting from a level and a nose-up pose; the magnetometer's turns with it."""
+    """Find the mounting from a level and a nose-up pose; the magnetometer's is rotated with it."""
     mounting = solve_mounting(_force(level, calibration), _force(nose_up, calibration))
-    # Both chips are on one board: their orientation to each other stays.
+    # Both chips are on one board, so their relative orientation does not change.
     between = np.linalg.solve(np.array(calibration.mounting), np.array(calibration.mag_mounting))
     return msgspec.structs.replace(
         calibration, mounting=mounting, mag_mounting=_matrix(np.array(mounting) @ between)
@@ -453,7 +455,7 @@ def calibrate_mounting(
 
 
 def calibrate_level(samples: NodeSamples, calibration: NodeCalibration) -> NodeCalibration:
-    """Correct the mounting by the small tilt that is measured on a level aircraft."""
+    """Correct the mounting by the small tilt measured on a level aircraft."""
     x, y, z = np.array(calibration.mounting) @ np.array(_force(samples, calibration))
     roll, pitch = _tilt((x, y, z))
     if max(abs(roll), abs(pitch)) > MAX_TILT_RAD:
@@ -464,7 +466,7 @@ def calibrate_level(samples: NodeSamples, calibration: NodeCalibration) -> NodeC
 def calibrate_accelerometer_level(
     samples: NodeSamples, calibration: NodeCalibration
 ) -> NodeCalibration:
-    """Take the force on a level aircraft that is not gravity as the accelerometer's bias."""
+    """Use the specific force of a level aircraft beyond gravity as the accelerometer's bias."""
     x, y, z = np.array(calibration.mounting) @ np.array(_force(samples, calibration))
     error_b = np.array([x, y, z + STANDARD_GRAVITY_MPS2])
     if np.abs(error_b).max() > MAX_ACCEL_BIAS_MPS2:
@@ -476,9 +478,9 @@ def calibrate_accelerometer_level(
 def calibrate_magnetometer_by_yaw(
     samples: NodeSamples, calibration: NodeCalibration, yaw_rad: float, field: MagneticField
 ) -> NodeCalibration:
-    """Take the field at rest, at a known heading from true north, beyond the Earth's as hard iron.
+    """Use the field beyond the Earth's, at rest at a known true heading, as hard iron.
 
-    The samples are calibrated already, in body axes; `calibration` is `IN_BODY_AXES`.
+    The samples are already calibrated, in body axes; `calibration` is `IN_BODY_AXES`.
     """
     windows = still_windows(samples)
     if not windows or len(samples.mag) < MIN_FIELD_SAMPLES:
@@ -493,9 +495,9 @@ def calibrate_magnetometer_by_yaw(
 
 
 def corrected_by(calibration: NodeCalibration, correction: NodeCalibration) -> NodeCalibration:
-    """Join a calibration with one that was measured on samples calibrated by it.
+    """Combine a calibration with one that was measured on samples calibrated by it.
 
-    With `R1 M1 (s - b1)` behind the first and `R2 M2 (v - b2)` behind the second, both together are
+    If the first gives `v = R1 M1 (s - b1)` and the second `R2 M2 (v - b2)`, both together are
     `R M (s - b)` with `R = R2 R1`, `M = R1' M2 R1 M1` and `b = b1 + inv(R1 M1) b2`.
     """
     changes: dict[str, object] = {}
@@ -517,7 +519,7 @@ def corrected_by(calibration: NodeCalibration, correction: NodeCalibration) -> N
 
 
 def sides_of(samples: Sequence[NodeSamples]) -> set[int]:
-    """Return the sides on which it lay: 0 to 5 where +x, -x, +y, -y, +z, -z reads gravity."""
+    """Return the lower sides: 0 to 5 where +x, -x, +y, -y, +z, -z measures gravity."""
     seen = set()
     for mean in _poses_of(samples):
         axis = int(np.abs(mean).argmax())
@@ -527,16 +529,16 @@ def sides_of(samples: Sequence[NodeSamples]) -> set[int]:
 
 
 def field_sides(samples: NodeSamples) -> int:
-    """Count the sides, of `FIELD_SIDES`, from which the magnetometer has seen the field.
+    """Count the sides, of `FIELD_SIDES`, from which the magnetometer has measured the field.
 
-    Hard iron is not known yet, so directions are taken from the middle of the readings. It is found
-    only once the readings spread alike on all axes; until then fewer sides count.
+    Hard iron is not known yet, so directions are from the middle of the readings. That is correct
+    only once the readings have equal spreads on all axes; until then fewer sides count.
     """
     if len(samples.mag) == 0:
         return 0
     low, high = samples.mag.min(axis=0), samples.mag.max(axis=0)
     direction = samples.mag - 0.5 * (low + high)
-    # Each face of a cube around the middle, in four.
+    # Each face of a cube around the middle is divided into four.
     axis = np.abs(direction).argmax(axis=1)
     others = np.take_along_axis(direction, (axis[:, np.newaxis] + [0, 1, 2]) % 3, axis=1) > 0.0
     sides = len(np.unique(axis * 8 + others @ [4, 2, 1]))
@@ -552,7 +554,7 @@ def _poses_of(samples: Sequence[NodeSamples]) -> FloatArray:
 
 
 def _force(samples: NodeSamples, calibration: NodeCalibration) -> Vec3:
-    """Mean specific force at rest, bias and scale taken out, in sensor axes."""
+    """Return the mean specific force at rest, corrected for bias and scale, in sensor axes."""
     parts = [samples.accel[window] for window in still_windows(samples)]
     if not parts:
         raise CalibrationError(NOT_STILL)
@@ -561,7 +563,7 @@ def _force(samples: NodeSamples, calibration: NodeCalibration) -> Vec3:
 
 
 def remove_tilt(calibration: NodeCalibration, roll_pitch_yaw_rad: Vec3) -> NodeCalibration:
-    """Turn both mountings so that an aircraft that seemed tilted by these angles is level."""
+    """Rotate both mountings so that an aircraft with these apparent angles is level."""
     turn = np.array(body_axes(from_euler(*roll_pitch_yaw_rad))).T
     return msgspec.structs.replace(
         calibration,

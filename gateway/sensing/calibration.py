@@ -20,13 +20,13 @@ IntArray = NDArray[np.int64]
 
 IDENTITY3: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 FACE_UP: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
-"""Sensor x forward, y left, z up: the board lies face up with its x arrow to the nose."""
+"""Sensor x forward, y left, z up: the board is face up with its x arrow to the nose."""
 
 FULL_SCALE_COUNTS: Final = 32768.0
 GYRO_LSB_PER_DPS: Final = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
-"""MPU6050 register map, section 4.19."""
+"""Counts per deg/s by range; MPU6050 register map, section 4.19."""
 MAG_OVERFLOW: Final = -4096
-"""The HMC5883L's own mark of an axis beyond its range."""
+"""Value of the HMC5883L for an axis beyond its range."""
 
 _NO_OFFSET: Final[Vec3] = (0.0, 0.0, 0.0)
 
@@ -34,7 +34,7 @@ _Accel = Annotated[float, msgspec.Meta(ge=-50, le=50)]
 _Rate = Annotated[float, msgspec.Meta(ge=-10, le=10)]
 _Field = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 _Share = Annotated[float, msgspec.Meta(ge=-10, le=10)]
-"""Bounds of the errors: a third of full scale in acceleration and rate, all of it in field."""
+"""Bounds of the errors: a third of full scale of acceleration and rate, full scale of the field."""
 _Rows = tuple[
     tuple[_Share, _Share, _Share], tuple[_Share, _Share, _Share], tuple[_Share, _Share, _Share]
 ]
@@ -44,7 +44,7 @@ Number = TypeVar("Number", float, FloatArray)
 
 
 class NodeCalibration(Settings, frozen=True):
-    """The sensor errors of one IMU node, and how it is mounted.
+    """The sensor errors of one IMU node, and its mounting.
 
     A calibrated vector is `R @ M @ (s - b)`: `s` in SI and sensor axes, `b` the bias, `M` the
     scale and misalignment, `R` the mounting rotation into body FRD.
@@ -53,8 +53,8 @@ class NodeCalibration(Settings, frozen=True):
     mounting: Annotated[
         _Rows,
         setting(
-            "Rotation from accelerometer and gyroscope axes to body FRD. Here the rows of its "
-            "matrix, as parameters its angles.",
+            "Rotation from accelerometer and gyroscope axes to body FRD: rows of the matrix in "
+            "this file, angles as parameters.",
             rotation=True,
         ),
     ] = FACE_UP
@@ -72,8 +72,8 @@ class NodeCalibration(Settings, frozen=True):
     mag_mounting: Annotated[
         _Rows,
         setting(
-            "Rotation from magnetometer axes to body FRD. Here the rows of its matrix, as "
-            "parameters its angles.",
+            "Rotation from magnetometer axes to body FRD: rows of the matrix in this file, angles "
+            "as parameters.",
             rotation=True,
         ),
     ] = FACE_UP
@@ -112,7 +112,7 @@ class NodeCalibration(Settings, frozen=True):
 
     @property
     def missing(self) -> ImuFlags:
-        """Flags of the sensors that were never calibrated: each one has some offset."""
+        """Flags of the sensors that were never calibrated, those with a bias of zero."""
         offsets = {
             ImuFlags.MAG_UNCALIBRATED: self.mag_hard_iron_ut,
             ImuFlags.GYRO_UNCALIBRATED: self.gyro_bias_radps,
@@ -122,7 +122,7 @@ class NodeCalibration(Settings, frozen=True):
         return reduce(operator.or_, missing, ImuFlags(0))
 
     def __post_init__(self) -> None:
-        """Refuse matrices that are no rotations, or have no inverse."""
+        """Refuse matrices that are not rotations, or have no inverse."""
         for name in ("mounting", "mag_mounting"):
             if not is_rotation(getattr(self, name)):
                 raise ValueError(f"{name} must be a rotation: orthogonal rows of length one")
@@ -210,7 +210,7 @@ def new_field_ut(counts: FloatArray, flags: IntArray) -> FloatArray:
 
 
 class Correction:
-    """One sensor's calibration, its matrices multiplied out: `v_b = matrix @ (v_s - bias)`."""
+    """One sensor's calibration, with its matrices multiplied: `v_b = matrix @ (v_s - bias)`."""
 
     def __init__(self, mounting: Matrix3, matrix: Matrix3, bias: Vec3) -> None:
         self._matrix = compose(mounting, matrix)
@@ -219,14 +219,14 @@ class Correction:
         self._numbers = (xx, xy, xz, yx, yy, yz, zx, zy, zz, *bias)
 
     def apply(self, v: Vec3, scale: float = 1.0) -> Vec3:
-        """Scale and correct one vector, such as one of counts, and turn it into body axes."""
-        # `transform` without the call: this runs for every sensor of every sample.
+        """Scale and correct one vector, such as counts, and rotate it into body axes."""
+        # `transform` inlined, since this runs for every sensor of every sample.
         xx, xy, xz, yx, yy, yz, zx, zy, zz, bias_x, bias_y, bias_z = self._numbers
         x, y, z = v
         x, y, z = x * scale - bias_x, y * scale - bias_y, z * scale - bias_z
         return (xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z)
 
     def apply_all(self, vectors: FloatArray) -> FloatArray:
-        """Correct an array of shape (n, 3); bit for bit what `apply` gives for each."""
+        """Correct an array of shape (n, 3), with exactly the results of `apply` for each row."""
         x, y, z = (column - bias for column, bias in zip(vectors.T, self._bias, strict=True))
         return np.column_stack([a * x + b * y + c * z for a, b, c in self._matrix])

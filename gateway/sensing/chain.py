@@ -31,16 +31,16 @@ from gateway.sensing.calibration import (
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BLANK: Final = (0, 0, 0)
-"""The accelerometer's counts after a reset of the MPU6050; its gyroscope gives none then either."""
+"""The accelerometer's counts after a reset of the MPU6050, when its gyroscope is off as well."""
 NEW_FIELD: Final = int(ImuFlags.MAG_NEW)
 FIELD_FLAGS: Final = NEW_FIELD | int(ImuFlags.MAG_ABSENT)
 ALL_FLAGS: Final = sum(map(int, ImuFlags))
-"""Plain numbers: a test with them costs a sixth, and hashing an enumeration calls Python."""
+"""All flags as an int: testing one costs a sixth, and hashing an enumeration calls Python."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImuLog:
-    """The columns of as many `ImuSample`; vectors have the shape (n, 3)."""
+    """`ImuSample` as columns; vectors have the shape (n, 3)."""
 
     time_us: IntArray
     accel_b_mps2: FloatArray
@@ -55,7 +55,7 @@ class ImuLog:
         return len(self.time_us)
 
     def samples(self) -> list[ImuSample]:
-        """Return them one by one."""
+        """Return the single samples."""
         has_mag = ~np.isnan(self.mag_b_ut[:, 0])
         return [
             ImuSample(time_us, accel, gyro, mag if new else None, degc, flags)
@@ -103,12 +103,12 @@ class SensorChain:
         )
 
     def _join(self, flags: ImuFlags) -> ImuFlags:
-        """Add the calibration's flags; kept, for they are the same for many samples."""
+        """Add the calibration's flags; cached, since they are the same for many samples."""
         joined = self._flags[flags & ALL_FLAGS] = flags | self._added_flags
         return joined
 
     def imu_calibrated(self, imu: ImuCalibrated) -> ImuSample:
-        """Return a sample that is calibrated already, such as one of another program's log."""
+        """Return a sample that is already calibrated, such as one of another program's log."""
         return ImuSample(
             time_us=imu.time_us,
             accel_b_mps2=imu.accel_b_mps2,
@@ -126,8 +126,8 @@ class SensorChain:
         Parameters
         ----------
         counts : ndarray, shape (n, 13)
-            Whole numbers: three of the accelerometer, of the gyroscope and of the magnetometer,
-            the temperature, and the three ranges, as in `ImuRaw`.
+            Integers: three of the accelerometer, of the gyroscope and of the magnetometer, the
+            temperature, and the three ranges, as in `ImuRaw`.
         flags : ndarray of int, shape (n,)
             `ImuFlags`.
 
@@ -138,7 +138,7 @@ class SensorChain:
             the node could not read them.
         temperature_degc : ndarray, shape (n,)
         flags : ndarray of int, shape (n,)
-            Those given, and those that the calibration adds.
+            The given flags and those that the calibration adds.
         """
         accel = vectors_from_counts(accel_scale, counts[:, 0:3], counts[:, 10])
         gyro = vectors_from_counts(gyro_scale, counts[:, 3:6], counts[:, 11])
@@ -155,7 +155,7 @@ class SensorChain:
     def baro(self, raw: BaroRaw) -> BaroSample:
         """Add the pressure altitude to a barometer payload.
 
-        It is above the 1013.25 hPa level, m; NaN for no pressure.
+        It is the height above the 1013.25 hPa level, m; NaN without a pressure.
         """
         return BaroSample(
             time_us=raw.time_us,

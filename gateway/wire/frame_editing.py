@@ -1,7 +1,7 @@
 """Edited frames: other values in the header or the payload, with the checksum computed again.
 
-A signature covers the whole frame, so an edited frame loses its own, or is signed again. Whoever
-edits decides: without a decision a signed frame is not edited.
+A signature covers the whole frame, so an edited frame loses its signature or is signed again. The
+caller decides: without a decision a signed frame is not edited.
 """
 
 from collections.abc import Callable, Mapping
@@ -29,7 +29,7 @@ CRC_SIZE: Final = 2
 NO_FIELDS: Final[Mapping[str, Any]] = {}
 
 Sign = Callable[[bytes], bytes]
-"""Returns the signature that follows these bytes of a frame, which end with the checksum."""
+"""Returns the signature for the bytes of a frame before it, which end with the checksum."""
 
 
 def edit_frame(
@@ -76,7 +76,7 @@ def edit_frame(
 
 
 def renumbered(frame: MavFrame, sequence: int) -> MavFrame:
-    """Return a frame with another sequence number; one of an unknown message, or signed, as it is.
+    """Return a frame with another sequence number; unchanged if signed or of an unknown message.
 
     The same as `edit_frame` in a third of the time: a client's filter renumbers most of our frames.
     """
@@ -90,7 +90,7 @@ def renumbered(frame: MavFrame, sequence: int) -> MavFrame:
 
 
 def _write(content: bytearray, message_id: int, fields: Mapping[str, Any]) -> None:
-    """Write fields into a frame without checksum; zeros that version 2 cut off are added."""
+    """Write fields into a frame without checksum; truncated zeros of version 2 are added again."""
     is_v2 = content[0] == START_V2
     begin, size = PAYLOAD_V2 if is_v2 else PAYLOAD_V1, len(content)
     for name, value in fields.items():
@@ -107,7 +107,7 @@ def _write(content: bytearray, message_id: int, fields: Mapping[str, Any]) -> No
 
 
 def _packed(message_id: int, name: str, value: Any) -> tuple[int, bytes]:
-    """Return where a field begins in the payload, and a value as its bytes."""
+    """Return the offset of a field in the payload, and its value as bytes."""
     offset, kind, shape = _field(message_id, name)
     try:
         values = np.array(value, kind)

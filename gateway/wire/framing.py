@@ -1,11 +1,11 @@
 """The serial line: zero-delimited COBS frames closed by a CRC-16.
 
 Theory of operation. The receiver sends `COBS(content + crc) 0x00`. COBS removes every zero from
-the content, so a zero on the line can only be a frame's end: after any damage the next zero brings
-the decoder back into step, and no length field can mislead it. Of a frame beyond the bound, which
-ends as one `TOO_LONG` fault, only the number of its bytes is kept.
+the content, so a zero on the line can only be a frame's end: after any damage the decoder is
+synchronised again at the next zero, and no length field can mislead it. A frame beyond the maximum
+length is not stored but only counted; it gives one `TOO_LONG` fault.
 
-The first frame after opening a port is usually cut; it comes out as one fault and nothing more.
+The first frame after opening a port is usually incomplete, which gives one fault.
 """
 
 import binascii
@@ -20,9 +20,9 @@ CRC_SIZE: Final = 2
 DELIMITER: Final = b"\x00"
 
 MAX_CONTENT: Final = 72
-"""Longest content: the receiver's status frame."""
+"""Longest content, bytes: that of the receiver's status frame."""
 MAX_ENCODED: Final = MAX_CONTENT + CRC_SIZE + 1
-"""COBS adds one byte to anything up to 254 bytes."""
+"""Longest encoded frame: COBS adds one byte to up to 254 bytes."""
 
 
 class FaultKind(StrEnum):
@@ -40,13 +40,13 @@ class FaultKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Bytes that were dropped, and why."""
+    """Bytes that were dropped, with the reason."""
 
     kind: str
-    """A `FaultKind` on the receiver's line; decoders of other sources have kinds of their own."""
+    """A `FaultKind` on the receiver's line; decoders of other sources have other kinds."""
     size: int
     detail: str = ""
-    """For people; empty where the kind is all that is known."""
+    """Text for users; empty if only the kind is known."""
 
 
 def crc16(content: bytes) -> int:
@@ -73,14 +73,14 @@ class FrameDecoder:
 
     def __init__(self) -> None:
         self._partial = b""
-        """The frame that is not complete yet; one byte more than the bound if it is too long."""
+        """The incomplete frame; one byte more than the maximum length if it is too long."""
         self._skipped = 0
-        """Bytes of it that were dropped, because it is too long."""
+        """Number of its bytes that were dropped because it is too long."""
 
     def feed(self, data: bytes) -> list[bytes | Fault]:
         """Decode any chunk of the line, and return the contents of the frames that it completes.
 
-        They are without CRC, and in order with every fault. Never raises on data.
+        They have no CRC, and faults are in order between them. Never raises on data.
         """
         pieces = (self._partial + data).split(DELIMITER)
         rest = self._partial = pieces.pop()
@@ -103,7 +103,7 @@ class FrameDecoder:
 
 
 def _open(stuffed: bytes) -> bytes | Fault:
-    """Return the content of one frame if it is whole."""
+    """Return the content of one frame, or its fault."""
     try:
         checked: bytes = cobs.decode(stuffed)
     except cobs.DecodeError:

@@ -1,4 +1,4 @@
-"""Bytes of the receiver to raw records on the gateway clock, and the counts of all losses.
+"""Bytes of the receiver to raw records on the gateway clock, with counts of all losses.
 
 One `Link` handles one serial line. It joins the frame decoder, the payload codec, one clock
 tracker for the receiver and one for each node, and counts everything that is lost.
@@ -36,24 +36,24 @@ UINT16_MAX: Final = 65_535
 FRAME_SEQ_MASK: Final = 0xFF
 SEQUENCE_MODULUS: Final = 1 << 16
 LATE_WINDOW: Final = 64
-"""Payloads further back than any retry queue belong to another run of the node."""
+"""Sequence numbers of late payloads; older ones than any retry queue has are of another run."""
 ALL_SEEN: Final = (1 << LATE_WINDOW) - 1
 SLOWED: Final = 64
-"""Divisor of the elapsed time: the most by which a sample's interval may be shortened."""
+"""Divisor of the elapsed time: the maximum by which a sample's interval may be shortened."""
 MOST_AHEAD_US: Final = 50_000
-"""A correction of the clock's estimate beyond this is applied at once."""
+"""A larger correction of the clock estimate is applied at once."""
 RATE_SPAN_US: Final = US_PER_S
 FIRST_YEAR: Final = 2024
-"""An earlier date is false: the receiver has lost count of the weeks, which start again every 1024,
-or reports the date of its firmware until it has received that of the satellites."""
+"""An earlier date is wrong: the receiver has missed a rollover of the GPS week number (every 1024
+weeks), or reports the date of its firmware until it has received that of the satellites."""
 MAX_PACKETS: Final = 64
-"""More than a chunk of the line has, or than a slow radio sends in a second."""
+"""Maximum waiting packets: more than in a chunk of the line, or than a slow radio sends in 1 s."""
 MAX_ARRIVALS: Final = 2048
-"""Twice what a node at the radio's best rate sends in `RATE_SPAN_US`."""
+"""Twice the payloads that a node sends in `RATE_SPAN_US` at the radio's maximum rate."""
 
 
 class Arrival(Enum):
-    """How a payload's sequence number relates to those before it."""
+    """Relation of a payload's sequence number to the previous ones."""
 
     NEW = "new"
     LATE = "late"
@@ -104,7 +104,7 @@ class SequenceCounter:
 
     def _begin(self, seq: int) -> Arrival:
         self._last = seq
-        # Numbers before the first one received are no late arrivals of this run.
+        # Numbers before the first received one do not count as late payloads of this run.
         self._seen = ALL_SEEN
         self.received += 1
         return Arrival.NEW
@@ -116,19 +116,19 @@ class _Node:
 
     clock: ClockTracker = field(default_factory=ClockTracker)
     restarts: int = 0
-    """Those of its clock that were taken into account."""
+    """Restarts of its clock that were processed."""
     sequence: SequenceCounter = field(default_factory=SequenceCounter)
     pipe: int = 0
     signal: RadioSignal | None = None
     last_time_us: int = 0
     last_stamp_us: int | None = None
-    """On its own clock; None before the first payload after a start of it."""
+    """Newest time on the node's clock; None before the first payload after its start."""
     quality: payloads.GpsQualityPayload | None = None
     faults: Counter[str] = field(default_factory=Counter)
     arrivals_us: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_ARRIVALS))
 
     def begin_run(self) -> None:
-        """Begin a new sequence where the clock has restarted, and not only been halted."""
+        """Begin a new sequence if the clock has restarted and was not only halted."""
         if self.clock.restarts == self.restarts and self.sequence.has_begun_again:
             self.clock.restarts += 1
         if self.clock.restarts != self.restarts:
@@ -146,14 +146,14 @@ class Link:
         self._receiver_status: ReceiverStatus | None = None
         self._nodes: dict[NodeId, _Node] = {}
         self._unproven: dict[NodeId, tuple[_Node, RawRecord | None]] = {}
-        """Nodes with a single payload so far, and its records: noise may look like one."""
+        """Nodes with a single payload so far, and its record: noise may look like a payload."""
         self._faults: Counter[str] = Counter()
         self._bytes_received = 0
         self._frames = 0
         self._frames_lost = 0
         self._foreign = 0
         self.packets: deque[payloads.ForeignFrame] = deque(maxlen=MAX_PACKETS)
-        """Packets of other programs that the caller has not taken yet."""
+        """Packets of other programs that the caller has not processed yet."""
         self._next_frame_seq: int | None = None
 
     def feed(self, data: bytes, arrival_us: int) -> list[RawRecord]:
@@ -188,12 +188,12 @@ class Link:
         return records
 
     def _count_gap(self, frame_seq: int, *, is_known: bool) -> None:
-        """Count the frames before this one that are missing, unless the receiver has restarted."""
+        """Count the missing frames before this one, unless the receiver has restarted."""
         if self._next_frame_seq is not None and is_known:
             self._frames_lost += frame_seq - self._next_frame_seq & FRAME_SEQ_MASK
 
     def reopened(self) -> None:
-        """Discard the cut frame and the frame sequence after the port was opened again."""
+        """Discard the incomplete frame and the frame sequence after the port was opened again."""
         self._decoder.reset()
         self._next_frame_seq = None
 
@@ -224,7 +224,7 @@ class Link:
         node, first = self._unproven.pop(header.node, (_Node(), None))
         second = _receive(node, frame, received_us, arrival_us)
         if node.clock.restarts:
-            # Their stamps do not agree with their arrivals: the first was false, or this one is.
+            # Their node times do not agree with their arrivals: one of the two is wrong.
             node = _Node()
             first, second = None, _receive(node, frame, received_us, arrival_us)
         elif node.sequence.received > 1:
@@ -243,7 +243,7 @@ def _receive(
     time_us = clock.observe(stamp_us, received_us)
     if clock.runs != runs:
         node.begin_run()
-    # A late payload is counted but not used: every stage behind relies on growing times.
+    # A late payload is counted but not used: all later stages rely on growing times.
     if node.sequence.count(header.seq) is not Arrival.NEW:
         node.faults["sequence"] += _is_later(stamp_us, node.last_stamp_us)
         return None
@@ -269,15 +269,15 @@ def _receive(
 
 
 def _is_later(stamp_us: int, last_us: int | None) -> bool:
-    """Return whether a payload is newer than the newest, so that its number should be, too."""
+    """Return whether a payload is newer than the newest, so that its number must be higher."""
     return last_us is not None and 0 < (stamp_us - last_us) % WRAP_US < WRAP_US // 2
 
 
 def _never_back(node: _Node, stamp_us: int, time_us: int) -> int:
-    """Return the time of a sample where a better estimate of the clock may have set it back.
+    """Return the time of a sample if a better estimate of the clock may have set it back.
 
     The sample then follows the last one a little sooner than the node's clock shows, until the
-    times agree: an estimator must not get many samples of one time, nor a stream send them at once.
+    times agree: an estimator must not get many samples of one time, nor a stream send them all.
     """
     last_us = node.last_time_us
     if node.last_stamp_us is not None:
@@ -320,7 +320,7 @@ def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) 
     alt_amsl_m = fix.alt_amsl_mm * M_PER_MM
     quality = node.quality
     separation_m = NAN if quality is None else quality.geoid_separation_cm * M_PER_CM
-    # The accuracy of another epoch does not belong to this fix; the geoid stays.
+    # The accuracy of another epoch is not that of this fix; the geoid height stays valid.
     if quality is None or quality.itow_ms != fix.itow_ms:
         quality = payloads.GpsQualityPayload(fix.itow_ms, *(UINT16_MAX,) * 5, 0, None)
     utc_us = None
@@ -349,14 +349,14 @@ def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) 
 
 
 def _unless_saturated(value: float, scale: float) -> float:
-    """Scale a 16-bit value; NaN for a saturated one, which only means "bad"."""
+    """Scale a 16-bit value; NaN for a saturated one, which means only "bad"."""
     return NAN if value == UINT16_MAX else value * scale
 
 
 def _node_status(
     header: payloads.Header, status: payloads.NodeStatusPayload, time_us: int
 ) -> NodeStatus:
-    """Copy the fields, which have the same names, and name the chips."""
+    """Convert a node's status; the fields have the same names, except for the chips."""
     fields = msgspec.structs.asdict(status)
     chips = fields.pop("chips")
     return NodeStatus(
@@ -369,7 +369,7 @@ def _node_status(
 
 
 def _receiver_status(frame: payloads.ReceiverStatusFrame, time_us: int) -> ReceiverStatus:
-    """Copy the fields, which have the same names."""
+    """Convert a receiver's status; the fields have the same names."""
     fields = msgspec.structs.asdict(frame)
     del fields["frame_seq"]
     return ReceiverStatus(time_us=time_us, **fields)

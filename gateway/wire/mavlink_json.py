@@ -2,11 +2,11 @@
 
 | field of MAVLink       | JSON                                                    |
 | ---------------------- | ------------------------------------------------------- |
-| of an enum             | `{"type": "MAV_TYPE_FIXED_WING"}`                       |
-| of a bitmask           | `{"bits": 81}`                                          |
+| enum                   | `{"type": "MAV_TYPE_FIXED_WING"}`                       |
+| bitmask                | `{"bits": 81}`                                          |
 | text (an array of char) | an array of characters, padded with NUL                 |
-| another array          | an array of numbers                                     |
-| called `type`          | is called `mavtype`; `type` is the name of the message  |
+| other array            | an array of numbers                                     |
+| `type`                 | `mavtype`, because `type` is the name of the message    |
 | NaN or infinity        | `null`                                                  |
 
 Input may also name a bitmask's flags (`"A | B"`), give a bare number for an enum or a bitmask, and
@@ -38,11 +38,11 @@ INTEGERS: Final = {
     **{f"uint{bits}_t": (0, (1 << bits) - 1) for bits in (8, 16, 32, 64)},
     **{f"int{bits}_t": (-1 << bits - 1, (1 << bits - 1) - 1) for bits in (8, 16, 32, 64)},
 }
-"""Least and greatest value by type."""
+"""Minimum and maximum value by type."""
 MAX_FLOAT: Final = 3.4028234663852886e38
 """Largest finite 32-bit float."""
 MAX_SHOWN: Final = 40
-"""Characters of a rejected value in an error message."""
+"""Maximum characters of a rejected value in an error message."""
 
 
 _Byte = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -64,7 +64,7 @@ class _Given(msgspec.Struct, frozen=True):
 
 
 class BadMessageError(ValueError):
-    """An invalid message; the text says why."""
+    """An invalid message; the text gives the reason."""
 
 
 def to_json(message: Any) -> dict[str, Any]:
@@ -123,8 +123,8 @@ def template(name: str) -> dict[str, Any]:
 def json_from_frame(frame: bytes) -> tuple[str, bytes, dict[str, bytes]] | None:
     """Return a complete frame as mavlink-server publishes it; None for an unknown message.
 
-    These are the name of the message, `{"header": ..., "message": ...}` as JSON, and the JSON of
-    each field by its name.
+    The parts are the name of the message, `{"header": ..., "message": ...}` as JSON, and the JSON
+    of each field by its name.
     """
     try:
         message = mavlink.MAVLink(None).decode(bytearray(frame))
@@ -252,13 +252,13 @@ def _bounded(value: Any, form: str) -> int | float:
 
 
 def _short(value: Any) -> str:
-    """Return a value of the client for an error message."""
+    """Return a client's value, shortened for an error message."""
     text = repr(value)
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
 
 
 def _length(kind: Any, name: str) -> int:
-    """Return how many elements an array has; 0 for other types."""
+    """Return the length of an array; 0 for other types."""
     length: int = kind.array_lengths[kind.ordered_fieldnames.index(name)]
     return length
 

@@ -1,6 +1,6 @@
 """Properties of each MAVLink message that a router needs: checksum seed, target, name.
 
-The widest dialect serves here, since frames of any vehicle pass through; messages that it lacks are
+The largest dialect is used, since frames of any vehicle pass through; messages that it lacks are
 forwarded unchecked.
 """
 
@@ -17,9 +17,9 @@ from gateway.records import MavFrame
 _TYPES: Final = {"uint8_t": "B", "uint16_t": "H", "uint32_t": "I", "char": "c"}
 NO_TARGET: Final = -1
 MAX_ID_V1: Final = 255
-"""Messages with greater ids do not exist in MAVLink 1."""
+"""Largest message id of MAVLink 1."""
 WIDEST: Final = 8
-"""Bytes of the widest type of a field."""
+"""Size of the largest type of a field, bytes."""
 US_PER_MS: Final = 1000
 BOOT_TIME_BYTES: Final = 4
 
@@ -27,7 +27,7 @@ BOOT_TIME_BYTES: Final = 4
 class MissingMessage:
     """The definition of a message that the dialects lack, with the attributes of pymavlink's.
 
-    Fields are given in their order of the payload: name, type, and length of an array or 0.
+    Fields are in the order of the payload: name, type, and length of an array or 0.
     """
 
     def __init__(self, name: str, crc_extra: int, *fields: tuple[str, str, int]) -> None:
@@ -55,15 +55,15 @@ MISSING: Final = {
         ("gcs_secondary", "uint8_t", 10),
     ),
 }  # fmt: skip
-"""Messages that the dialects lack and a vehicle of the gateway sends."""
+"""Messages that vehicles of the gateway send and the dialects lack."""
 
 DEFINITIONS: Final[dict[int, Any]] = {**dialect.mavlink_map, **MISSING}
-"""Every message that is known here, by id: name and fields as pymavlink lays them out."""
+"""All known messages by id: name and fields in the layout of pymavlink."""
 
 
 @cache
 def layout_of(message_id: int) -> np.dtype[np.void]:
-    """Return a message's fields as they lie in its payload."""
+    """Return the layout of a message's fields in its payload."""
     kind = DEFINITIONS[message_id]
     fields = []
     for name, code, length in zip(
@@ -77,7 +77,7 @@ def layout_of(message_id: int) -> np.dtype[np.void]:
 
 
 def offset_of(message_id: int, field: str) -> int:
-    """Find where a field begins in the payload, or `NO_TARGET`."""
+    """Return the offset of a field in the payload, or `NO_TARGET`."""
     fields = layout_of(message_id).fields
     return fields[field][1] if fields is not None and field in fields else NO_TARGET
 
@@ -85,7 +85,7 @@ def offset_of(message_id: int, field: str) -> int:
 CRC_EXTRA: Final[dict[int, bytes]] = {
     message_id: bytes((message.crc_extra,)) for message_id, message in DEFINITIONS.items()
 }
-"""The byte that closes each message's checksum, as the checksum function wants it."""
+"""The last byte of each message's checksum input (CRC_EXTRA), as `bytes`."""
 
 TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
     message_id: (offset_of(message_id, "target_system"), offset_of(message_id, "target_component"))
@@ -116,7 +116,7 @@ BOOT_TIME_OFFSETS: Final = {
     for message_id in MESSAGE_NAMES
     if (offset := offset_of(message_id, "time_boot_ms")) != NO_TARGET
 }
-"""Where messages contain the time since the start of their sender, in ms."""
+"""Offsets of the field with the time since the start of the sender, in ms, by message."""
 
 
 def boot_time_us(frame: MavFrame, now_us: int) -> int | None:
@@ -125,7 +125,7 @@ def boot_time_us(frame: MavFrame, now_us: int) -> int | None:
     if offset is None:
         return None
     time_ms = int.from_bytes(frame.payload[offset : offset + BOOT_TIME_BYTES], "little")
-    # 0 is sent by those that do not know the time.
+    # 0 means that the sender has no such time.
     return now_us - time_ms * US_PER_MS if time_ms else None
 
 
@@ -134,7 +134,7 @@ def base_size(message_id: int) -> int | None:
     """Return the size of a message without its extensions; None if MAVLink 1 lacks it.
 
     Extension fields were added after the message was defined, so the checksum seed covers only the
-    fields before them, which shows where they begin.
+    fields before them, from which their begin is found.
     """
     message: Any = dialect.mavlink_map.get(message_id)
     if message is None or message_id > MAX_ID_V1:

@@ -2,19 +2,19 @@
 
 A signature is the first 48 bits of SHA-256 over key and frame; a timestamp in units of 10 us since
 2015 inside it makes every frame unique, so that a recorded one cannot be sent again. A stream is
-one link of one component; the first timestamp of a stream must not be more than a minute behind our
-own clock.
+the frames of one component on one link; its first timestamp must not be more than a minute behind
+our own clock.
 
-A frame is signed where it is sent, because only there its sequence number and its order are known:
+A frame is signed when it is sent, because only then its sequence number and its order are final:
 before, it may be renumbered, be overtaken, or be kept for a new client, and a receiver drops a
-frame whose signing timestamp is earlier than that of the frame before it.
+frame whose signing timestamp is earlier than that of the previous frame.
 
 There are two policies against replays:
 
 | received                              | accepted once, and                                     |
 | ------------------------------------- | ------------------------------------------------------ |
 | from a client: `Verifier`             | only if later than all before of its stream            |
-| over Zenoh, where frames of different | only if not further behind the newest than a window,   |
+| over Zenoh, where frames of different | only if it is at most a window behind the newest,      |
 | priority overtake: `WindowVerifier`   | as IPsec does with sequence numbers [2]_               |
 
 The newest timestamp of every stream of a client is kept over restarts and passphrase changes;
@@ -22,8 +22,8 @@ otherwise a recorded command could be replayed after a restart of the gateway. T
 are ahead of the received ones by `RESERVE_TICKS`, so that a busy stream is written only every few
 seconds: after a crash a stream is accepted again once its timestamps have passed the reserve.
 
-The check is our own, not pymavlink's: that one stores the timestamp of a stream before it has
-checked the signature, so a single forged frame would lock the true sender out.
+The check is our own, because pymavlink's stores the timestamp of a stream before it has checked the
+signature, so a single forged frame would lock the true sender out.
 
 References
 ----------
@@ -45,29 +45,29 @@ KEY_BYTES: Final = 32
 HASH_BYTES: Final = 6
 OWN_LINK: Final = 0
 KEPT_LINK: Final = 255
-"""Of kept answers: a stream of its own, since the vehicle's clock may differ from ours."""
+"""Link id of kept answers: a separate stream, since the vehicle's clock may differ from ours."""
 EPOCH_2015_US: Final = 1_420_070_400_000_000
 TICK_US: Final = 10
 TICKS_PER_S: Final = 100_000
 NEW_STREAM_TICKS: Final = 60 * TICKS_PER_S
-"""Largest age of the first timestamp of a stream."""
+"""Maximum age of the first timestamp of a stream."""
 GPS_TOLERANCE_US: Final = 2_000_000
 BEHIND_S: Final = 2.0
-"""A rejected timestamp that is older is the fault of a clock, rather than a repeated frame."""
+"""Age from which a rejected timestamp counts as a clock error, not as a repeated frame."""
 
 _TIMESTAMP: Final = slice(-12, -HASH_BYTES)
-"""Between the link id and the hash."""
+"""Bytes of the timestamp: between the link id and the hash."""
 _TIMESTAMP_BYTES: Final = 6
 RESERVE_TICKS: Final = 5 * TICKS_PER_S
 MAX_KEYS: Final = 16
 MAX_STREAMS: Final = 256
-"""Only holders of the key make streams, so untrusted clients never reach this."""
+"""Maximum streams: only holders of the key begin one, so untrusted clients never reach this."""
 KeptTimestamps = dict[str, dict[str, int]]
-"""By the id of the key, then by the stream as `link.system.component`."""
+"""Timestamps by the id of the key, then by the stream as `link.system.component`."""
 WINDOW_TICKS: Final = 5 * TICKS_PER_S
-"""Zenoh gives up a message that has waited for 5 s, so none is overtaken for longer."""
+"""Size of the window: Zenoh drops a message that has waited for 5 s, so none is later."""
 MAX_WINDOWS: Final = 1024
-"""Streams of one site; only a holder of the passphrase begins one."""
+"""Maximum streams of one site; only a holder of the passphrase begins one."""
 
 
 def key_from_passphrase(passphrase: str) -> bytes:
@@ -113,7 +113,7 @@ class SigningClock:
         self._offset_us = unix_us_at_zero - EPOCH_2015_US
 
     def set_gps_time(self, unix_us_at_zero: int) -> None:
-        """Use GPS time if the machine's differs from it by more than the latency."""
+        """Use GPS time if the machine's time differs from it by more than the latency."""
         offset_us = unix_us_at_zero - EPOCH_2015_US
         if abs(offset_us - self._offset_us) > GPS_TOLERANCE_US:
             self._offset_us = offset_us
@@ -123,29 +123,29 @@ class SigningClock:
         return max(0, self._offset_us + now_us) // TICK_US
 
     def oldest(self, now_us: int) -> int:
-        """Return the least timestamp with which a stream may start."""
+        """Return the earliest timestamp with which a stream may start."""
         return self.timestamp(now_us) - NEW_STREAM_TICKS
 
 
 class FrameSigner:
-    """Number our own frames, and sign those of systems that have a key, which needs a clock."""
+    """Number our own frames, and sign those of systems that have a key."""
 
     def __init__(self, clock: SigningClock | None = None) -> None:
         self.keys: dict[int, bytes] = {}
         """Signing keys by system id; set by the stage that owns the vehicles."""
         self.shared_key = b""
-        """Key of the settings, also without a vehicle of the gateway; empty for none."""
+        """Key of the settings, used even without a vehicle of the gateway; empty for none."""
         self._clock = clock
         self._newest = 0
-        """Each timestamp is later than the one before."""
+        """Newest timestamp, since each must be later than the previous one."""
 
     def renewal(self, frame: MavFrame) -> Sign | None:
-        """Return the signer of a changed frame, by the key of its signature; None without it."""
+        """Return the signer of a changed frame, with the key of its signature; None if unknown."""
         key = self.key_of(frame)
         return None if key is None else renewed(key, frame.data)
 
     def key_of(self, frame: MavFrame) -> bytes | None:
-        """Return the key by which a signed frame is genuine; None if it is not known."""
+        """Return the key with which a frame was signed; None if it is unknown."""
         keys = {self.shared_key, *self.keys.values()} - {b""}
         return next((key for key in keys if is_genuine(key, frame.data)), None)
 
@@ -164,8 +164,8 @@ class FrameSigner:
         """Return a frame with this sequence number, signed again if its system has a key.
 
         `system` is the one that has the key; by default the sender. A frame of an unknown message,
-        or signed by somebody else, is returned as it is; one of version 1 is numbered and never
-        signed.
+        or one signed by another sender, is returned unchanged; one of version 1 is numbered and
+        never signed.
         """
         key = self.keys.get(frame.origin[0] if system is None else system) if self.keys else None
         if key is None or self._clock is None:
@@ -175,16 +175,16 @@ class FrameSigner:
 
 
 class SigningTimestamps:
-    """The timestamps that one vehicle has accepted, also in earlier runs."""
+    """The timestamps that one vehicle has accepted, including those of earlier runs."""
 
     def __init__(self, kept: Mapping[str, Mapping[str, int]] | None = None) -> None:
         self._newest = _copied(kept or {})
         self._kept = _copied(self._newest)
         self.is_due = False
-        """Whether `to_keep` has something that must be written."""
+        """Whether `to_keep` has changes to be written."""
 
     def accept(self, key_id: str, stream: str, timestamp: int, oldest: int) -> bool:
-        """Add a timestamp if it grows, or of a new stream if it is not older than `oldest`."""
+        """Add a timestamp later than the last, or for a new stream one not before `oldest`."""
         streams = self._newest.get(key_id, {})
         is_known = stream in streams
         if timestamp < (streams[stream] + 1 if is_known else oldest):
@@ -192,7 +192,7 @@ class SigningTimestamps:
         if not is_known and len(streams) >= MAX_STREAMS:
             return False
         streams[stream] = timestamp
-        # The key that was used last comes last.
+        # The key that was used last is stored last.
         self._newest.pop(key_id, None)
         self._newest[key_id] = streams
         for removed in list(self._newest)[:-MAX_KEYS]:
@@ -204,7 +204,7 @@ class SigningTimestamps:
         return True
 
     def to_keep(self) -> KeptTimestamps:
-        """Return what to write now, so that no frame accepted so far is accepted again."""
+        """Return the timestamps to write now, so that no accepted frame is accepted again."""
         self.is_due = False
         return _copied(self._kept)
 
@@ -231,11 +231,11 @@ class Verifier:
         self._timestamps = SigningTimestamps() if timestamps is None else timestamps
 
     def accepts(self, data: bytes, now_us: int) -> bool:
-        """Return whether a whole frame is signed by a holder of the key, and not a replay."""
+        """Return whether a complete frame is signed by a holder of the key, and not a replay."""
         return not self.rejection(data, now_us)
 
     def rejection(self, data: bytes, now_us: int) -> str:
-        """Return why a signed frame is rejected; empty if it is accepted."""
+        """Return the reason why a signed frame is rejected; empty if it is accepted."""
         if not is_genuine(self._key, data):
             return "signed with another passphrase"
         stream = f"{data[-SIGNATURE_SIZE]}.{data[5]}.{data[6]}"
@@ -244,7 +244,7 @@ class Verifier:
             return ""
         behind_s = (self._clock.timestamp(now_us) - timestamp) / TICKS_PER_S
         if behind_s >= BEHIND_S:
-            # Two digits: one sender is one entry, whatever the delay of its frames.
+            # Two digits, so that frames of one sender with different delays share one entry.
             return f"its clock is {float(f'{behind_s:.2g}'):.0f} s behind"
         return "its signing timestamp was used before"
 
@@ -277,7 +277,7 @@ class WindowVerifier:
         self._windows: dict[tuple[int, int, int], _Window] = {}
 
     def check(self, frame: MavFrame, now_us: int) -> str:
-        """Return the counter of why a frame is rejected; empty if it is accepted."""
+        """Return the counter of the reason for a rejection; empty if the frame is accepted."""
         if not frame.signed:
             return "unsigned"
         if not self.is_genuine(frame):

@@ -1,19 +1,19 @@
-"""Cut MAVLink 1 and 2 frames out of bytes without decoding them.
+"""Split bytes into MAVLink 1 and 2 frames without decoding them.
 
 Theory of operation. A frame starts with 0xFD (version 2) or 0xFE (version 1) and a length byte.
-Nothing is escaped, so both values also occur inside frames; only the checksum separates a real
-start from a coincidence. At each candidate:
+There is no escaping, so both values also occur inside frames; only the checksum distinguishes a
+real start from a coincidence. At each candidate:
 
 | condition                                       | action                                 |
 | ----------------------------------------------- | -------------------------------------- |
-| the frame is not complete yet                   | waits, of a datagram as below          |
-| the checksum holds                              | yields the frame's own bytes           |
-| an unknown message, then another start or an end | yields it: routers pass the unknown    |
-| anything else, or a flag other than "signed"    | drops one byte and seeks the next start |
+| the frame is not complete yet                   | waits; for datagrams see below         |
+| the checksum is correct                         | returns the unchanged bytes            |
+| an unknown message, then another start or an end | returns it, for routers to forward     |
+| otherwise, or a flag other than "signed"        | drops a byte and seeks the next start  |
 
 A serial bridge may cut frames anywhere between its datagrams. `DatagramSplitter` keeps the first
-bytes of an unfinished frame, but seeks on behind them: a frame that is found there is returned at
-once and shows that those bytes were no frame.
+bytes of an unfinished frame, but continues to search after them: a frame that is found there is
+returned at once and shows that those bytes were not a frame.
 
 Dropped bytes in a row are reported as one fault. The signature is skipped, not checked. Each frame
 is returned as a `MavFrame`, whose header is read once; routing and transports use its fields.
@@ -44,15 +44,16 @@ OVERHEAD_V2: Final = 12
 SEQUENCE_V1: Final = 2
 SEQUENCE_V2: Final = 4
 KEY_SIZE_V2: Final = 5
-"""Of `MavFrame.key` of a frame of version 2."""
+"""Size of `MavFrame.key` of a frame of version 2."""
 SIGNATURE_SIZE: Final = 13
 MAX_FALSE_STARTS: Final = 256
-"""In one chunk; bytes with more are no MAVLink, and each costs a checksum of up to 255 bytes."""
+"""Maximum false starts in one chunk, each of which costs a checksum of up to 255 bytes; data with
+more is not MAVLink."""
 KEPT_US: Final = US_PER_S
-"""Time limit of an unfinished frame between two datagrams: 280 bytes at 2800 Bd, and what a radio
-link delays them."""
+"""Timeout of an unfinished frame between two datagrams: 280 bytes at 2800 Bd, and the delay of a
+radio link."""
 KEPT_PEERS: Final = 64
-"""Peers of one socket whose unfinished frames are kept; beyond, the oldest is dropped."""
+"""Maximum peers of one socket with unfinished frames; beyond, the oldest frame is dropped."""
 
 _HEAD_V2: Final = struct.Struct("<BBBBBBBHB").unpack_from
 """Start, length, two bytes of flags, sequence, system, component, message id in three bytes."""
@@ -62,12 +63,12 @@ _STARTS: Final = re.compile(rb"[\xfd\xfe]")
 
 
 class SplitFaultKind(StrEnum):
-    """Why bytes were dropped."""
+    """Reasons for which bytes are dropped."""
 
     GARBAGE = "garbage"
-    """They do not begin like a frame."""
+    """The bytes do not begin like a frame."""
     CRC = "crc"
-    """They begin like a frame, but the checksum (or the end) is wrong."""
+    """The bytes begin like a frame, but the checksum (or the end) is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +89,9 @@ class MavlinkSplitter:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Event]:
-        """Take any chunk of the stream, and return the frames and runs of dropped bytes it ends.
+        """Process any chunk of the stream; return the frames and runs of dropped bytes that end.
 
-        Frames are byte for byte as received. Never raises on data.
+        Frames are unchanged. Never raises on data.
         """
         data = self._rest + data
         events, end, unfinished = _split(data)
@@ -109,7 +110,7 @@ class MavlinkSplitter:
 
 
 class DatagramSplitter:
-    """Turn the datagrams of some peers into frames and faults; frames may be cut between them."""
+    """Turn the datagrams of some peers into frames and faults; a frame may span datagrams."""
 
     def __init__(self) -> None:
         self._rests: dict[Hashable, tuple[bytes, int]] = {}
@@ -120,7 +121,7 @@ class DatagramSplitter:
         return bool(self._rests)
 
     def feed(self, data: bytes, now_us: int, peer: Hashable = None) -> list[Event]:
-        """Take a peer's next datagram; return the frames and runs of dropped bytes it ends."""
+        """Process a peer's next datagram; return the frames and runs of dropped bytes that end."""
         rest, since_us = self._rests.pop(peer, (b"", now_us))
         late: list[Event] = []
         if now_us - since_us > KEPT_US:
@@ -135,7 +136,7 @@ class DatagramSplitter:
         return late + events
 
     def split_off(self, peer: Hashable) -> "DatagramSplitter":
-        """Return another splitter that continues with the datagrams of one peer alone."""
+        """Return another splitter that continues with the datagrams of one peer."""
         other = DatagramSplitter()
         if peer in self._rests:
             other._rests[None] = self._rests.pop(peer)
@@ -143,7 +144,7 @@ class DatagramSplitter:
 
 
 def split_datagram(data: bytes) -> list[Event]:
-    """Cut one datagram into frames and runs of dropped bytes; nothing carries over to the next."""
+    """Split one datagram into frames and runs of dropped bytes, without state."""
     events, end, _ = _split(data, seeks_on=True)
     _report(events, data, end, len(data))
     return events
@@ -152,7 +153,7 @@ def split_datagram(data: bytes) -> list[Event]:
 def read_datagram(data: bytes) -> MavFrame | None:
     """Return a datagram that is exactly one unsigned version 2 frame of a known message.
 
-    Nearly every datagram is one; for any other, None, and `split_datagram` finds its frames.
+    Nearly every datagram is one; for any other the result is None, and `split_datagram` is needed.
     """
     if len(data) < OVERHEAD_V2:
         return None
@@ -180,7 +181,7 @@ def frame_of(data: bytes) -> MavFrame:
 
 
 def _target(message_id: int, data: bytes, begin: int) -> tuple[int, int]:
-    """Return the addressed system and component; version 2 cuts trailing zeros off the payload."""
+    """Return the addressed system and component, 0 where version 2 has truncated zeros."""
     offsets = TARGET_OFFSETS.get(message_id)
     if offsets is None:
         return EVERYBODY
@@ -206,7 +207,7 @@ def message_id_of(data: bytes) -> int:
 def to_mavlink1(frame: bytes) -> bytes | None:
     """Encode a frame of either version as MAVLink 1, without extension fields and signature [1]_.
 
-    Returns None if MAVLink 1 cannot carry the message, or its definition is not known.
+    Returns None if MAVLink 1 cannot carry the message, or its definition is unknown.
 
     References
     ----------
@@ -226,9 +227,10 @@ def to_mavlink1(frame: bytes) -> bytes | None:
 
 
 def _split(data: bytes, *, seeks_on: bool = False) -> tuple[list[Event], int, int]:
-    """Return frames, the faults before them, the end of the last one, where one is unfinished.
+    """Return frames and the faults before them, the end of the last, and the begin of a partial one.
 
-    That is the end of the data if none is. `seeks_on` looks for frames behind it.
+    The begin is the end of the data if no frame is unfinished. With `seeks_on`, the bytes after it
+    are searched for frames too.
     """
     events: list[Event] = []
     position = end = false_starts = 0
@@ -259,7 +261,7 @@ def _report(events: list[Event], data: bytes, begin: int, end: int) -> None:
 
 
 def _measure(data: bytes, begin: int, *, takes_unknown: bool) -> int:
-    """Return the size of the frame that begins here, or why there is none."""
+    """Return the size of the frame that begins here, or the reason why there is none."""
     available = len(data) - begin
     start = data[begin]
     if start == START_V2:

@@ -1,7 +1,7 @@
 """The bytes of radio payloads and receiver frames: `firmware/PROTOCOL.md` in code.
 
-Decoding never raises on data: content that is no payload of this version becomes a `Fault`.
-Encoding serves the simulator and the golden vectors that the firmware's tests share.
+Decoding never raises on data: content that is not a payload of this version becomes a `Fault`.
+Encoding is for the simulator, and for the golden vectors that the firmware's tests share.
 """
 
 import struct
@@ -20,7 +20,7 @@ GPS_ACKNOWLEDGES: Final = 0x10
 """Bit of the GPS byte: the receiver acknowledges its settings."""
 GPS_NMEA: Final = 1
 SENSOR_IMU, SENSOR_MAG, SENSOR_BARO, SENSOR_GPS = (1 << bit for bit in range(4))
-"""Bits of a node's sensors present and failed."""
+"""Bits of a node's masks of present and failed sensors."""
 
 _IMU_NAMES: Final = {
     0x68: "MPU6050",
@@ -33,9 +33,9 @@ _IMU_NAMES: Final = {
     0x19: "MPU6886",
     0xAF: "ICM-20608",
 }
-"""By WHO_AM_I."""
+"""Names of IMUs by WHO_AM_I."""
 _MAG_NAMES: Final = {0x1E: "HMC5883L", 0x0D: "QMC5883L", 0x2C: "QMC5883P"}
-"""By I2C address; HMC5983 and DA5883 have the identification of the HMC5883L."""
+"""Names by I2C address; HMC5983 and DA5883 have the identification of the HMC5883L."""
 _BARO_NAMES: Final = {
     0x55: "BMP180",
     0x56: "BMP280",
@@ -43,7 +43,7 @@ _BARO_NAMES: Final = {
     0x58: "BMP280",
     0x60: "BME280",
 }
-"""By chip id."""
+"""Names of barometers by chip id."""
 _GPS_NAMES: Final = {
     GPS_NMEA: "NMEA receiver",
     2: "u-blox look-alike",
@@ -55,10 +55,10 @@ _GPS_NAMES: Final = {
 }
 PROTOCOL_VERSION: Final = 1
 MAX_PAYLOAD: Final = 32
-"""One nRF24L01+ packet."""
+"""Bytes of one nRF24L01+ packet."""
 PIPES: Final = 6
 NO_PIPE: Final = 0xFF
-"""Of a frame that carries no radio payload."""
+"""Pipe of a frame without a radio payload."""
 ACCEL_RANGES_G: Final = (2, 4, 8, 16)
 GYRO_RANGES_DPS: Final = (250, 500, 1000, 2000)
 HMC5883L_LSB_PER_GAUSS: Final = (1370, 1090, 820, 660, 440, 390, 330, 230)
@@ -67,7 +67,7 @@ MAG_LSB_PER_GAUSS: Final = (*HMC5883L_LSB_PER_GAUSS, 3000, 3750)
 _FRAME_HEADER: Final = struct.Struct("<BBBI")
 _HEADER: Final = struct.Struct("<BBHI")
 _RADIO_HEAD: Final = struct.Struct("<BBBIBBHI")
-"""A frame's header and that of the payload in it."""
+"""Header of a frame and of the payload in it."""
 _SIGNAL: Final = struct.Struct("<Bb")
 _SNR_PER_DB: Final = 4
 _unpack_head: Final = _RADIO_HEAD.unpack_from
@@ -76,23 +76,23 @@ _BARO: Final = struct.Struct("<Ih")
 _GPS_FIX: Final = struct.Struct("<Iiii3hBB")
 _GPS_QUALITY: Final = struct.Struct("<IHHHHHhBBBBBBBB")
 _NODE_STATUS_1_0: Final = struct.Struct("<BBBBBHHHHHH")
-"""Of firmware 1.0: without the chips."""
+"""Layout of firmware 1.0, without the chips."""
 _NODE_STATUS: Final = struct.Struct("<BBBBBHHHHHHBBBBH")
 _RECEIVER_HEAD: Final = struct.Struct("<BBHB")
 _PIPE: Final = struct.Struct("<IIH")
 _NODES: Final = tuple(NodeId(address >> 3, address & 0x7) for address in range(256))
-"""Indexed by the address byte."""
+"""Nodes by the address byte."""
 _LEAST_ADDRESS: Final = 1 << 3
-"""No vehicle has the id 0."""
+"""Least valid address, because no vehicle has the id 0."""
 _imu_flags = cache(ImuFlags)
-"""They are the same for many samples; a lookup costs a tenth of making them."""
+"""Flags are the same for many samples; a lookup costs a tenth of creating them."""
 _MAG_SHIFT: Final = 4
 _GYRO_SHIFT: Final = 2
 _RANGES: Final = tuple(
     (byte & 3, byte >> _GYRO_SHIFT & 3, byte >> _MAG_SHIFT)
     for byte in range(len(MAG_LSB_PER_GAUSS) << _MAG_SHIFT)
 )
-"""Codes of accelerometer, gyroscope and magnetometer by their byte; another byte is a fault."""
+"""Range codes of accelerometer, gyroscope and magnetometer by their byte; others are faults."""
 _RADIO_SHIFT: Final = 4
 _RESET_MASK: Final = 0x0F
 _RADIO_STATES: Final = frozenset(RadioState)
@@ -100,7 +100,7 @@ _Unpack = Callable[[bytes, int], tuple[int, ...]]
 
 
 class Chips(msgspec.Struct, frozen=True, gc=False):
-    """The chips that a node has found, as it sends them; 0 for none."""
+    """The chips that a node has found, as identified in its report; 0 for none."""
 
     imu: int = 0
     """WHO_AM_I."""
@@ -116,7 +116,7 @@ class Chips(msgspec.Struct, frozen=True, gc=False):
 def chip_names(chips: Chips, sensors_present: int) -> tuple[str, ...]:
     """Name the chips that a node has found, such as `"QMC5883L"` or `"u-blox M10 at 57600 baud"`.
 
-    An identification of 0 is one, too, if the bit of the sensor is set.
+    An identification of 0 is valid if the bit of the sensor is set.
     """
     names = []
     if sensors_present & SENSOR_IMU:
@@ -143,7 +143,7 @@ class FrameKind(IntEnum):
     RADIO = 1
     RECEIVER_STATUS = 2
     RADIO_SIGNAL = 3
-    """As `RADIO`, with the signal of the packet."""
+    """Like `RADIO`, with the signal of the packet."""
     FOREIGN = 4
     """A packet of another program."""
 
@@ -168,7 +168,7 @@ class Header(msgspec.Struct, frozen=True, gc=False):
     seq: int
     """Counts this node's payloads of every kind, modulo 65536."""
     node_time_us: int
-    """Modulo 2**32: wraps every 71.6 minutes."""
+    """Time on the node's clock, modulo 2**32: wraps every 71.6 minutes."""
 
 
 class ImuPayload(msgspec.Struct, frozen=True, gc=False):
@@ -215,7 +215,7 @@ class GpsQualityPayload(msgspec.Struct, frozen=True, gc=False):
     pdop_centi: int
     geoid_separation_cm: int
     utc: datetime | None
-    """To a hundredth of a second; None unless the receiver reports date and time as valid."""
+    """UTC to a hundredth of a second; None unless the receiver reports date and time as valid."""
 
 
 class NodeStatusPayload(msgspec.Struct, frozen=True, gc=False):
@@ -233,7 +233,7 @@ class NodeStatusPayload(msgspec.Struct, frozen=True, gc=False):
     supply_mv: int
     radio: RadioState = RadioState.OK
     chips: Chips | None = None
-    """None from firmware 1.0, whose report ends before them."""
+    """None from firmware 1.0, which does not report them."""
 
 
 Payload = ImuPayload | BaroPayload | GpsFixPayload | GpsQualityPayload | NodeStatusPayload
@@ -248,7 +248,7 @@ class RadioFrame(msgspec.Struct, frozen=True, gc=False):
     header: Header
     payload: Payload
     signal: RadioSignal | None = None
-    """None from a radio that does not measure it."""
+    """None if the radio does not measure it."""
 
 
 class ForeignFrame(msgspec.Struct, frozen=True, gc=False):
@@ -258,7 +258,7 @@ class ForeignFrame(msgspec.Struct, frozen=True, gc=False):
     receiver_time_us: int
     signal: RadioSignal
     packet: bytes
-    """With the other program's header."""
+    """The packet, with the other program's header."""
 
 
 class ReceiverStatusFrame(msgspec.Struct, frozen=True, gc=False):
@@ -315,7 +315,7 @@ def encode_receiver_status(status: ReceiverStatusFrame) -> bytes:
 def decode_content(content: bytes) -> RadioFrame | ReceiverStatusFrame | ForeignFrame | Fault:
     """Read the content of one checked serial frame, without COBS and CRC.
 
-    A fault names what does not fit: version, kind, length or a value.
+    A fault names the invalid part: version, kind, length or a value.
     """
     size = len(content)
     if size < _RADIO_HEAD.size or content[0] != _RADIO_FIRST:
@@ -355,7 +355,7 @@ def _decode_other(
 
 
 def _decode_radio_signal(content: bytes) -> RadioFrame | Fault:
-    """Read a radio payload with its signal: that of a plain frame, and two bytes before it."""
+    """Read a radio payload with its signal: two bytes, then the content of a plain frame."""
     signal, payload = _split_signal(content[_FRAME_HEADER.size :])
     frame = decode_content(bytes([_RADIO_FIRST]) + content[1 : _FRAME_HEADER.size] + payload)
     if isinstance(frame, RadioFrame):
@@ -369,7 +369,7 @@ def _split_signal(body: bytes) -> tuple[RadioSignal, bytes]:
 
 
 def _read_body(first: int, address: int, data: bytes, begin: int) -> Payload | FaultKind:
-    """Read the body of a payload, or return why that is impossible."""
+    """Read the body of a payload, or return the fault."""
     layout = _BODIES.get((first, len(data) - begin))
     if layout is None or address < _LEAST_ADDRESS:
         return _fault_of(first, address, len(data) - begin)
@@ -432,7 +432,7 @@ def _encode_quality(payload: GpsQualityPayload) -> bytes:
     if utc is not None:
         clock = (utc.hour, utc.minute, utc.second, utc.microsecond // 10_000)
         moment = (utc.year - 2000, utc.month, utc.day, *clock)
-    # The fields are in the order of the wire.
+    # The fields are in the order of the payload.
     *words, _ = msgspec.structs.astuple(payload)
     return _GPS_QUALITY.pack(*words, utc is not None, *moment)
 
@@ -465,7 +465,7 @@ def _read_gps_quality(words: tuple[int, ...]) -> GpsQualityPayload:
     valid, year, month, day, hour, minute, second, hundredths = words[7:]
     utc = None
     if valid:
-        # A leap second is sent as 60; the last hundredth before it is near enough.
+        # A leap second is sent as 60; the last hundredth before it is used instead.
         if second == 60:
             second, hundredths = 59, 99
         clock = (hour, minute, second, hundredths * 10_000)
@@ -496,4 +496,5 @@ _BODIES: Final[dict[tuple[int, int], tuple[_Unpack, _Read]]] = {
         (PayloadKind.NODE_STATUS, _NODE_STATUS, _read_node_status),
     )
 }
-"""By first byte and size of the body: a payload that has grown is still read in its old size."""
+"""Decoders by first byte and size of the body: extended payloads are also read in their old
+size."""

@@ -1,8 +1,8 @@
-"""Fields of messages that hold system ids, for links on which systems have other ids.
+"""Fields of messages that contain system ids, for links on which systems have other ids.
 
-In addition to the sender in its header a message may hold: the system that it addresses; one that
-it reports, as the one in control of a gimbal; and one in a parameter of a command, also of a
-command in a mission: the vehicle to follow, the target of a camera.
+In addition to the sender in its header a message may contain: the system that it addresses; a
+system that it reports, such as the one in control of a gimbal; and a system in a parameter of a
+command or of a mission item, such as the vehicle to follow or the target of a camera.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ FIELD_NAMES: Final = (
     *("target_system", "gcs_system_id", "primary_control_sysid", "secondary_control_sysid"),
     *("gcs_main", "gcs_secondary"),
 )
-"""Names that are used in all messages for a system id."""
+"""Names of fields that contain a system id in all messages."""
 FIELDS: Final[dict[int, tuple[str, ...]]] = {
     message_id: names
     for message_id in MESSAGE_NAMES
@@ -36,13 +36,13 @@ COMMANDS: Final = {
     dialect.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE: (1, 3),
     dialect.MAV_CMD_ARM_AUTHORIZATION_REQUEST: (1,),
 }
-"""Commands, and which of their parameters are system ids."""
+"""Numbers of the parameters that are system ids, by command."""
 CARRIERS: Final = frozenset(
     message_id
     for message_id in FIELDS
     if {"command", "param1"} <= set(layout_of(message_id).names or ())
 )
-"""Messages with a command."""
+"""Messages that contain a command."""
 
 
 def rename_systems(
@@ -53,7 +53,7 @@ def rename_systems(
     sign: Sign | None = None,
     drop_signature: bool = False,
 ) -> MavFrame | None:
-    """Return a frame from another sender, with other system ids in its fields.
+    """Return a frame with other system ids in its header and fields.
 
     `rename` returns the new id of a system, 1 to 255. A frame that changes is signed by `sign` if
     it is signed, or becomes unsigned by `drop_signature`. Returns the same frame if nothing
@@ -88,5 +88,5 @@ def _renamed_fields(frame: MavFrame, rename: Callable[[int], int]) -> dict[str, 
 def _renamed(value: Any, rename: Callable[[int], int]) -> Any:
     if isinstance(value, list):
         return [_renamed(each, rename) for each in value]
-    # NaN and negative numbers, as in the command for gimbals, are no ids.
+    # NaN and negative numbers, as in the command for gimbals, are not ids.
     return rename(int(value)) if 0 < value <= LAST_ID else value

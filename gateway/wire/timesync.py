@@ -1,22 +1,22 @@
-"""Node clocks to the gateway clock: offset and drift from the packets with the least delay.
+"""Conversion of node clocks to the gateway clock: offset and drift from the least delayed packets.
 
 Theory of operation. A packet stamped `t` by a remote clock arrives at `t + offset + delay` on the
 local one, where the delay is never negative but has bursts (retries, buffers, USB polling). The
-difference `arrival - t` therefore lies above the line `offset + skew * t`, and touches it whenever
-a packet meets no queue: the line is the lower envelope of all points. As in [1]_, it is found as
-the lower convex hull's edge above the window's middle, which is the supporting line with the least
-sum of distances to the points.
+difference `arrival - t` is therefore above the line `offset + skew * t`, or on it for a packet
+without a queue: the line is the lower envelope of all points. As in [1]_, it is found as the edge
+of the lower convex hull over the window's middle, which is the supporting line with the least sum
+of distances to the points.
 
-| what happens                                          | what the tracker does                  |
+| event                                                  | action                                 |
 | ------------------------------------------------------ | -------------------------------------- |
-| stamp agrees with the arrival, any number of wraps on  | unwraps it, adds the point             |
-| stamp is late, or early, by less than RESTART_JUMP_US  | the same: a queue, not a restart       |
-| stamp is late by more, but goes on from the last one   | the same, for DRAIN_US at most: the    |
-|                                                        | local computer stood still, and reads  |
-|                                                        | what its buffers kept                  |
-| stamp is late for longer, but goes on from the last    | its clock was halted: starts again     |
-| stamp disagrees by more                                | the remote restarted: starts again     |
-| packet seems to come before it was sent                | waits for a second one that agrees     |
+| time agrees with the arrival, even after wraps         | unwraps it, adds the point             |
+| time is late, or early, by less than RESTART_JUMP_US   | the same: a queue, not a restart       |
+| time is late by more, but continues the last one       | the same, for DRAIN_US at most: the    |
+|                                                        | local computer was suspended, and      |
+|                                                        | reads the content of its buffers       |
+| time is late for longer, but continues the last one    | its clock was halted: starts again     |
+| time disagrees by more                                 | the remote restarted: starts again     |
+| packet seems to arrive before it was sent              | waits for a second one that agrees     |
 
 References
 ----------
@@ -35,31 +35,33 @@ WRAP_US: Final = 1 << 32
 HALF_WRAP_US: Final = WRAP_US // 2
 WRAP_MASK: Final = WRAP_US - 1
 BUCKET_US: Final = 250_000
-"""Only the soonest packet of a bucket is kept: at any rate a window costs the same."""
+"""Length of a bucket, of which only the least delayed packet is kept: so the cost of a window does
+not depend on the rate."""
 MAX_BUCKETS: Final = 120
-"""30 s: long enough to average quantisation, short enough to follow a warming resonator."""
+"""Buckets of a window, 30 s: long enough to average quantisation, short enough to follow a warming
+resonator."""
 MIN_SKEW_SPAN_US: Final = 2_000_000
-"""Below this span, a burst of retries would look like drift."""
+"""Shortest span for a fit of the drift: in a shorter one, a burst of retries would look like it."""
 MAX_SKEW: Final = 0.01
-"""Ceramic resonators drift by up to 0.5 %; what seems to be more may be a queue that grows."""
+"""Maximum drift: ceramic resonators drift by up to 0.5 %; more may be a growing queue."""
 MAX_RC_SKEW: Final = 0.1
-"""A processor that runs on its internal RC oscillator, since its fuses are wrong."""
+"""Maximum drift of a processor on its internal RC oscillator, because its fuses are wrong."""
 LONGEST_QUEUE_US: Final = 500_000
-"""A greater change of the offset is not due to a queue."""
+"""A larger change of the offset is not due to a queue."""
 RESTART_JUMP_US: Final = 1_500_000
-"""More than any queue holds, less than a microcontroller's restart with its sensors' start-up."""
+"""More than the delay of any queue, less than a restart of a microcontroller with its sensors."""
 MAX_STALL_US: Final = 60_000_000
-"""How long the local computer may have stood still, in which the remote clock went on."""
+"""Maximum time for which the local computer may be suspended while the remote clock runs."""
 DRAIN_US: Final = 3_000_000
-"""Until then the buffers have been read; stamps that are still so late are those of a remote whose
-clock was halted, or which restarted and is beyond its last stamp again."""
+"""Time in which the buffers are read; packets that are still so late are those of a remote whose
+clock was halted, or which restarted and is beyond its last time again."""
 AHEAD_US: Final = 50_000
-"""More than the line can err by between two packets. Either the line was learned in a queue, and
-the next packets say the same, or a single stamp is wrong and must not move all that follow."""
+"""More than the error of the line between two packets. Either the line was fitted to a queue, and
+the next packets agree with this one, or its time is wrong and must not move the line."""
 RECENT: Final = 15
-"""Number of newest fixes used of each aircraft: some seconds."""
+"""Number of newest fixes of each aircraft that are used: some seconds."""
 ENOUGH: Final = 3
-"""Number of fixes before an aircraft is used: the first may hold the time of the last flight."""
+"""Number of fixes before an aircraft is used: the first may have the time of the last flight."""
 
 
 class _Point(msgspec.Struct, frozen=True, gc=False):
@@ -68,46 +70,46 @@ class _Point(msgspec.Struct, frozen=True, gc=False):
 
 
 class ClockTracker:
-    """Follow one remote 32-bit microsecond clock from pairs of (its time, arrival)."""
+    """Track one remote 32-bit microsecond clock from pairs of (its time, arrival)."""
 
     def __init__(self) -> None:
         self.restarts = 0
         self.resumptions = 0
-        """How often the remote clock went on after it had been halted."""
+        """Number of times that the remote clock continued after it had been halted."""
         self.runs = 0
-        """How often the line was begun: restarts, resumptions and the start."""
+        """Number of lines begun: the start, restarts and resumptions."""
         self._reset()
 
     def _reset(self) -> None:
         self.runs += 1
         self._last_us = self._last_arrival_us = 0
-        """The newest stamp, without its wraps, and its arrival."""
+        """The newest remote time, unwrapped, and its arrival."""
         self._buckets: list[_Point] = []
         self._hull: list[_Point] = []
-        """Lower hull of all buckets but the newest, which may still get a sooner packet."""
+        """Lower hull of all buckets but the newest, which may still get a less delayed packet."""
         self._line = self._soonest = _Point(0, 0)
         self._bucket_end_us = 0
-        """On the remote clock, of the newest bucket."""
+        """End of the newest bucket on the remote clock."""
         self._skew = 0.0
         self._suspect_us: int | None = None
         self._late_since_us: int | None = None
 
     @property
     def skew_ppm(self) -> float:
-        """How much faster than the local clock the remote one runs, in parts per million."""
+        """Relative speed of the remote clock, in parts per million; positive if it is fast."""
         return (1.0 / (1.0 + self._skew) - 1.0) * 1e6
 
     def observe(self, remote_u32: int, arrival_us: int) -> int:
         """Return the time of a packet on the local clock, µs; never later than its arrival.
 
-        `remote_u32` is the remote clock's stamp in µs, modulo 2**32, `arrival_us` is on the local
+        `remote_u32` is the remote clock's time in µs, modulo 2**32, `arrival_us` is on the local
         clock.
         """
         last_us, line, soonest, skew = self._last_us, self._line, self._soonest, self._skew
         remote_us = last_us + (remote_u32 - last_us & WRAP_MASK)
         local_us = remote_us + round(line.delta_us + skew * (remote_us - line.remote_us))
         if (
-            # Nearly every packet: this runs twice for each payload.
+            # The usual case, kept fast: this runs twice for each payload.
             last_us < remote_us < self._bucket_end_us
             and -AHEAD_US <= arrival_us - local_us <= RESTART_JUMP_US
             and arrival_us - remote_us >= soonest.delta_us + skew * (remote_us - soonest.remote_us)
@@ -161,28 +163,28 @@ class ClockTracker:
         return remote_u32
 
     def _goes_on(self, remote_us: int, arrival_us: int, slack_us: float) -> bool:
-        """Return whether a stamp continues the last one on the known line, though read late."""
+        """Return whether a time continues the last one on the known line, though read late."""
         late_us = arrival_us - self._to_local(remote_us)
         return remote_us > self._last_us and -slack_us <= late_us <= MAX_STALL_US
 
     def _is_stale(self, arrival_us: int) -> bool:
-        """Return whether stamps have been too late for longer than buffers explain."""
+        """Return whether times have been too late for longer than buffers explain."""
         if self._late_since_us is None:
             self._late_since_us = arrival_us
         return arrival_us - self._late_since_us > DRAIN_US
 
     def _is_soonest(self, remote_us: int, delta_us: int) -> bool:
-        """Return whether a point is the soonest of its bucket so far, drift removed."""
+        """Return whether a point is the least delayed of its bucket so far, drift removed."""
         if not self._buckets or remote_us >= self._bucket_end_us:
             return True
         soonest = self._soonest
         if remote_us < self._bucket_end_us - BUCKET_US:
             return False
-        # Of a clock that runs fast, each packet alone seems to come sooner than the last.
+        # If the clock is fast, each packet would seem less delayed than the one before.
         return delta_us < soonest.delta_us + self._skew * (remote_us - soonest.remote_us)
 
     def _add(self, point: _Point) -> None:
-        """Add the soonest point of its bucket, and fit the line again."""
+        """Add the least delayed point of its bucket, and fit the line again."""
         buckets, hull = self._buckets, self._hull
         if buckets and point.remote_us < self._bucket_end_us:
             buckets.pop()
@@ -191,7 +193,7 @@ class ClockTracker:
         buckets.append(point)
         if len(buckets) > MAX_BUCKETS:
             del buckets[0]
-            # The later points of the hull stay in it; those up to its second one may enter it.
+            # Later points of the hull stay in it; those up to its second point may enter it.
             until = bisect_right(buckets, hull[1].remote_us, key=_remote_us)
             begun: list[_Point] = []
             for each in buckets[:until]:
@@ -248,8 +250,8 @@ class GpsTime:
     def update(self, vehicle_id: int, utc_us: int, time_us: int) -> int | None:
         """Process the UTC of a fix and its arrival on the gateway clock.
 
-        The arrival is used as the time of the fix: late by the latency, so never in the future.
-        Returns UTC at the zero of the gateway clock; None while there are too few fixes.
+        The arrival is used as the time of the fix, which is late by the latency, never early.
+        Returns UTC at the zero of the gateway clock; None if there are too few fixes.
         """
         offsets_us = self._offsets_us.setdefault(vehicle_id, deque(maxlen=RECENT))
         offsets_us.append(utc_us - time_us)
