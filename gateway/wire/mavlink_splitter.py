@@ -227,7 +227,7 @@ def to_mavlink1(frame: bytes) -> bytes | None:
 
 
 def _split(data: bytes, *, seeks_on: bool = False) -> tuple[list[Event], int, int]:
-    """Return frames and the faults before them, the end of the last, and the begin of a partial one.
+    """Return frames and the faults before them, the end of the last, and the begin of a partial.
 
     The begin is the end of the data if no frame is unfinished. With `seeks_on`, the bytes after it
     are searched for frames too.
