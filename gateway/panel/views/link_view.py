@@ -26,6 +26,9 @@ from gateway.units import US_PER_S, counted
 REFRESH_S: Final = 1.0
 SERIAL_S: Final = 2.0
 AUTO: Final = "find the receiver by its frames"
+OPEN_BY_ADDRESS: Final = (
+    "A phone cannot reach these URLs: open this page by this computer's address in the network"
+)
 LOOPBACK_ONLY: Final = (
     "Only this machine reaches the panel: a phone needs panel.address, a password, and a "
     "certificate or insecure = true"
@@ -106,13 +109,15 @@ class LinkView:
         """Build the list of URLs to which a phone posts, which is hidden without such a source."""
         with ui.element("div").classes("card padded").props("data-role=push") as self._push:
             heading("Posts of a phone")
+            request = ui.context.client.request
+            self._base = str(request.base_url) if request is not None else "/"
             if self._context.parts.settings.address in LOOPBACK:
                 ui.label(f"{LOOPBACK_ONLY}.").classes("soft")
+            elif request is not None and request.url.hostname in LOOPBACK:
+                ui.label(f"{OPEN_BY_ADDRESS}.").classes("soft")
             self._push_urls = ui.element("div")
         self._push.set_visibility(False)
         self._pushed: Record = {}
-        request = ui.context.client.request
-        self._base = str(request.base_url) if request is not None else "/"
         self._context.every(SERIAL_S, self._refresh_push)
 
     async def _refresh_push(self) -> None:
