@@ -28,7 +28,7 @@ _LEAPS_US: Final = [
     )
 ]
 """Civil time at the end of each leap second."""
-LEAPS_KNOWN_UNTIL_US: Final = _unix_us(2026, 6, 28)
+LEAPS_KNOWN_UNTIL_US: Final = _unix_us(2027, 6, 28)
 """No other leap second was announced for the time before this."""
 
 
