@@ -4,12 +4,13 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from gateway.batch.executors import ClusterError, DaskCluster, WorkFailed
-from tests.kit.cli import invoke
+from tests.kit.cli import run
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.io
@@ -22,12 +23,6 @@ def address() -> Iterator[str]:
         dashboard_address="127.0.0.1:0", silence_logs=50,
     ) as cluster:  # fmt: skip
         yield cluster.scheduler_address
-
-
-def _run(season: Path, out: Path, *more: str) -> tuple[int, str]:
-    files = [season / name for name in ("alpha_01_v1.csv", "gamma_01_v2.csv", "broken.csv")]
-    done = invoke("batch", "report", "--no-pages", *files, "-o", out, *more)
-    return done.exit_code, done.output
 
 
 def _kill_one_worker(marker: Path) -> int:
@@ -46,9 +41,10 @@ def _fail(marker: Path) -> int:
 def test_cluster_gives_the_results_of_this_machine(
     address: str, season: Path, tmp_path: Path
 ) -> None:
-    code, text = _run(season, tmp_path / "cluster", "--scheduler", address)
-    assert (code, "1 of 3 recordings failed" in text) == (1, True), text
-    assert _run(season, tmp_path / "here")[0] == 1
+    files = [season / name for name in ("alpha_01_v1.csv", "gamma_01_v2.csv", "broken.csv")]
+    for out, options in (("cluster", ("--scheduler", address)), ("here", ())):
+        words = ("batch", "report", "--no-pages", *files, "-o", tmp_path / out, *options)
+        assert "1 of 3 recordings failed" in run(*words, code=1)
     for part in ("results", "fused"):
         here, there = (
             {path.name: path.read_bytes() for path in (tmp_path / side / part).iterdir()}
@@ -59,28 +55,20 @@ def test_cluster_gives_the_results_of_this_machine(
 
 
 def test_work_of_killed_worker_is_repeated(address: str, tmp_path: Path) -> None:
-    cluster = DaskCluster(address)
-    try:
-        names = ["a", "bb", "deadly", "ccc", *(f"more {k}" for k in range(20))]
+    names = ["a", "bb", "deadly", "ccc", *(f"more {k}" for k in range(20))]
+    with closing(DaskCluster(address)) as cluster:
         found = dict(cluster.run(_kill_one_worker, [tmp_path / name for name in names]))
-    finally:
-        cluster.close()
     assert (tmp_path / "deadly").exists()
     assert found == {k: len(name) for k, name in enumerate(names)}
 
 
 def test_failed_work_is_returned_with_reason(address: str, tmp_path: Path) -> None:
-    cluster = DaskCluster(address)
-    try:
+    with closing(DaskCluster(address)) as cluster:
         ((_, outcome),) = cluster.run(_fail, [tmp_path / "x"])
-    finally:
-        cluster.close()
     assert outcome == WorkFailed("KeyError: 'x'")
 
 
-def test_missing_scheduler_is_reported(
-    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_scheduler_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gateway.batch.executors.CONNECT_S", 0.3)
     with pytest.raises(ClusterError, match="no Dask scheduler responds"):
         DaskCluster("tcp://127.0.0.1:9")

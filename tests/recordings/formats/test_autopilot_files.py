@@ -41,8 +41,7 @@ MAKERS: dict[str, tuple[Callable[[float], bytes], int]] = {
 }
 
 
-def make_logs(tmp_path_factory: pytest.TempPathFactory, seconds: float) -> Path:
-    folder = tmp_path_factory.mktemp("logs")
+def make_logs(folder: Path, seconds: float) -> Path:
     for name, (make, _) in MAKERS.items():
         flown.write(folder / name, make(seconds))
     return folder
@@ -51,23 +50,21 @@ def make_logs(tmp_path_factory: pytest.TempPathFactory, seconds: float) -> Path:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Logs of the whole flight."""
-    return make_logs(tmp_path_factory, flown.DURATION_S)
+    return make_logs(tmp_path_factory.mktemp("logs"), flown.DURATION_S)
 
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Logs of its first third, which are read many times."""
-    return make_logs(tmp_path_factory, flown.DURATION_S / 3)
-
-
-@cache
-def whole(path: Path) -> tuple[RecordedTable, list[TableRow]]:
-    return rows_of(path)
+    return make_logs(tmp_path_factory.mktemp("logs"), flown.DURATION_S / 3)
 
 
 def rows_of(path: Path) -> tuple[RecordedTable, list[TableRow]]:
     table = open_rows(path, OPTIONS)
     return table, list(table.plain_rows)
+
+
+whole = cache(rows_of)
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -99,9 +96,8 @@ def test_repeated_magnetometer_field_is_read_once(tmp_path: Path) -> None:
     for number in range(12):
         mark = -500 if number % 3 == 0 else 0x7FFF_FFFF
         log.add("sensor_combined", 4000 * number, *inertial, mark, 0.2, 0.0, 0.4)
-    path = tmp_path / "older.ulg"
-    path.write_bytes(b"".join(log.parts))
-    fields = [row.imu.mag_b_ut for row in rows_of(path)[1] if row.imu is not None]
+    _, rows = rows_of(flown.write(tmp_path / "older.ulg", b"".join(log.parts)))
+    fields = [row.imu.mag_b_ut for row in rows if row.imu is not None]
     assert [bool(field) for field in fields] == [True, False, False] * 4
 
 
@@ -114,16 +110,11 @@ def test_fixes_have_all_values_of_the_log(folder: Path, name: str) -> None:
     pairs = [(f, r) for f, r in zip(fixes, sent, strict=True) if r.fix_ok]
     assert len(pairs) > 100
     for f, r in pairs:
-        assert (f.lat_dege7, f.lon_dege7, f.satellites) == (
-            r.lat_dege7,
-            r.lon_dege7,
-            r.satellites,
-        )
-        assert f.alt_amsl_m == pytest.approx(r.alt_amsl_m, abs=0.006)
+        for exact in ("lat_dege7", "lon_dege7", "satellites"):
+            assert getattr(f, exact) == getattr(r, exact)
+        for rounded in ("alt_amsl_m", "h_acc_m", "v_acc_m", "speed_acc_mps"):
+            assert getattr(f, rounded) == pytest.approx(getattr(r, rounded), abs=0.006)
         assert f.vel_n_mps == pytest.approx(r.vel_n_mps, abs=1e-4)
-        assert f.h_acc_m == pytest.approx(r.h_acc_m, abs=0.006)
-        assert f.v_acc_m == pytest.approx(r.v_acc_m, abs=0.006)
-        assert f.speed_acc_mps == pytest.approx(r.speed_acc_mps, abs=0.006)
         assert f.utc_us is not None
         assert r.utc_us is not None
         assert abs(f.utc_us - r.utc_us) <= 1000

@@ -34,11 +34,8 @@ def test_line_with_all_columns_is_read() -> None:
     assert row.imu.mag_b_ut == (20.0, 5.0, -40.0)
     assert row.imu.flags is ImuFlags.MAG_NEW
     assert pressure_altitude_m(row.baro.pressure_pa) == pytest.approx(512.5, abs=1e-6)
-    assert (row.gps.time_us, row.gps.lat_dege7, row.gps.lon_dege7) == (
-        1_450_000,
-        471_000_000,
-        85_000_000,
-    )
+    fix = (row.gps.time_us, row.gps.lat_dege7, row.gps.lon_dege7)
+    assert fix == (1_450_000, 471_000_000, 85_000_000)
     assert row.gps.vel_n_mps == (1.0, 2.0, 3.0)
     assert row.gps.fix_type is GpsFixType.FIX_3D
     assert math.isnan(row.gps.h_acc_m)
@@ -60,21 +57,12 @@ def test_blank_cells_give_no_records() -> None:
     assert row.baro is row.gps is None
 
 
-def test_unreadable_lines_are_counted() -> None:
-    reader, rows = read("x,1", ",,,", "2,0,0,0,0,0,0,,,,,,,,,,,,")
-    assert len(rows) == 1
-    assert reader.faults == 2
-
-
 PLAIN = "1.5,0,0,-9.8,0,0,0,20,5,-40,500,1.45,47.1,8.5,430,1,2,3,hi,5,120"
-AT = {name: number for number, name in enumerate(NAMES.split(","))}
 
 
 def with_cells(**texts: str) -> str:
-    cells = PLAIN.split(",")
-    for name, text in texts.items():
-        cells[AT[name]] = text
-    return ",".join(cells)
+    cells = dict(zip(NAMES.split(","), PLAIN.split(","), strict=True))
+    return ",".join((cells | texts).values())
 
 
 @pytest.mark.parametrize("word", ["null", "N/A", "NaN", "nan", "-", "--", "None", "#N/A", " "])
@@ -108,6 +96,11 @@ def test_unreadable_cell_drops_only_its_record(cells: dict[str, str], lost: str)
 def test_line_without_a_time_is_named(line: str, fault: str) -> None:
     reader, rows = read(line)
     assert (rows, reader.first_fault) == ([], fault)
+
+
+def test_unreadable_lines_are_counted() -> None:
+    reader, rows = read("x,1", ",,,", PLAIN)
+    assert (len(rows), reader.faults) == (1, 2)
 
 
 def test_quoted_decimal_commas_between_commas_are_read() -> None:
@@ -159,9 +152,8 @@ def test_file_without_mapped_columns_is_refused() -> None:
     ],
 )
 def test_only_needed_columns_are_reported_missing_without_a_map(names: str, missing: str) -> None:
-    with pytest.raises(
-        ValueError, match=f"no column {missing}; found, separated by commas: time_s"
-    ):
+    match = f"no column {missing}; found, separated by commas: time_s"
+    with pytest.raises(ValueError, match=match):
         rows_of(CsvReader(TRACKER, lenient=True), names, "1,2")
 
 

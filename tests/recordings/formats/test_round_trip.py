@@ -18,7 +18,6 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.config import GatewaySettings
 from gateway.recordings.columns import TableRow, row_to_line
@@ -29,10 +28,11 @@ from gateway.recordings.formats.maps import tracks_of_messages, tracks_of_table
 from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_table import aircraft_of, header_for
 from gateway.recordings.table import TableNote, encode_line
-from gateway.recordings.tlog import TlogRecord, encode_record
+from gateway.recordings.tlog import TlogRecord
 from gateway.records import NodeId, NodeStatus
+from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
-from tests.kit.recordings import START_US
+from tests.kit.recordings import START_US, make_tlog
 from tests.recordings.flights import OPTIONS, fly, make_flight
 from tests.recordings.formats import flown
 
@@ -68,15 +68,10 @@ def tracker() -> bytes:
     return "\n".join([*lines, ""]).encode()
 
 
-def tlog() -> bytes:
-    """Write the MAVLink of the table's flight."""
-    return convert("flight.csv", table(), ".tlog")
-
-
 SOURCES: dict[str, Callable[[], bytes]] = {
     "flight.csv": table,
     "flight.parquet": lambda: convert("flight.csv", table(), ".parquet"),
-    "flight.tlog": tlog,
+    "flight.tlog": lambda: convert("flight.csv", table(), ".tlog"),
     "tracker.csv": tracker,
     "new.ulg": lambda: flown.make_ulog(seconds=SECONDS),
     "old.ulg": lambda: flown.make_ulog(old=True, seconds=SECONDS),
@@ -114,10 +109,6 @@ def convert(name: str, data: bytes, ending: str) -> bytes:
         path = Path(folder, name)
         path.write_bytes(data)
         return written(path, ending)
-
-
-def rows_of(path: Path) -> list[str]:
-    return [row_to_line(row) for row in open_rows(path, OPTIONS).plain_rows]
 
 
 @cache
@@ -162,10 +153,10 @@ def of_mcap(data: bytes) -> list[tuple[int, str]]:
 
 def of_frames(records: Iterable[TlogRecord]) -> list[tuple[int, str]]:
     found = []
-    for time_us, frame in ((record.time_us, record.frame) for record in records):
-        system, component = origin_of(frame)
-        name = mavlink.mavlink_map[message_id_of(frame)].msgname
-        found.append((time_us, f"/mavlink/{system}/{component}/{name}"))
+    for record in records:
+        system, component = origin_of(record.frame)
+        name = MESSAGE_NAMES[message_id_of(record.frame)]
+        found.append((record.time_us, f"/mavlink/{system}/{component}/{name}"))
     return found
 
 
@@ -179,7 +170,8 @@ def checks(*endings: str) -> Callable[[Callable[[Path, bytes, Path], None]], Any
 
 @checks(".csv", ".parquet")
 def same_rows(source: Path, data: bytes, out: Path) -> None:
-    assert rows_of(out) == [*map(row_to_line, table_of(source))]
+    rows = open_rows(out, OPTIONS).plain_rows
+    assert [*map(row_to_line, rows)] == [*map(row_to_line, table_of(source))]
     # A table is read as it was written, and written as it was read.
     assert written(out, out.suffix) == data
     assert written(out, ".csv") == (data if out.suffix == ".csv" else written(source, ".csv"))
@@ -191,7 +183,7 @@ def same_frames(source: Path, data: bytes, out: Path) -> None:
     times_us = [record.time_us for record in records]
     assert len(times_us) > 100
     assert times_us == sorted(set(times_us))
-    assert data == b"".join(encode_record(record.time_us, record.frame) for record in records)
+    assert data == make_tlog(records)
     assert written(out, ".tlog") == data
 
 
