@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from gateway.analysis.case import Case, make_case
-from gateway.analysis.flight import Flight
+from gateway.analysis.flight import Flight, FlightTrack
 from gateway.analysis.simulated import simulated_flight
 from gateway.simulator.simulator_settings import SimulatorSettings
 
@@ -22,6 +22,13 @@ def short_flight(duration_s: float = DURATION_S) -> Flight:
 @cache
 def short_case() -> Case:
     return make_case(short_flight())
+
+
+def true_track(flight: Flight) -> FlightTrack:
+    """Return the exact truth of a simulated flight."""
+    assert flight.reference is not None
+    assert flight.reference.is_exact
+    return flight.reference.track
 
 
 def with_imu(flight: Flight, **columns: np.ndarray) -> Flight:

@@ -27,7 +27,7 @@ from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.reading import TRACKER_LOG
 from gateway.sensing.calibration import NodeCalibration
-from tests.analysis.flights import DURATION_S, short_case, short_flight
+from tests.analysis.flights import DURATION_S, short_case, short_flight, true_track
 
 
 def line(valid_s: list[float]) -> Fixes:
@@ -104,12 +104,10 @@ def test_fixes_of_some_seconds_are_withheld_and_the_last_of_each_span_compared()
 
 
 def test_truth_agrees_with_fixes_at_their_time_of_validity() -> None:
-    flight = short_flight()
-    assert flight.reference is not None
-    error = error_at_fixes_m(flight.reference.track, fixes_of(flight))
+    truth, fixes = true_track(short_flight()), fixes_of(short_flight())
+    error = error_at_fixes_m(truth, fixes)
     assert np.hypot(*error.T).max() < 5.0
-    late = fixes_of(flight)
-    worse = error_at_fixes_m(flight.reference.track, replace(late, valid_us=late.arrival_us))
+    worse = error_at_fixes_m(truth, replace(fixes, valid_us=fixes.arrival_us))
     assert np.nanmean(np.hypot(*worse.T)) > np.nanmean(np.hypot(*error.T))
 
 
@@ -145,9 +143,8 @@ def test_interpolated_gps_scores_zero_against_itself() -> None:
 
 def test_truth_scores_zero_against_itself() -> None:
     flight = short_flight()
-    assert flight.reference is not None
     judge = make_judge(flight, np.ones(len(flight.fixes), np.bool_))
-    found = score(flight.reference.track, judge)
+    found = score(true_track(flight), judge)
     assert found["reference_m"] == pytest.approx(0.0)
     assert np.isnan(found["held_m"])
 

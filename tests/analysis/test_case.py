@@ -1,6 +1,5 @@
 """Key figures of a flight, and figures for pilots."""
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -18,9 +17,10 @@ from gateway.analysis.flight import FlightTrack, LocalFrame, local_frame
 from gateway.analysis.pilot_figures import pilot_figures
 from gateway.analysis.reporting.estimators import comparison
 from gateway.analysis.simulated import simulated_flight
+from gateway.analysis.sweep import with_values
 from gateway.recordings.fuse import with_estimator
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.analysis.flights import DURATION_S, short_case, short_flight, with_imu
+from tests.analysis.flights import DURATION_S, short_case, short_flight, true_track, with_imu
 
 
 def test_summary_contains_the_key_figures() -> None:
@@ -53,9 +53,8 @@ def test_error_without_gps_exceeds_that_at_withheld_fixes(monkeypatch: pytest.Mo
 
 def test_changed_settings_are_listed_with_both_values() -> None:
     a = short_case().fusion
-    paper = msgspec.structs.replace(a.estimation.paper, accel_cutoff_hz=5.0)
-    estimation = msgspec.structs.replace(a.estimation, estimator="paper", paper=paper)
-    b = msgspec.structs.replace(a, estimation=estimation)
+    keys = ("estimation.estimator", "estimation.paper.accel_cutoff_hz")
+    b = with_values(a, keys, ("paper", 5.0))
     assert changed_settings(a, a) == []
     assert changed_settings(a, b) == [
         ("estimation.estimator", "eskf", "paper"),
@@ -88,11 +87,10 @@ def test_pilot_figures_agree_with_simulated_truth() -> None:
     case = short_case()
     assert case.frame is not None
     figures = pilot_figures(case.flight, case.track, case.frame)
-    truth = case.flight.reference
-    assert truth is not None
-    speed = np.hypot(truth.track.vel_n_mps[:, 0], truth.track.vel_n_mps[:, 1])
+    truth = true_track(case.flight)
+    speed = np.hypot(truth.vel_n_mps[:, 0], truth.vel_n_mps[:, 1])
     assert figures.fastest_mps == pytest.approx(float(speed.max()), abs=1.0)
-    height = truth.track.alt_amsl_m - truth.track.alt_amsl_m[0]
+    height = truth.alt_amsl_m - truth.alt_amsl_m[0]
     assert figures.highest_m == pytest.approx(float(height.max()), abs=8.0)
     flown = speed[:-1] * np.diff(case.flight.time_s)
     assert figures.distance_m == pytest.approx(float(flown[height[1:] > 3.0].sum()), rel=0.05)

@@ -4,12 +4,12 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
 from gateway.analysis.case import ESTIMATORS, make_case
 from gateway.analysis.flight import (
+    Flight,
     FlightTrack,
     LocalFrame,
     at_times,
@@ -22,6 +22,7 @@ from gateway.analysis.flight import (
 from gateway.analysis.metrics import position_error_m, rms
 from gateway.analysis.reporting.compose import make_report
 from gateway.analysis.simulated import ideal_calibration
+from gateway.analysis.sweep import with_value
 from gateway.estimation.select import make_estimator
 from gateway.geometry.geodesy import displacement_m
 from gateway.recordings.columns import TableRow
@@ -31,7 +32,7 @@ from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuFlags, ImuRaw, No
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.analysis.flights import DURATION_S, short_case, short_flight, with_imu
+from tests.analysis.flights import DURATION_S, short_case, short_flight, true_track, with_imu
 from tools.simulated_flight import SimulatedFlight, fly
 
 
@@ -41,9 +42,7 @@ def test_simulated_flight_is_calibrated_and_has_exact_truth() -> None:
     assert flight.duration_s == pytest.approx(DURATION_S, abs=0.1)
     rest = flight.imu.accel_b_mps2[: round(5 * flight.rate_hz)].mean(axis=0)
     assert rest == pytest.approx([0.0, 0.0, -9.80665], abs=0.03)
-    assert flight.reference is not None
-    assert flight.reference.is_exact
-    assert len(flight.reference.track.lat_deg) == len(flight.time_us)
+    assert len(true_track(flight).lat_deg) == len(flight.time_us)
     assert np.linalg.norm(flight.imu.gyro_b_radps[:200].mean(axis=0)) < math.radians(0.3)
 
 
@@ -93,6 +92,15 @@ SIMULATED: SimulatedFlight = fly(
 )
 
 
+def recorded(*, raw: bool, calibration: NodeCalibration | None = None) -> Flight:
+    """Read the rows of the simulated flight as a flight."""
+    calibration = calibration or NodeCalibration()
+    blocks = [block_of(rows(raw=raw))]
+    return flight_of_blocks(
+        blocks, calibration, short_case().fusion, name="log.csv", description="A log."
+    )
+
+
 def rows(*, raw: bool) -> Iterator[TableRow]:
     """Rows as the recorder writes them, with states."""
     fusion = short_case().fusion
@@ -120,13 +128,7 @@ def rows(*, raw: bool) -> Iterator[TableRow]:
 
 @pytest.mark.parametrize("raw", [True, False])
 def test_recorded_rows_give_samples_and_states_of_simulated_flight(raw: bool) -> None:
-    flight = flight_of_blocks(
-        [block_of(rows(raw=raw))],
-        ideal_calibration(SIMULATED.errors),
-        short_case().fusion,
-        name="a",
-        description="",
-    )
+    flight = recorded(raw=raw, calibration=ideal_calibration(SIMULATED.errors))
     chain = SensorChain(ideal_calibration(SIMULATED.errors))
     samples = [chain.imu(record) for record in SIMULATED.records() if isinstance(record, ImuRaw)]
     assert flight.imu.accel_b_mps2.tolist() == [list(s.accel_b_mps2) for s in samples]
@@ -150,13 +152,7 @@ def test_simulated_flight_has_radio_loss_and_jitter() -> None:
 
 
 def test_report_without_reference_compares_recorded_states() -> None:
-    flight = flight_of_blocks(
-        [block_of(rows(raw=False))],
-        NodeCalibration(),
-        short_case().fusion,
-        name="log.csv",
-        description="A log.",
-    )
+    flight = recorded(raw=False)
     assert flight.reference is None
     report = make_report(make_case(flight))
     titles = [section.title for section in report.sections]
@@ -203,8 +199,7 @@ def test_report_without_gps_compass_and_reference_has_three_sections() -> None:
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_fused_track_is_within_4_m_rms_of_truth(name: str) -> None:
     flight = short_flight()
-    assert flight.reference is not None
-    error = position_error_m(short_case().tracks[name], flight.reference.track)[flight.scored]
+    error = position_error_m(short_case().tracks[name], true_track(flight))[flight.scored]
     assert rms(np.hypot(error[:, 0], error[:, 1])) < 4.0
 
 
@@ -217,7 +212,5 @@ def test_position_before_first_valid_fix_is_nan() -> None:
 
 def test_changed_cutoff_changes_fused_attitude() -> None:
     flight, fusion = short_flight(), with_estimator(short_case().fusion, "paper")
-    paper = msgspec.structs.replace(fusion.estimation.paper, accel_cutoff_hz=2.0)
-    estimation = msgspec.structs.replace(fusion.estimation, paper=paper)
-    changed = fuse_track(flight, msgspec.structs.replace(fusion, estimation=estimation))
+    changed = fuse_track(flight, with_value(fusion, "estimation.paper.accel_cutoff_hz", 2.0))
     assert not np.array_equal(changed.q_nb, short_case().tracks["paper"].q_nb)

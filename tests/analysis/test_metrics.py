@@ -15,7 +15,7 @@ from gateway.analysis.metrics import (
     total_error_rad,
     worst,
 )
-from tests.analysis.flights import short_flight
+from tests.analysis.flights import short_flight, true_track
 
 
 def quats(rotation: Rotation) -> np.ndarray:
@@ -58,9 +58,7 @@ def test_euler_angles_equal_those_of_scipy(rng: np.random.Generator) -> None:
 
 
 def test_position_error_is_north_east_up() -> None:
-    reference = short_flight().reference
-    assert reference is not None
-    track = reference.track
+    track = true_track(short_flight())
     lat_deg, lon_deg = track.lat_deg + 1e-5, track.lon_deg - 1e-5
     moved = replace(track, lat_deg=lat_deg, lon_deg=lon_deg, alt_amsl_m=track.alt_amsl_m + 2.0)
     error = position_error_m(moved, track)

@@ -3,11 +3,11 @@
 import gzip
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from gateway.analysis.case import make_case
 from gateway.analysis.reporting.estimators import estimators
+from gateway.analysis.sweep import with_value
 from gateway.batch.tasks import read_season_flight
 from gateway.cli.support.options import read_options
 from gateway.cli.support.recording_options import load_flight
@@ -17,7 +17,7 @@ from gateway.recordings.flown import open_flown
 from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_fusion import RecordedFusion, aircraft_for
 from gateway.recordings.recorded_table import ReadOptions, settings_of
-from tests.kit.cli import invoke
+from tests.kit.cli import run
 from tests.recordings.flights import OPTIONS
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -25,7 +25,6 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 TODAY = GatewaySettings()
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "take_off.csv.gz"
-SETTINGS = GatewaySettings().default_aircraft
 
 
 @pytest.fixture
@@ -39,7 +38,6 @@ def test_every_command_uses_the_latency_estimated_from_manoeuvres(without_latenc
     table = open_rows(without_latency, OPTIONS)
     latency_s = aircraft_for([without_latency], table, OPTIONS).estimation.reference.gps_latency_s
     assert latency_s == pytest.approx(0.16, abs=0.02)
-    assert "GPS latency not in log; estimated 0.1" in table.remarks[0]
     assert "GPS latency not in log; estimated 0.1" in table.remarks[0]
     assert load_flight(without_latency, TODAY, read_options(TODAY)).latency_s == latency_s
     assert read_season_flight([without_latency], OPTIONS, "log").flight.latency_s == latency_s
@@ -63,8 +61,7 @@ def test_recording_fused_with_another_latency_is_reported(
 ) -> None:
     own, config = tmp_path / "own.csv", tmp_path / "c.toml"
     config.write_text(f"[estimation.reference]\ngps_latency_s = {set_s}\n")
-    convert = ["fuse", str(without_latency), "-o", str(own), "--config", str(config)]
-    invoke(*convert, code=0)
+    run("fuse", without_latency, "-o", own, "--config", config)
     assert load_flight(own, TODAY, read_options(TODAY)).latency_s == set_s
     words = " ".join(capsys.readouterr().err.split())
     assert ("its manoeuvres show a GPS latency of 0.1" in words) == (set_s == 0.4)
@@ -79,10 +76,8 @@ def test_latency_of_user_log_or_settings_is_used(without_latency: Path) -> None:
 
     assert latency_s(GOLDEN, OPTIONS) == 0.16
     assert latency_s(GOLDEN, OPTIONS, 0.3) == latency_s(without_latency, OPTIONS, 0.3) == 0.3
-    reference = msgspec.structs.replace(SETTINGS.estimation.reference, gps_latency_s=0.2)
-    estimation = msgspec.structs.replace(SETTINGS.estimation, reference=reference)
-    set_s = PipelineSettings(msgspec.structs.replace(SETTINGS, estimation=estimation))
-    assert latency_s(without_latency, ReadOptions(set_s)) == 0.2
+    changed = with_value(TODAY.default_aircraft, "estimation.reference.gps_latency_s", 0.2)
+    assert latency_s(without_latency, ReadOptions(PipelineSettings(changed))) == 0.2
 
 
 def test_every_command_smooths_with_the_latency_that_contradicts_the_one_set(
@@ -92,8 +87,7 @@ def test_every_command_smooths_with_the_latency_that_contradicts_the_one_set(
     text = gzip.decompress(GOLDEN.read_bytes()).decode()
     path.write_text(text.replace("gps_latency_s=0.16", "gps_latency_s=0.4"))
     remark = "smoothed with a GPS latency of 0.1"
-    fused = invoke("fuse", path, "-o", out, "--smooth")
-    assert remark in " ".join(fused.output.split())
+    assert remark in run("fuse", path, "-o", out, "--smooth")
     table = open_rows(out, OPTIONS)
     latency_s = settings_of(table.header).estimation.reference.gps_latency_s
     assert latency_s == pytest.approx(0.16, abs=0.02)
