@@ -19,6 +19,12 @@ def make_player(records: list[TlogRecord] = RECORDS, now_us: int = 0, **options:
     return Player([make_track(make_tlog(records))], now_us, **options)
 
 
+@pytest.fixture
+def clip() -> Player:
+    """Return a player of a part of the recording."""
+    return make_player(begin_us=START_US + 10 * STEP_US, end_us=START_US + 20 * STEP_US)
+
+
 def play_to_end(player: Player, now_us: int = 0) -> list[tuple[int, bytes]]:
     """Poll exactly when the player asks for it."""
     found = []
@@ -103,12 +109,10 @@ def test_seek_while_paused_sends_the_state_and_stays_paused() -> None:
     assert player.next_due_us() is None
 
 
-def test_seek_is_clamped_to_the_range() -> None:
-    player = make_player(begin_us=START_US + 10 * STEP_US, end_us=START_US + 20 * STEP_US)
-    player.seek(0, 0)
-    assert player.position_us == START_US + 10 * STEP_US
-    player.seek(10**18, 0)
-    assert player.position_us == START_US + 20 * STEP_US
+@pytest.mark.parametrize(("to_us", "number"), [(0, 10), (10**18, 20)])
+def test_seek_is_clamped_to_the_range(clip: Player, to_us: int, number: int) -> None:
+    clip.seek(to_us, 0)
+    assert clip.position_us == START_US + number * STEP_US
 
 
 @pytest.mark.parametrize(("position", "shown"), [(0, {0, 1}), (2, {0, 1}), (50, {48, 49})])
@@ -129,9 +133,8 @@ def test_state_follows_the_played_frames() -> None:
     assert set(player.held()) <= set(FRAMES[50:61])
 
 
-def test_range_begins_with_its_state_messages() -> None:
-    player = make_player(begin_us=START_US + 10 * STEP_US, end_us=START_US + 20 * STEP_US)
-    frames = [frame for _, frame in play_to_end(player)]
+def test_range_begins_with_its_state_messages(clip: Player) -> None:
+    frames = [frame for _, frame in play_to_end(clip)]
     assert sorted(frames[:2]) == sorted([FRAMES[7], FRAMES[9]])
     assert frames[2:] == FRAMES[10:21]
 

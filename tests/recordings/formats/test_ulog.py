@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gateway.estimation.record import FloatArray
 from gateway.recordings.formats.ulog import Px4Log
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
 
@@ -81,19 +82,20 @@ def test_chosen_sensor_that_the_log_lacks_is_reported() -> None:
     assert Px4Log(found, 1, {"GPS": 2}).chosen == ["has no GPS 3"]
 
 
-@pytest.mark.parametrize("field", ["q[3]", "timestamp"])
-def test_topic_without_its_fields_is_left_out(field: str) -> None:
+@pytest.mark.parametrize(
+    ("field", "values"),
+    [("q[3]", None), ("timestamp", None), ("timestamp", np.linspace(0.0, 1.0, ROWS))],
+    ids=["no field", "no time", "fractional times"],
+)
+def test_topic_without_its_fields_is_left_out(field: str, values: FloatArray | None) -> None:
     found = topics()
-    del found["vehicle_attitude", 0][field]
+    columns = found["vehicle_attitude", 0]
+    del columns[field]
+    if values is not None:
+        columns[field] = values
     flight = Px4Log(found, 1)
     assert flight.left_out == ["vehicle_attitude"]
     assert len(list(flight.records())) == ROWS
-
-
-def test_topic_with_fractional_times_is_left_out() -> None:
-    found = topics()
-    found["vehicle_attitude", 0]["timestamp"] = np.linspace(0.0, 1.0, ROWS)
-    assert Px4Log(found, 1).left_out == ["vehicle_attitude"]
 
 
 @pytest.mark.parametrize("off_us", [86_400_000_000, 31_536_000_000_000, -4_000_000, 1 << 60])
@@ -116,11 +118,10 @@ def test_velocity_is_used_with_a_fix_and_where_it_is_valid(
     fix_type: int, valid: int, known: bool
 ) -> None:
     found = topics()
-    times = {"timestamp": found["sensor_combined", 0]["timestamp"][:1]}
+    time_us = found["sensor_combined", 0]["timestamp"][0]
     numbers = {"fix_type": fix_type, "vel_ned_valid": valid, "lat": 470000000, "lon": 80000000}
-    speeds = dict.fromkeys(("vel_n_m_s", "vel_e_m_s", "vel_d_m_s"), np.full(1, 1.5))
-    found["vehicle_gps_position", 0] = (
-        times | {name: np.array([number]) for name, number in numbers.items()} | speeds
-    )
+    speeds = dict.fromkeys(("vel_n_m_s", "vel_e_m_s", "vel_d_m_s"), 1.5)
+    columns = {"timestamp": time_us} | numbers | speeds
+    found[GPS, 0] = {name: np.array([value]) for name, value in columns.items()}
     (fix,) = (record for record in Px4Log(found, 1).records() if isinstance(record, GpsFix))
     assert (fix.vel_n_mps == (1.5, 1.5, 1.5)) is known
