@@ -29,9 +29,8 @@ def test_lost_and_late_samples_are_measured() -> None:
     node_time_us = 10_000 * np.arange(len(flight.time_us))
     node_time_us[100:] += 20_000
     late_us = 1000 * (np.arange(len(flight.time_us)) % 2)
-    (row,) = loss_table(with_imu(flight, time_us=node_time_us + late_us), node_time_us).to_dict(
-        "records"
-    )
+    late = with_imu(flight, time_us=node_time_us + late_us)
+    (row,) = loss_table(late, node_time_us).to_dict("records")
     assert (row["nominal interval, ms"], row["lost"]) == (10.0, 2)
     assert row["longest gap, ms"] == pytest.approx(30.0, abs=1.01)
     assert row["jitter of gateway time, ms RMS"] == pytest.approx(1.0)
@@ -141,6 +140,11 @@ def folder(page: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def html(folder: Path) -> str:
+    return (folder / "index.html").read_text(encoding="utf-8")
+
+
 class Tags(HTMLParser):
     """Every tag with its attributes, and whether tags close in order."""
 
@@ -161,36 +165,33 @@ class Tags(HTMLParser):
         self.seen.append((tag, dict(attrs)))
 
 
-def test_page_is_well_formed_without_scripts_or_remote_assets(folder: Path) -> None:
-    text = (folder / "index.html").read_text(encoding="utf-8")
+def test_page_is_well_formed_without_scripts_or_remote_assets(folder: Path, html: str) -> None:
     tags = Tags()
-    tags.feed(text)
+    tags.feed(html)
     assert tags.open == []
     for _, attributes in tags.seen:
         for name in ("src", "href", "xlink:href"):
             target = attributes.get(name) or "#"
             is_local = "/" not in target and (folder / target).is_file()
             assert target.startswith(("#", "data:")) or is_local
-    assert "@import" not in text
-    assert "<script" not in text
+    assert "@import" not in html
+    assert "<script" not in html
 
 
-def test_figures_take_colours_from_page_theme(folder: Path) -> None:
-    text = (folder / "index.html").read_text(encoding="utf-8")
-    figures = "".join(re.findall(r"<svg.*?</svg>", text, flags=re.DOTALL))
+def test_figures_take_colours_from_page_theme(html: str) -> None:
+    figures = "".join(re.findall(r"<svg.*?</svg>", html, flags=re.DOTALL))
     assert not [colour for colour in CSS_NAMES if colour in figures]
     for name in CSS_NAMES.values():
-        assert len(re.findall(rf"--{name}: #", text)) == 2
+        assert len(re.findall(rf"--{name}: #", html)) == 2
 
 
 def test_every_figure_is_drawn_at_phone_width(report: Report, page: Report) -> None:
     names = {picture.name for section in report.sections for picture in section.pictures}
     assert {"fig07_yaw", "fig08_quaternion", "fig09_acceleration_x", "table1_heat_map"} <= names
-    for section in report.sections:
-        if section not in page.sections:
-            for picture in section.pictures:
-                with style.styled():
-                    picture.draw(style.NARROW_IN).draw_without_rendering()
+    others = [section for section in report.sections if section not in page.sections]
+    for picture in (picture for section in others for picture in section.pictures):
+        with style.styled():
+            picture.draw(style.NARROW_IN).draw_without_rendering()
 
 
 def test_every_figure_and_table_is_written_to_a_file(page: Report, folder: Path) -> None:
@@ -202,17 +203,15 @@ def test_every_figure_and_table_is_written_to_a_file(page: Report, folder: Path)
     assert len(pd.read_csv(folder / "table1.csv")) == 9
 
 
-def test_every_navigation_link_has_its_section(folder: Path) -> None:
-    text = (folder / "index.html").read_text(encoding="utf-8")
-    links = re.findall(r'<li><a href="#([^"]+)">', text)
+def test_every_navigation_link_has_its_section(html: str) -> None:
+    links = re.findall(r'<li><a href="#([^"]+)">', html)
     assert links
-    assert set(links) == set(re.findall(r'<section id="([^"]+)">', text))
+    assert set(links) == set(re.findall(r'<section id="([^"]+)">', html))
 
 
 def test_numbers_are_rounded_and_nan_is_a_dash() -> None:
-    table = ReportTable(
-        "t", pd.DataFrame({"a": [1.23456, float("nan")], "b": ["x", "y"]}), "", digits=1
-    )
+    frame = pd.DataFrame({"a": [1.23456, float("nan")], "b": ["x", "y"]})
+    table = ReportTable("t", frame, "", digits=1)
     assert table.rows() == [["1.2", "x"], ["—", "y"]]
     assert [table.is_text(0), table.is_text(1)] == [False, True]
 

@@ -2,7 +2,7 @@
 
 import asyncio
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -49,11 +49,8 @@ def tlog(making: Making) -> Iterator[FusedTlog]:
 def test_frames_are_made_on_demand(making: Making, tlog: FusedTlog) -> None:
     assert making.made <= 2 * PIECE
     track = Track(tlog)
-    assert (track.first_us, track.last_us, tlog.index.senders.origins) == (
-        START_US,
-        END_US,
-        {0x101},
-    )
+    assert (track.first_us, track.last_us) == (START_US, END_US)
+    assert tlog.index.senders.origins == {0x101}
     for record in RECORDS[:100]:
         assert track.peek_us() == record.time_us
         assert track.take() == record.frame
@@ -84,11 +81,7 @@ async def test_playback_continues_until_a_seek_is_ready(
     making: Making, tlog: FusedTlog, clock: ManualClock
 ) -> None:
     frames: list[bytes] = []
-
-    def emit(new: Iterable[bytes]) -> None:
-        frames.extend(new)
-
-    edge = PlayerEdge(Player([Track(tlog)], clock()), emit, clock)
+    edge = PlayerEdge(Player([Track(tlog)], clock()), frames.extend, clock)
     edge.start()
     edge.seek("10")
     assert edge.status().state == "seeking"
@@ -105,31 +98,29 @@ async def test_playback_continues_until_a_seek_is_ready(
     edge.close()
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+FULL = Path("/dev/full")
+needs_full_disk = pytest.mark.skipif(not FULL.exists(), reason="needs a disk that is always full")
+
+
+@needs_full_disk
 def test_full_disk_ends_the_playback_with_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: Path("/dev/full").open("w+b"))  # noqa: SIM115
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: FULL.open("w+b"))
     file = FusedTlog(iter(RECORDS))
     assert file.prepare(RECORDS[-1].time_us)
     assert "The rest cannot be played" in caplog.text
     file.close()
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+@needs_full_disk
 def test_full_disk_of_a_copy_is_reported_with_its_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.bin"
-    monkeypatch.setattr(
-        recording_streams,
-        "TemporaryFile",
-        lambda **_: Path("/dev/full").open("wb"),  # noqa: SIM115
-    )
-    with (
-        pytest.raises(OSError, match=f"No space left on device for a copy of {path}") as caught,
-        temporary_copy(path, [b"1"]),
-    ):
+    monkeypatch.setattr(recording_streams, "TemporaryFile", lambda **_: FULL.open("wb"))
+    text = f"No space left on device for a copy of {path}"
+    with pytest.raises(OSError, match=text) as caught, temporary_copy(path, [b"1"]):
         pass
     assert caught.value.filename == tempfile.gettempdir()
 

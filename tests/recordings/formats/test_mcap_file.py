@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.summary import Summary
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import rotate
@@ -35,6 +36,13 @@ def messages_of(path: Path) -> list[Message]:
         ]
 
 
+def summary_of(path: Path) -> Summary:
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary
+
+
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a simulated flight, out of its log, as MCAP."""
@@ -57,9 +65,7 @@ def of(shown: list[Message], topic: str) -> Iterator[tuple[float, dict[str, Any]
 
 
 def test_every_message_has_the_fields_of_its_schema(flight: Path, shown: list[Message]) -> None:
-    with flight.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
+    summary = summary_of(flight)
     schemas = {s.name: json.loads(s.data) for s in summary.schemas.values()}
     assert {s.encoding for s in summary.schemas.values()} == {"jsonschema"}
     assert {c.message_encoding for c in summary.channels.values()} == {"json"}
@@ -109,9 +115,8 @@ def test_state_matches_the_truth_in_degrees(shown: list[Message]) -> None:
     states = [(t, s) for t, s in of(shown, "/vehicle_7/state") if t > 30]
     truth = flown.simulated().trajectory.truth_at(np.array([t for t, _ in states]))
     speeds = np.hypot(truth.vel_n_mps[:, 0], truth.vel_n_mps[:, 1])
-    assert (
-        np.median([abs(s["speed_mps"] - v) for (_, s), v in zip(states, speeds, strict=True)]) < 1
-    )
+    errors = np.array([s["speed_mps"] for _, s in states]) - speeds
+    assert np.median(np.abs(errors)) < 1
     assert max(s["height_m"] for _, s in states) > 5
     assert all(0 <= s["heading_deg"] < 360 for _, s in states)
 
@@ -162,11 +167,8 @@ def paths_of(value: Any, key: str = "") -> Iterator[str]:
 
 
 def test_layout_names_topics_of_the_file(flight: Path) -> None:
-    text = (ROOT / "config" / "foxglove-layout.json").read_text()
-    layout = json.loads(text)
-    with flight.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
+    layout = json.loads((ROOT / "config" / "foxglove-layout.json").read_text())
+    summary = summary_of(flight)
     fields = {
         # The layout is for vehicle 1; the flight's is 7.
         re.sub("/7/", "/1/", channel.topic.replace("_7", "_1")): json.loads(
@@ -180,9 +182,8 @@ def test_layout_names_topics_of_the_file(flight: Path) -> None:
         topic, _, field = path.partition(".")
         assert topic in fields, path
         assert not field or field in fields[topic], path
-    panels = set(
-        re.findall(r'"((?:3D|map|Gauge|Plot|RosOut)![a-z]+)"', json.dumps(layout["layout"]))
-    )
+    kinds = r'"((?:3D|map|Gauge|Plot|RosOut)![a-z]+)"'
+    panels = set(re.findall(kinds, json.dumps(layout["layout"])))
     assert panels == set(layout["configById"])
     assert all("foxglovePanelTitle" in panel for panel in layout["configById"].values())
     assert {panel.split("!")[0] for panel in panels} == {"3D", "map", "Gauge", "Plot", "RosOut"}

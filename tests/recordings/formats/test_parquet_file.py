@@ -28,8 +28,7 @@ def table(tmp_path: Path, rng: np.random.Generator) -> Path:
     text = fly(settings, make_flight(rng, 12))[0].decode()
     text = text.replace('"unix_us_at_zero":null', f'"unix_us_at_zero":{START_US}')
     lines = text.splitlines(keepends=True)
-    lines.insert(300, encode_line(header_for(settings, 1)))
-    lines.insert(300, encode_line(TableNote(123, "over the wood")))
+    lines[300:300] = map(encode_line, (TableNote(123, "over the wood"), header_for(settings, 1)))
     lines.append(encode_line(TableNote(456, "landed")))
     path = tmp_path / "flight.csv"
     path.write_text("".join(lines))

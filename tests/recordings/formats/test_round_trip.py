@@ -29,10 +29,11 @@ from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_table import aircraft_of, header_for
 from gateway.recordings.table import TableNote, encode_line
 from gateway.recordings.tlog import TlogRecord
-from gateway.records import NodeId, NodeStatus
+from gateway.records import NodeId
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 from tests.kit.recordings import START_US, make_tlog
+from tests.kit.records import status
 from tests.recordings.flights import OPTIONS, fly, make_flight
 from tests.recordings.formats import flown
 
@@ -49,11 +50,8 @@ def table() -> bytes:
     text = fly(AIRCRAFT, make_flight(np.random.default_rng(1), 12))[0].decode()
     text = text.replace('"unix_us_at_zero":null', f'"unix_us_at_zero":{START_US}')
     lines = text.splitlines(keepends=True)
-    lines.insert(300, encode_line(header_for(AIRCRAFT, 1)))
-    lines.insert(300, encode_line(TableNote(123, "over the wood")))
-    node = NodeStatus(
-        9, NodeId(1, 0), 8, (1, 2), 0, 3, 0, 0, 1, 2, 900, 100, 3300, chips=("BMP280",)
-    )
+    lines[300:300] = map(encode_line, (TableNote(123, "over the wood"), header_for(AIRCRAFT, 1)))
+    node = status(NodeId(1, 0), radio_failed=1, chips=("BMP280",))
     lines.insert(200, encode_line(node))
     lines.append(encode_line(TableNote(456, "landed")))
     return "".join(lines).encode()
@@ -141,6 +139,13 @@ def coordinates(data: bytes) -> int:
     return sum(len(s["coordinates"]) for s in shapes if s["type"] == "LineString")
 
 
+POINTS: dict[str, Callable[[bytes], int]] = {
+    ".kml": lambda data: tagged(data, "coord"),
+    ".gpx": lambda data: tagged(data, "trkpt"),
+    ".geojson": coordinates,
+}
+
+
 def of_mcap(data: bytes) -> list[tuple[int, str]]:
     """List the times and topics of the MAVLink messages."""
     messages = make_reader(io.BytesIO(data)).iter_messages()
@@ -192,19 +197,9 @@ def same_messages(source: Path, data: bytes, out: Path) -> None:
     assert of_mcap(data) == of_frames(frames_of(source))
 
 
-@checks(".kml")
-def same_kml_points(source: Path, data: bytes, out: Path) -> None:
-    assert tagged(data, "coord") == points_of(source) > 20
-
-
-@checks(".gpx")
-def same_gpx_points(source: Path, data: bytes, out: Path) -> None:
-    assert tagged(data, "trkpt") == points_of(source) > 20
-
-
-@checks(".geojson")
-def same_geojson_points(source: Path, data: bytes, out: Path) -> None:
-    assert coordinates(data) == points_of(source) > 20
+@checks(*POINTS)
+def same_points(source: Path, data: bytes, out: Path) -> None:
+    assert POINTS[out.suffix](data) == points_of(source) > 20
 
 
 def test_every_writer_has_a_check() -> None:
