@@ -6,10 +6,10 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.play import Track
+from gateway.recordings.recorded_table import Line
 from gateway.recordings.senders import Senders
-from gateway.recordings.table import TableHeader, encode_head
+from gateway.recordings.table import TableHeader, encode_head, encode_line
 from gateway.recordings.tlog import Batch, TlogRecord, TlogScanner, encode_record
 from gateway.recordings.tlog_index import TlogIndex
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
@@ -60,8 +60,8 @@ def write_tlog(path: Path, records: Iterable[TlogRecord]) -> Path:
     return path
 
 
-def write_table(path: Path, header: TableHeader, rows: Iterable[TableRow]) -> Path:
-    path.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
+def write_table(path: Path, header: TableHeader, lines: Iterable[Line]) -> Path:
+    path.write_text(encode_head(header) + "".join(map(encode_line, lines)))
     return path
 
 

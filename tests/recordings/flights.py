@@ -126,9 +126,8 @@ def fly_from_the_middle(
             if isinstance(action, FusedSample | BaroRaw | GpsFix):
                 rows += builder.add(action)
     assert state is not None
-    text = encode_head(header_for(settings, 1)) + encode_line(state)
-    text += "".join(map(row_to_line, rows))
-    found, *again = TableReader().feed(text.encode(), final=True)
+    lines = [encode_head(header_for(settings, 1)), *map(encode_line, [state, *rows])]
+    found, *again = TableReader().feed("".join(lines).encode(), final=True)
     assert isinstance(found, FusionState)
     assert repr(again) == repr(rows)
     return settings, found, rows

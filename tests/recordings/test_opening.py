@@ -10,11 +10,9 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
 from gateway.recordings.answers import VehicleAnswers
-from gateway.recordings.columns import row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
 from gateway.recordings.recorded_table import header_for
-from gateway.recordings.table import encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord
 from tests.kit.mavlink import STATION, Sender, read_back
 from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, write_table, write_tlog
@@ -91,9 +89,7 @@ def test_settings_changed_in_flight_are_answered_from_their_time(
     changed = header_for(msgspec.structs.replace(then, estimation=estimation), 1)
     header, rows = read(fly(then, make_flight(rng, 6))[0])
     half = len(rows) // 2
-    path = tmp_path / "a_01_v1.csv"
-    lines = [*map(row_to_line, rows[:half]), encode_line(changed), *map(row_to_line, rows[half:])]
-    path.write_text(encode_head(header) + "".join(lines))
+    path = write_table(tmp_path / "a_01_v1.csv", header, [*rows[:half], changed, *rows[half:]])
     with ExitStack() as opened:
         (flight,) = lay_out(open_flights([path], OPTIONS, opened), with_commands=False)
         (track,) = flight.tracks
@@ -121,8 +117,6 @@ def test_file_without_frames_is_refused(tmp_path: Path) -> None:
 
 def test_vehicles_of_a_recording_follow_the_id_of_its_first(tmp_path: Path) -> None:
     both = write_tlog(tmp_path / "both.tlog", [*RECORDS[:50], *make_records(50, system_id=7)])
-    assert [flight.system_ids for flight in laid_out([both, both], 200)] == [
-        {1: 200, 7: 201},
-        {1: 1, 7: 7},
-    ]
+    first, second = laid_out([both, both], 200)
+    assert (first.system_ids, second.system_ids) == ({1: 200, 7: 201}, {1: 1, 7: 7})
     assert laid_out([both], 249)[0].system_ids[7] < 249, "ground stations begin at 250"

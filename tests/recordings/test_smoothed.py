@@ -10,13 +10,13 @@ import pytest
 from gateway.analysis.flight import flight_of_files, fuse_track, smooth_track
 from gateway.estimation.columns import NAV_ALT, NAV_ATTITUDE_STD, NAV_FLAGS, NAV_LAT, NAV_VEL
 from gateway.estimation.record import FloatArray, IntArray
-from gateway.recordings.columns import NAV, has_group, row_to_line
+from gateway.recordings.columns import NAV, has_group
 from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import header_for
-from gateway.recordings.table import encode_head, encode_line
 from gateway.records import NavFlags
 from tests.kit.cli import run
+from tests.kit.recordings import write_table
 from tests.recordings.flights import OPTIONS, fly_from_the_middle
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "take_off.csv.gz"
@@ -70,10 +70,8 @@ def recording_from_the_middle(
     settings, stored, rows = fly_from_the_middle("eskf", rng)
     kept = stored.estimation[: len(stored.estimation) - lost_bytes]
     stored = msgspec.structs.replace(stored, estimation=kept)
-    lines = [encode_head(header_for(settings, 1)), encode_line(stored) if state else ""]
-    path = folder / f"{state}.csv"
-    path.write_text("".join([*lines, *map(row_to_line, rows)]))
-    return path
+    lines = [stored, *rows] if state else rows
+    return write_table(folder / f"{state}.csv", header_for(settings, 1), lines)
 
 
 def test_recording_begun_in_flight_is_smoothed_from_its_stored_state(tmp_path: Path) -> None:
