@@ -59,13 +59,27 @@ def test_range_without_samples_is_refused(
         assert not out.exists()
 
 
-def test_existing_output_is_overwritten_only_with_force(tlog: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out.tlog"
+@pytest.mark.parametrize(
+    "words",
+    ["convert {} -o out.tlog", "fuse {} -o out.csv", "extract {} --params out.param",
+     "diff {} {} --html out.html", "sweep {} --beta 0.1,0.9 -o out.toml", "report {} -o out"],
+)  # fmt: skip
+def test_existing_output_is_overwritten_only_with_force(
+    table: Path, monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    monkeypatch.chdir(table.parent)
+    out = Path(words.split()[-1])
+    if out.suffix == "":
+        out.mkdir()
+        out /= "index.html"
     out.write_text("dear")
-    assert "--force" in run("convert", tlog, "-o", out, code=2)
+    assert "use --force to overwrite" in run(
+        *words.format("flight.csv", "flight.csv").split(), code=2
+    )
     assert out.read_text() == "dear"
-    run("convert", tlog, "-o", out, "--force")
-    assert read_tlog(out) == RECORDS
+    if words.startswith("convert"):
+        run(*words.format("flight.csv").split(), "--force")
+        assert read_tlog(out)
 
 
 def test_interpolated_positions_lie_on_lines_between_fixes(table: Path, tmp_path: Path) -> None:

@@ -36,6 +36,10 @@ def run(log: Path, *arguments: str) -> list[dict[str, str]]:
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
+def yaw_deg(row: dict[str, str]) -> float:
+    return math.degrees(2.0 * math.atan2(float(row["nav_q_z"]), float(row["nav_q_w"])))
+
+
 @pytest.mark.parametrize("estimator", ["paper", "eskf"])
 def test_one_row_per_sample_with_position_and_true_heading(log: Path, estimator: str) -> None:
     rows = run(log, "--estimator", estimator)
@@ -44,18 +48,15 @@ def test_one_row_per_sample_with_position_and_true_heading(log: Path, estimator:
     assert int(last["time_us"]) == 4_990_000
     assert float(last["nav_lat_deg"]) == pytest.approx(47.0, abs=1e-6)
     assert float(last["nav_alt_amsl_m"]) == pytest.approx(500.0, abs=0.5)
-    yaw = 2.0 * math.atan2(float(last["nav_q_z"]), float(last["nav_q_w"]))
-    assert math.degrees(yaw) == pytest.approx(10.0, abs=0.5)
-    known = last["nav_pos_std_north_m"] != ""
-    assert known == (estimator != "paper")
+    assert yaw_deg(last) == pytest.approx(10.0, abs=0.5)
+    assert (last["nav_pos_std_north_m"] == "") == (estimator == "paper")
 
 
 def test_settings_file_overrides_facts_of_the_log(log: Path) -> None:
     config = log.with_name("c.toml")
     config.write_text('[estimation.reference]\ndeclination = "fixed"\ndeclination_deg = -20.0\n')
     last = run(log, "--estimator", "eskf", "--config", str(config))[-1]
-    yaw = 2.0 * math.atan2(float(last["nav_q_z"]), float(last["nav_q_w"]))
-    assert math.degrees(yaw) == pytest.approx(-20.0, abs=0.5)
+    assert yaw_deg(last) == pytest.approx(-20.0, abs=0.5)
 
 
 @pytest.mark.parametrize("force", [[], ["--force"]])
@@ -64,14 +65,6 @@ def test_input_as_output_is_refused(log: Path, force: list[str]) -> None:
     result = invoke("fuse", log, "-o", log, *force, code=2)
     assert "is what the output is made of" in result.output
     assert log.read_bytes() == before
-
-
-def test_existing_output_needs_force(log: Path) -> None:
-    out = log.with_name("out.csv")
-    out.write_text("precious")
-    result = invoke("fuse", log, "-o", out, code=2)
-    assert "use --force to overwrite" in result.output
-    assert out.read_text() == "precious"
 
 
 @pytest.mark.slow

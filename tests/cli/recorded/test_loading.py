@@ -11,11 +11,12 @@ from gateway.config import GatewaySettings
 from gateway.estimation.kernel import FoundLatency
 from gateway.estimation.select import EstimationSettings
 from gateway.recordings import recorded_fusion as log_facts
-from gateway.recordings.columns import TableRow, row_to_line
+from gateway.recordings.columns import TableRow
 from gateway.recordings.files import TABLE, FlightError
 from gateway.recordings.recorded_table import header_for
-from gateway.recordings.table import encode_head
-from gateway.records import ImuCalibrated, ImuFlags, NodeId
+from gateway.records import ImuCalibrated, ImuFlags
+from tests.kit.recordings import write_table
+from tests.kit.records import IMU_NODE
 
 pytestmark = pytest.mark.io
 
@@ -24,14 +25,10 @@ TODAY = GatewaySettings()
 
 
 def recording(path: Path, samples: int) -> Path:
-    lines = [encode_head(header_for(RECORDED, 1))]
-    for time_us in range(10_000, 10_000 * (samples + 1), 10_000):
-        imu = ImuCalibrated(
-            time_us, NodeId(1, 0), (0.0, 0.0, -9.81), (0.0, 0.0, 0.0), None, 20.0, ImuFlags(0)
-        )
-        lines.append(row_to_line(TableRow(time_us, imu=imu)))
-    path.write_text("".join(lines))
-    return path
+    rest = ((0.0, 0.0, -9.81), (0.0, 0.0, 0.0), None, 20.0, ImuFlags(0))
+    times_us = range(10_000, 10_000 * (samples + 1), 10_000)
+    rows = (TableRow(t, imu=ImuCalibrated(t, IMU_NODE, *rest)) for t in times_us)
+    return write_table(path, header_for(RECORDED, 1), rows)
 
 
 def test_recording_is_loaded_with_its_recorded_settings(tmp_path: Path) -> None:
@@ -47,10 +44,8 @@ def test_latency_contradicted_by_the_motion_is_reported(
 ) -> None:
     monkeypatch.setattr(log_facts, "estimate_latency", lambda log: FoundLatency(0.9, 0.01))
     load_flight(recording(tmp_path / "flight.csv", 20), TODAY, read_options(TODAY))
-    assert (
-        "flight.csv: its manoeuvres show a GPS latency of 0.900 ± 0.010 s"
-        in capsys.readouterr().err
-    )
+    remark = "flight.csv: its manoeuvres show a GPS latency of 0.900 ± 0.010 s"
+    assert remark in capsys.readouterr().err
 
 
 def test_recording_of_one_sample_is_refused(tmp_path: Path) -> None:

@@ -1,18 +1,16 @@
 import errno
-from importlib.machinery import ModuleSpec
-from importlib.util import find_spec
+import sys
 from pathlib import Path
 
 import pytest
 
-from gateway import extras
 from gateway.analysis.reporting.page import Report
 from gateway.analysis.reporting.raw_sensors import timing
 from gateway.cli.recorded import report
-from gateway.recordings.columns import row_to_line
-from gateway.recordings.table import TableHeader, encode_head
+from gateway.recordings.table import TableHeader
 from tests.analysis.test_flight import rows
 from tests.kit.cli import invoke
+from tests.kit.recordings import write_table
 
 pytestmark = pytest.mark.io
 
@@ -22,12 +20,11 @@ def test_recording_is_compared_with_other_settings(
 ) -> None:
     """One section stands for all of them, which take ten seconds to draw."""
     monkeypatch.setattr("gateway.analysis.reporting.compose.SECTIONS", (timing,))
-    recording, other = tmp_path / "flight.csv", tmp_path / "other.toml"
-    recording.write_text(encode_head(TableHeader()) + "".join(map(row_to_line, rows(raw=True))))
+    recording = write_table(tmp_path / "flight.csv", TableHeader(), rows(raw=True))
+    other, folder = tmp_path / "other.toml", tmp_path / "out"
     other.write_text('[estimation]\nestimator = "paper"\n')
-    folder = tmp_path / "out"
-    arguments = ["--against-config", str(other), "--reference", str(recording), "-o", str(folder)]
-    invoke("report", recording, *arguments, code=0)
+    words = ("--against-config", other, "--reference", recording, "-o", folder)
+    invoke("report", recording, *words, code=0)
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Flight report: flight.csv" in page
     assert "Comparison" in page
@@ -36,18 +33,14 @@ def test_recording_is_compared_with_other_settings(
 
 
 def test_file_without_rows_is_refused(tmp_path: Path) -> None:
-    empty = tmp_path / "empty.csv"
-    empty.write_text(encode_head(TableHeader()))
+    empty = write_table(tmp_path / "empty.csv", TableHeader(), [])
     result = invoke("report", empty, "-o", tmp_path / "out", code=2)
     assert "contains no row" in result.output
     assert not (tmp_path / "out").exists()
 
 
 def test_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    def without(name: str) -> ModuleSpec | None:
-        return None if name == "jinja2" else find_spec(name)
-
-    monkeypatch.setattr(extras, "find_spec", without)
+    monkeypatch.setitem(sys.modules, "jinja2", None)
     result = invoke("report", code=2)
     assert result.output.startswith("a report needs the extra plot; to install it: ")
     assert result.output.endswith("install 'jinja2>=3.1' 'matplotlib>=3.9'\n")
@@ -66,10 +59,3 @@ def test_full_disk_is_reported_with_its_folder(
     monkeypatch.setattr(report, "load_flight", lambda *_: None)
     result = invoke("report", "-o", tmp_path / "page", code=2)
     assert f"{tmp_path / 'page'}: No space left" in result.output
-
-
-def test_folder_that_is_not_empty_needs_force(tmp_path: Path) -> None:
-    (tmp_path / "index.html").write_text("mine")
-    result = invoke("report", "-o", tmp_path, code=2)
-    assert "use --force to overwrite" in result.output
-    assert (tmp_path / "index.html").read_text() == "mine"

@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 
 from gateway.config import load
-from gateway.recordings.columns import row_to_line
-from gateway.recordings.table import TableHeader, encode_head
+from gateway.recordings.table import TableHeader
 from tests.analysis.test_flight import rows
 from tests.kit.cli import invoke
+from tests.kit.recordings import write_table
 
 pytestmark = pytest.mark.io
 
@@ -19,8 +19,7 @@ pytestmark = pytest.mark.io
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Half a minute of a flight, as the recorder writes it."""
     path = tmp_path_factory.mktemp("flight") / "flight.csv"
-    path.write_text(encode_head(TableHeader()) + "".join(map(row_to_line, rows(raw=False))))
-    return path
+    return write_table(path, TableHeader(), rows(raw=False))
 
 
 def test_best_settings_are_written_as_a_settings_file(recording: Path, tmp_path: Path) -> None:
@@ -34,20 +33,19 @@ def test_best_settings_are_written_as_a_settings_file(recording: Path, tmp_path:
     estimation = load(best).estimation
     assert estimation.estimator == "paper"
     assert estimation.paper.alpha_accel == trials["estimation.paper.alpha_accel"][0]
-    written = tomllib.loads(best.read_text())
-    assert written.keys() == {"estimation"}, "only what was varied, and what that needs"
-    assert written["estimation"].keys() == {"estimator", "paper"}
-    assert written["estimation"]["paper"].keys() == {"alpha_accel", "beta_velocity"}
+    # Only what was varied, and what that needs.
+    [(section, written)] = tomllib.loads(best.read_text()).items()
+    assert (section, written.keys()) == ("estimation", {"estimator", "paper"})
+    assert written["paper"].keys() == {"alpha_accel", "beta_velocity"}
     assert "at rest" not in result.output
 
 
 def test_flight_at_rest_is_reported(tmp_path: Path) -> None:
-    path = tmp_path / "rest.csv"
     resting = [
         replace(row, gps=row.gps and msgspec.structs.replace(row.gps, vel_n_mps=(0.2, 0.1, 0.0)))
         for row in rows(raw=False)
     ]
-    path.write_text(encode_head(TableHeader()) + "".join(map(row_to_line, resting)))
+    path = write_table(tmp_path / "rest.csv", TableHeader(), resting)
     result = invoke("sweep", path, "--alpha", "0.1,0.9", "-o", tmp_path / "best.toml", code=0)
     assert "at rest throughout, at most 0.2 m/s by GPS: nothing can be learned" in result.output
 
@@ -94,17 +92,3 @@ def test_setting_without_effect_is_reported(recording: Path, tmp_path: Path) -> 
 def test_impossible_sweep_is_reported(recording: Path, arguments: list[str], text: str) -> None:
     result = invoke("sweep", recording, *arguments, code=2)
     assert text in result.output
-
-
-def test_missing_file_is_reported(tmp_path: Path) -> None:
-    result = invoke("sweep", tmp_path / "no.csv", "--alpha", "0.1,0.2", code=2)
-    assert "no.csv" in result.output
-
-
-def test_existing_settings_need_force(recording: Path, tmp_path: Path) -> None:
-    best = tmp_path / "best.toml"
-    best.write_text("# mine")
-    arguments = ["--beta", "0.1,0.9", "-o", str(best), "--jobs", "1"]
-    result = invoke("sweep", recording, *arguments, code=2)
-    assert "use --force to overwrite" in result.output
-    assert best.read_text() == "# mine"
