@@ -3,7 +3,7 @@
 import asyncio
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,10 @@ from gateway.recordings.tlog import TlogRecord
 from gateway.records import Outgoing
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_splitter import frame_of
+from tests.kit.hub import Station
 from tests.kit.mavlink import STATION, Sender
-from tests.kit.recordings import START_US, make_tlog
+from tests.kit.process import until
+from tests.kit.recordings import records_of, write_tlog
 from tests.ports import free_port
 from tests.recordings.flights import OPTIONS
 
@@ -37,58 +39,57 @@ LIMIT_S = 60
 def recording(step_us: int = 1) -> list[TlogRecord]:
     """Vehicle 3 sends its parameters, and station 255 arms it."""
     vehicle, station = Sender(3), Sender(255, STATION)
-    said: list[tuple[Any, Any]] = [(vehicle, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))]
-    said += [
-        (vehicle, mavlink.MAVLink_param_value_message(f"P{i}".encode(), i, 9, PARAMETERS, i))
+    beat = mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)
+    parameters = [
+        mavlink.MAVLink_param_value_message(f"P{i}".encode(), i, 9, PARAMETERS, i)
         for i in range(PARAMETERS)
     ]
-    arm = mavlink.MAVLink_command_long_message(3, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
-    said += [(station, arm), (vehicle, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))]
-    records = []
-    for i, (who, message) in enumerate(said):
-        records.append(TlogRecord(START_US + i * step_us, who.pack(message)))
-    return records
+    arm = station.pack(mavlink.MAVLink_command_long_message(3, 1, 400, 0, 1, *[0] * 6))
+    frames = [*map(vehicle.pack, [beat, *parameters]), arm, vehicle.pack(beat)]
+    return records_of(frames, step_us)
 
 
-class Station:
-    """A bare client on the event loop."""
+class PlayedTo(Station):
+    """A station, and the frames that it has received."""
 
     def __init__(self) -> None:
-        self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.sock.bind(("127.0.0.1", 0))
-        self.sock.setblocking(False)
-        self.mav = mavlink.MAVLink(None, 255, 190)
+        super().__init__(None, socket.SOCK_DGRAM, (255, STATION))
         self.frames: list[bytes] = []
-        self.peer: Any = None
 
     @property
     def url(self) -> str:
-        return f"udp:127.0.0.1:{self.sock.getsockname()[1]}"
+        return f"udp:127.0.0.1:{self.port}"
 
     async def until(self, count: int) -> None:
-        loop = asyncio.get_running_loop()
-        async with asyncio.timeout(LIMIT_S):
-            while len(self.frames) < count:
-                frame, self.peer = await loop.sock_recvfrom(self.sock, 2048)
-                self.frames.append(frame)
-
-    def send(self, message: Any) -> None:
-        self.sock.sendto(message.pack(self.mav), self.peer)
+        while len(self.frames) < count:
+            self.frames.append(await self.receive())
 
 
 @pytest.fixture
-def station() -> Iterator[Station]:
-    station = Station()
+def station() -> Iterator[PlayedTo]:
+    station = PlayedTo()
     yield station
-    station.sock.close()
+    station.socket.close()
+
+
+Make = Callable[..., PlayerDaemon]
 
 
 @pytest.fixture
-def opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ExitStack]:
+async def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Make]:
+    """Make players of a recording to some endpoints; they are closed at the end."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    (tmp_path / "a.tlog").write_bytes(make_tlog(recording()))
-    with ExitStack() as stack:
-        yield stack
+    with ExitStack() as opened:
+
+        def make(*urls: str, records: list[TlogRecord] | None = None, **plan: Any) -> PlayerDaemon:
+            path = write_tlog(tmp_path / "a.tlog", records or recording())
+            flights = open_flights([path], OPTIONS, opened)
+            played = lay_out(flights, with_commands=plan.get("with_commands", False))
+            daemon = PlayerDaemon(settings_of(*urls), played, PlayPlan(**plan), ["a.tlog"])
+            opened.callback(daemon.close)
+            return daemon
+
+        yield make
 
 
 def settings_of(*endpoints: str) -> GatewaySettings:
@@ -99,20 +100,11 @@ def settings_of(*endpoints: str) -> GatewaySettings:
     )
 
 
-def make_daemon(
-    folder: Path, opened: ExitStack, settings: GatewaySettings, **plan: Any
-) -> PlayerDaemon:
-    flights = open_flights([folder / "a.tlog"], OPTIONS, opened)
-    played = lay_out(flights, with_commands=plan.get("with_commands", False))
-    return PlayerDaemon(settings, played, PlayPlan(**plan), ["a.tlog"])
-
-
 @pytest.mark.parametrize("with_commands", [False, True])
 async def test_commands_of_stations_are_played_only_on_request(
-    tmp_path: Path, opened: ExitStack, station: Station, with_commands: bool
+    make: Make, station: PlayedTo, with_commands: bool
 ) -> None:
-    daemon = make_daemon(tmp_path, opened, settings_of(station.url), with_commands=with_commands)
-    await daemon.start()
+    await make(station.url, with_commands=with_commands).start()
     wanted = [r.frame for r in recording()]
     if not with_commands:
         # The parameters are an answer; without it the second heartbeat follows the first.
@@ -120,24 +112,15 @@ async def test_commands_of_stations_are_played_only_on_request(
         assert edited is not None
         wanted = [wanted[0], edited.data]
     await station.until(len(wanted))
-    daemon.close()
     assert station.frames == wanted
 
 
-async def test_recorded_high_latency_messages_are_played(
-    tmp_path: Path, opened: ExitStack, station: Station
-) -> None:
+async def test_recorded_high_latency_messages_are_played(make: Make, station: PlayedTo) -> None:
     vehicle = Sender(3)
-    records = [
-        TlogRecord(START_US + i, vehicle.pack(mavlink.MAVLink_high_latency2_message(*[i] * 27)))
-        for i in range(5)
-    ]
-    (tmp_path / "a.tlog").write_bytes(make_tlog(records))
-    daemon = make_daemon(tmp_path, opened, settings_of(station.url))
-    await daemon.start()
-    await station.until(len(records))
-    daemon.close()
-    assert station.frames == [record.frame for record in records]
+    frames = [vehicle.pack(mavlink.MAVLink_high_latency2_message(*[i] * 27)) for i in range(5)]
+    await make(station.url, records=records_of(frames, 1)).start()
+    await station.until(len(frames))
+    assert station.frames == frames
 
 
 @pytest.mark.parametrize(
@@ -150,30 +133,27 @@ async def test_recorded_high_latency_messages_are_played(
         "tcp:drone.example:5760",
     ],
 )
-def test_commands_to_other_machines_need_confirmation(
-    tmp_path: Path, opened: ExitStack, url: str
-) -> None:
-    settings = settings_of("udp:127.0.0.1:14550", "tcp:[::1]:5760", url)
-    assert endpoints_beyond(settings.hub) == [url]
+def test_commands_to_other_machines_need_confirmation(make: Make, url: str) -> None:
+    urls = ("udp:127.0.0.1:14550", "tcp:[::1]:5760", url)
+    assert endpoints_beyond(settings_of(*urls).hub) == [url]
     with pytest.raises(ValueError, match="yes"):
-        make_daemon(tmp_path, opened, settings, with_commands=True)
-    make_daemon(tmp_path, opened, settings, with_commands=True, commands_anywhere=True)
-    make_daemon(tmp_path, opened, settings)
+        make(*urls, with_commands=True)
+    make(*urls, with_commands=True, commands_anywhere=True)
+    make(*urls)
 
 
 async def test_all_parameters_arrive_with_consecutive_sequence_numbers(
-    tmp_path: Path, opened: ExitStack, station: Station
+    make: Make, station: PlayedTo
 ) -> None:
-    daemon = make_daemon(tmp_path, opened, settings_of(station.url))
+    daemon = make(station.url)
     await daemon.start()
     await station.until(2)
     station.frames.clear()
-    station.send(mavlink.MAVLink_param_request_list_message(3, 1))
+    station.send(station.sender.pack(mavlink.MAVLink_param_request_list_message(3, 1)))
     await station.until(PARAMETERS)
     daemon.edge.seek("0")
     daemon.edge.resume()
     await station.until(PARAMETERS + 2)
-    daemon.close()
     answers = [mavlink.MAVLink(None).decode(bytearray(f)) for f in station.frames[:PARAMETERS]]
     assert [(m.param_id, m.param_count) for m in answers] == [
         (f"P{i}", PARAMETERS) for i in range(PARAMETERS)
@@ -182,23 +162,19 @@ async def test_all_parameters_arrive_with_consecutive_sequence_numbers(
     assert [f[4] for f in station.frames[:PARAMETERS]] == list(range(2, 2 + PARAMETERS))
 
 
-async def test_answer_is_sent_after_the_batch_before_it(
-    tmp_path: Path, opened: ExitStack, station: Station
-) -> None:
-    daemon = make_daemon(tmp_path, opened, settings_of(station.url), paused=True)
+async def test_answer_is_sent_after_the_batch_before_it(make: Make, station: PlayedTo) -> None:
+    daemon = make(station.url, paused=True)
     await daemon.start()
     played = [record.frame for record in recording()[: PARAMETERS + 1]]
     daemon._send(played)
     assert daemon._hub.counters().published == SENDS_AT_ONCE < len(played)
     daemon._perform([Outgoing(played[-1], 22, 1)])
     await station.until(len(played) + 1)
-    daemon.close()
     assert [frame[4] for frame in station.frames] == list(range(len(played) + 1))
 
 
-async def test_keys_steer_the_player(tmp_path: Path, opened: ExitStack, station: Station) -> None:
-    (tmp_path / "a.tlog").write_bytes(make_tlog(recording(step_us=10_000_000)))
-    daemon = make_daemon(tmp_path, opened, settings_of(station.url), paused=True)
+async def test_keys_steer_the_player(make: Make, station: PlayedTo) -> None:
+    daemon = make(station.url, records=recording(step_us=10_000_000), paused=True)
     await daemon.start()
     for key, state, speed, loop in (
         ("space", "playing", 1.0, False),
@@ -223,36 +199,29 @@ async def test_keys_steer_the_player(tmp_path: Path, opened: ExitStack, station:
     assert not daemon.ended.is_set()
     steer(daemon, "q")
     assert daemon.ended.is_set()
-    daemon.close()
 
 
 async def test_endpoint_whose_name_is_unknown_ends_the_playback(
-    tmp_path: Path, opened: ExitStack, station: Station
+    make: Make, station: PlayedTo
 ) -> None:
-    daemon = make_daemon(tmp_path, opened, settings_of("udp:nowhere.invalid:14550"))
     with pytest.raises(FlightError, match=r"nothing can be sent to udp:nowhere.invalid:14550: \w"):
-        await daemon.start()
-    daemon.close()
-    daemon = make_daemon(tmp_path, opened, settings_of("udp:nowhere.invalid:1", station.url))
+        await make("udp:nowhere.invalid:14550").start()
+    daemon = make("udp:nowhere.invalid:1", station.url)
     await daemon.start()
     await station.until(1)
     assert len(daemon.troubles()) == 1
-    daemon.close()
 
 
-async def test_port_without_a_listener_is_named_at_once(tmp_path: Path, opened: ExitStack) -> None:
+async def test_port_without_a_listener_is_named_at_once(make: Make) -> None:
     urls = f"udp:127.0.0.1:{free_port()}", f"tcp:127.0.0.1:{free_port()}"
-    daemon = make_daemon(tmp_path, opened, settings_of(*urls))
+    daemon = make(*urls)
     await daemon.start()
-    async with asyncio.timeout(LIMIT_S):
-        while len(daemon.troubles()) < len(urls):
-            await asyncio.sleep(0.01)
+    await until(lambda: len(daemon.troubles()) == len(urls), 0.01)
     assert {trouble.rpartition(": ")[0] for trouble in daemon.troubles()} == {*urls}
-    daemon.close()
 
 
 def test_end_does_not_wait_for_a_name(
-    tmp_path: Path, opened: ExitStack, monkeypatch: pytest.MonkeyPatch, station: Station
+    make: Make, monkeypatch: pytest.MonkeyPatch, station: PlayedTo
 ) -> None:
     resolve, answered, given_up = socket.getaddrinfo, threading.Event(), []
 
@@ -262,7 +231,7 @@ def test_end_does_not_wait_for_a_name(
         return resolve("127.0.0.1", *args, **kwargs)
 
     async def play() -> None:
-        daemon = make_daemon(tmp_path, opened, settings_of("udp:slow.example:1", station.url))
+        daemon = make("udp:slow.example:1", station.url)
         await daemon.start()
         daemon.close()
 
@@ -275,18 +244,14 @@ def test_end_does_not_wait_for_a_name(
 
 @pytest.mark.parametrize("plan", [{"paused": True}, {}], ids=["before the start", "at the end"])
 async def test_idle_player_repeats_the_state_without_gaps_in_the_numbers(
-    tmp_path: Path, opened: ExitStack, station: Station, plan: dict[str, Any]
+    make: Make, station: PlayedTo, plan: dict[str, Any]
 ) -> None:
-    daemon = make_daemon(tmp_path, opened, settings_of(station.url), **plan)
-    await daemon.start()
-    recorded = 0 if plan else 2
-    await station.until(recorded + 3)
-    daemon.close()
+    await make(station.url, **plan).start()
+    await station.until(3 if plan else 5)
     read = [frame_of(frame) for frame in station.frames]
     assert {frame.message_id for frame in read} == {mavlink.MAVLINK_MSG_ID_HEARTBEAT}
-    assert [frame.sequence for frame in read] == [
-        (read[0].sequence + i) % 256 for i in range(len(read))
-    ]
+    first = read[0].sequence
+    assert [frame.sequence for frame in read] == [(first + i) % 256 for i in range(len(read))]
 
 
 @pytest.mark.parametrize(
@@ -298,12 +263,9 @@ async def test_idle_player_repeats_the_state_without_gaps_in_the_numbers(
     ],
 )  # fmt: skip
 def test_vehicles_and_endpoints_are_printed(
-    tmp_path: Path,
-    opened: ExitStack,
-    capsys: pytest.CaptureFixture[str],
-    endpoints: tuple[str, ...],
-    text: str,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], endpoints: tuple[str, ...], text: str
 ) -> None:
-    flights = open_flights([tmp_path / "a.tlog"], OPTIONS, opened)
-    print_plan(["a.tlog"], lay_out(flights, with_commands=False), endpoints)
+    with ExitStack() as opened:
+        flights = open_flights([write_tlog(tmp_path / "a.tlog", recording())], OPTIONS, opened)
+        print_plan(["a.tlog"], lay_out(flights, with_commands=False), endpoints)
     assert " ".join(capsys.readouterr().out.split()) == text
