@@ -8,6 +8,7 @@ import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from gateway.compiled.entry_point import (
     stamp_in,
     stamp_of,
 )
+from gateway.geometry.quaternion import _from_euler_array
 from tools.build_kernels import (
     KERNEL_MODULES,
     MAX_CACHED,
@@ -54,23 +56,37 @@ def allocate(count: int) -> None:
     np.zeros(count)[0] = 1.0
 
 
+Scaling = EntryPoint[[int, int, float]]
+
+
 @pytest.fixture
-def scaling() -> EntryPoint[[int, int, float]]:
+def scaling() -> Scaling:
     """An entry point that the installed library lacks."""
     point = EntryPoint(scale)
     ENTRY_POINTS.remove(point)
     return point
 
 
-def use(function: EntryPoint[[int, int, float]], offset: float = 0.25) -> list[float]:
+@pytest.fixture
+def cached(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the machine code of some sources is kept."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return path_of("1")
+
+
+def path_of(version: str) -> Path:
+    path = cached_object(f"gateway/units.py {version}")
+    assert path is not None
+    return path
+
+
+def use(function: Scaling, offset: float = 0.25) -> list[float]:
     numbers = np.array([1.0, 2.5])
     function(address_of(numbers), 2, offset)
     return numbers.tolist()
 
 
-def test_machine_code_gives_results_of_python(
-    scaling: EntryPoint[[int, int, float]], tmp_path: Path
-) -> None:
+def test_machine_code_gives_results_of_python(scaling: Scaling, tmp_path: Path) -> None:
     build_library(path := tmp_path / "kernels.so", [scaling])
     scaling.load(path)
     assert use(scaling) == use(scale) == [12.25, 30.25]
@@ -79,11 +95,9 @@ def test_machine_code_gives_results_of_python(
 
 
 def test_cached_machine_code_is_not_compiled_again_and_oldest_is_removed(
-    scaling: EntryPoint[[int, int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scaling: Scaling, cached: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    found = [cached_object(f"gateway/units.py 1 {k}") for k in range(MAX_CACHED + 1)]
-    *others, cached = (path for path in found if path is not None)
+    others = [path_of(f"1 {k}") for k in range(MAX_CACHED)]
     cached.parent.mkdir(parents=True)
     for age, path in enumerate(others):
         path.touch()
@@ -109,8 +123,7 @@ def put_folder(cached: Path) -> None:
 
 
 def swap(cached: Path) -> None:
-    other = cached_object("gateway/units.py 2")
-    assert other is not None
+    other = path_of("2")
     cached.unlink()
     build_library(cached.with_suffix(".so"), [], cached=other)
     cached.symlink_to(other)
@@ -118,14 +131,8 @@ def swap(cached: Path) -> None:
 
 @pytest.mark.parametrize("change", [write_as_other, damage, put_folder, swap])
 def test_cached_machine_code_that_is_damaged_or_another_users_is_compiled_again(
-    scaling: EntryPoint[[int, int, float]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    change: Callable[[Path], None],
+    scaling: Scaling, cached: Path, tmp_path: Path, change: Callable[[Path], None]
 ) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    cached = cached_object("gateway/units.py 1")
-    assert cached is not None
     build_library(tmp_path / "first.so", [], cached=cached)
     change(cached)
     build_library(path := tmp_path / "second.so", [scaling], cached=cached)
@@ -134,12 +141,9 @@ def test_cached_machine_code_that_is_damaged_or_another_users_is_compiled_again(
 
 
 def test_link_in_the_place_of_the_cache_gets_no_file(
-    scaling: EntryPoint[[int, int, float]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scaling: Scaling, cached: Path, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    cached, target = cached_object("gateway/units.py 1"), tmp_path / "documents"
-    assert cached is not None
-    target.mkdir()
+    (target := tmp_path / "documents").mkdir()
     cached.parent.parent.mkdir()
     cached.parent.symlink_to(target)
     build_library(tmp_path / "first.so", [scaling], cached=cached)
@@ -147,30 +151,20 @@ def test_link_in_the_place_of_the_cache_gets_no_file(
 
 
 def test_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    def home() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(Path, "home", home)
+    monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError))
     assert cached_object("gateway/units.py 1") is None
 
 
 def test_experiment_compiles_patched_constants_until_its_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    flight = entry_point_of_quaternions()
-    before = from_euler(flight)
+    flight, before = _from_euler_array, from_euler(_from_euler_array)
     monkeypatch.setattr("gateway.geometry.quaternion.from_euler", compiled(lambda *_: (7.0,) * 4))
     assert from_euler(flight) == before
     with compiled_again([flight]):
         assert from_euler(flight) == [7.0] * 4
     assert from_euler(flight) == before
-
-
-def entry_point_of_quaternions() -> EntryPoint[[int, int, int]]:
-    from gateway.geometry.quaternion import _from_euler_array
-
-    return _from_euler_array
 
 
 def from_euler(point: EntryPoint[[int, int, int]]) -> list[float]:
@@ -216,9 +210,7 @@ def test_only_a_change_of_code_makes_a_library_stale(
     assert changed_source(stamp) == (None if current else "kernel.py")
 
 
-def test_library_records_versions_of_its_sources(
-    scaling: EntryPoint[[int, int, float]], tmp_path: Path
-) -> None:
+def test_library_records_versions_of_its_sources(scaling: Scaling, tmp_path: Path) -> None:
     build_library(path := tmp_path / "kernels.so", [scaling], stamp='gateway/units.py 1 2\n"\\\0x')
     assert stamp_in(open_library(path)) == 'gateway/units.py 1 2\n"\\'
     assert changed_source(stamp_in(open_library(path))) == "gateway/units.py"

@@ -14,24 +14,28 @@ from gateway.output import PRIVATE, check_folder, check_output, write_new, writt
 pytestmark = pytest.mark.io
 
 
+def content(folder: Path) -> dict[str, bytes]:
+    """Return the files of a folder, and those in its folders."""
+    return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def test_new_file_has_permissions_of_umask(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
         assert write_new(tmp_path / "a", [b"12", b"3"]) == 3
     finally:
         os.umask(before)
-    assert (tmp_path / "a").read_bytes() == b"123"
+    assert content(tmp_path) == {"a": b"123"}
     assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
-    assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
 def test_existing_file_is_replaced_only_with_overwrite(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"old")
     with pytest.raises(FileExistsError):
         write_new(tmp_path / "a", [b"new"])
-    assert (tmp_path / "a").read_bytes() == b"old"
+    assert content(tmp_path) == {"a": b"old"}
     write_new(tmp_path / "a", [b"new"], overwrite=True)
-    assert (tmp_path / "a").read_bytes() == b"new"
+    assert content(tmp_path) == {"a": b"new"}
 
 
 @pytest.mark.parametrize("rights", [None, PRIVATE])
@@ -85,7 +89,7 @@ def test_interrupted_write_leaves_previous_content(tmp_path: Path, old: bytes | 
         (tmp_path / "a").write_bytes(old)
     with pytest.raises(KeyboardInterrupt):
         write_new(tmp_path / "a", broken(), overwrite=True)
-    assert [path.read_bytes() for path in tmp_path.iterdir()] == ([] if old is None else [old])
+    assert content(tmp_path) == ({} if old is None else {"a": old})
 
 
 def no_links(*_: object) -> None:
@@ -105,7 +109,7 @@ def test_file_created_during_write_is_not_overwritten(
     with pytest.raises(FileExistsError) as refused:
         write_new(tmp_path / "a", slow())
     assert refused.value.filename == str(tmp_path / "a")
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"other"}
+    assert content(tmp_path) == {"a": b"other"}
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -117,7 +121,7 @@ def test_file_appears_only_when_complete(tmp_path: Path, overwrite: bool) -> Non
         yield b"1"
 
     write_new(tmp_path / "a", looking(), overwrite=overwrite)
-    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"1")]
+    assert content(tmp_path) == {"a": b"1"}
 
 
 def test_existing_file_with_the_temporary_name_is_unchanged(tmp_path: Path) -> None:
@@ -140,7 +144,7 @@ def test_folder_that_is_not_empty_needs_overwrite(tmp_path: Path) -> None:
 
 def test_output_check_creates_no_file(tmp_path: Path) -> None:
     check_output(tmp_path / "a")
-    assert not (tmp_path / "a").exists()
+    assert content(tmp_path) == {}
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
@@ -171,17 +175,12 @@ def test_files_of_a_folder_are_replaced_together_or_not_at_all(
     with pytest.raises(OSError, match="full") as caught:
         fill_disk()
     assert caught.value.filename == str(folder / "figure")
-    assert [path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()] == (
-        [b"old"] if is_there else []
-    )
+    assert content(tmp_path) == ({"page": b"old"} if is_there else {})
     assert folder.exists() == is_there
     with written_together(folder) as fresh:
         write_new(fresh / "page", [b"new"])
         write_new(fresh / "figure", [b"1"])
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
-        "page": b"new",
-        "figure": b"1",
-    }
+    assert content(folder) == {"page": b"new", "figure": b"1"}
 
 
 def test_error_of_unwritable_folder_names_requested_folder(
@@ -211,7 +210,7 @@ def test_read_error_names_the_input(tmp_path: Path) -> None:
 def test_long_non_ascii_name_is_written(tmp_path: Path) -> None:
     name = "飛" * 83 + ".csv"
     write_new(tmp_path / name, [b"1"])
-    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert content(tmp_path) == {name: b"1"}
 
 
 def test_missing_or_read_only_folder_is_reported_before_the_work(

@@ -1,6 +1,7 @@
 """The stages joined: bytes in, actions out, several aircraft, a source that comes and goes."""
 
 import math
+from typing import Any
 
 import msgspec
 import pytest
@@ -44,10 +45,10 @@ class Tracker:
 
     def frame(self, time_us: int, payload: payloads.Payload, node: int = 0) -> bytes:
         """Encode a payload; a node's first after another, without which it is not accepted."""
-        first = b"" if self.seq[node] else self._frame(time_us, QUALITY, node)
-        return first + self._frame(time_us, payload, node)
+        first = b"" if self.seq[node] else self.one(time_us, QUALITY, node)
+        return first + self.one(time_us, payload, node)
 
-    def _frame(self, time_us: int, payload: payloads.Payload, node: int) -> bytes:
+    def one(self, time_us: int, payload: payloads.Payload, node: int = 0) -> bytes:
         header = payloads.Header(NodeId(self.vehicle_id, node), self.seq[node], time_us)
         self.seq[node] += 1
         packet = payloads.encode_payload(header, payload)
@@ -84,13 +85,13 @@ def test_one_imu_frame_gives_attitude_at_once(pipeline: Pipeline) -> None:
 def test_aircraft_needs_two_frames_with_agreeing_clocks(pipeline: Pipeline) -> None:
     """Noise may pass the check of a frame; two of it that agree do not come."""
     ghost, true = Tracker(7), Tracker()
-    assert pipeline.feed(ghost._frame(0, LEVEL, 0), 5_000) == Outputs()
+    assert pipeline.feed(ghost.one(0, LEVEL), 5_000) == Outputs()
     pipeline.feed(true.frame(0, LEVEL), 6_000)
     assert list(pipeline.aircraft) == [1]
-    late = ghost._frame(3_000_000_000, LEVEL, 0)
+    late = ghost.one(3_000_000_000, LEVEL)
     assert pipeline.feed(late, 20_000) == Outputs(), "their clocks do not agree"
     assert list(pipeline.aircraft) == [1]
-    out = pipeline.feed(ghost._frame(3_000_010_000, LEVEL, 0), 30_000)
+    out = pipeline.feed(ghost.one(3_000_010_000, LEVEL), 30_000)
     assert sum(isinstance(record, FusedSample) for record in out.records) == 2, "nothing is lost"
     assert sorted(pipeline.aircraft) == [1, 7]
 
@@ -122,17 +123,16 @@ def test_first_message_of_aircraft_is_its_heartbeat(pipeline: Pipeline) -> None:
 
 def test_records_are_returned_in_order_of_fusion(pipeline: Pipeline) -> None:
     tracker = Tracker()
-    records = pipeline.feed(tracker.frame(0, LEVEL), 0).records
-    baro_frame = tracker.frame(5_000, payloads.BaroPayload(10_000_000, 250))
-    records += pipeline.feed(baro_frame, 5_000).records
-    line = tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1)
-    records += pipeline.feed(line, 8_000).records
-    records += pipeline.feed(tracker.frame(10_000, LEVEL), 10_000).records
+    records: list[Any] = []
+    for time_us, line in (
+        (0, tracker.frame(0, LEVEL)),
+        (5_000, tracker.frame(5_000, payloads.BaroPayload(10_000_000, 250))),
+        (8_000, tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1)),
+        (10_000, tracker.frame(10_000, LEVEL)),
+    ):
+        records += pipeline.feed(line, time_us).records
+    assert [type(record) for record in records] == [FusedSample, BaroRaw, GpsFix, FusedSample]
     first, baro, fix, second = records
-    assert isinstance(first, FusedSample)
-    assert isinstance(baro, BaroRaw)
-    assert isinstance(fix, GpsFix)
-    assert isinstance(second, FusedSample)
     assert baro.pressure_pa == 100_000.0
     assert fix.h_acc_m == pytest.approx(1.2)
     assert math.isnan(first.state.lat_deg)
@@ -155,10 +155,8 @@ def test_two_aircraft_are_two_systems_with_their_own_calibration(pipeline: Pipel
 def test_heartbeats_continue_while_receiver_is_disconnected(pipeline: Pipeline) -> None:
     pipeline.feed(Tracker().frame(0, LEVEL), 0)
     pipeline.disconnect("/dev/ttyUSB0")
-    beats = [
-        len(named(pipeline.poll(time_us), "HEARTBEAT")) for time_us in range(0, 10_000_000, 50_000)
-    ]
-    assert 9 <= sum(beats) <= 11
+    times_us = range(0, 10_000_000, 50_000)
+    assert 9 <= sum(len(named(pipeline.poll(t), "HEARTBEAT")) for t in times_us) <= 11
 
 
 def test_loss_of_the_receiver_is_reported(pipeline: Pipeline) -> None:
@@ -166,11 +164,8 @@ def test_loss_of_the_receiver_is_reported(pipeline: Pipeline) -> None:
     pipeline.feed(Tracker().frame(0, LEVEL), 0)
     pipeline.poll(1_000)
     pipeline.disconnect("/dev/ttyUSB0")
-    texts = [
-        message.text
-        for time_us in range(1_000_000, 10_000_000, 100_000)
-        for message in named(pipeline.poll(time_us), "STATUSTEXT")
-    ]
+    times_us = range(1_000_000, 10_000_000, 100_000)
+    texts = [m.text for t in times_us for m in named(pipeline.poll(t), "STATUSTEXT")]
     assert sum("/dev/ttyUSB0" in text for text in texts) == 1
     assert not pipeline.report.connected
 
@@ -217,7 +212,7 @@ def test_signatures_of_all_messages_pass_strict_check() -> None:
         frames = pipeline.feed(tracker.frame(time_us, LEVEL), time_us).frames
         frames += pipeline.poll(time_us).frames
         wanted = 148 + time_us // 10_000
-        ask = mavlink.MAVLink_command_long_message(1, 1, 512, 0, wanted, 0, 0, 0, 0, 0, 0)
+        ask = mavlink.MAVLink_command_long_message(1, 1, 512, 0, wanted, *[0] * 6)
         read = mavlink.MAVLink_param_request_read_message(1, 1, b"", 0)
         for question in (ask, read):
             incoming = Incoming(7, bytes(question.pack(station)), trusted=True)
@@ -251,10 +246,8 @@ def test_other_passphrases_reach_aircraft_heard_and_not_yet_heard(pipeline: Pipe
     def signers(time_us: int) -> dict[int, bool]:
         outs = [pipeline.feed(each.frame(time_us, LEVEL), time_us) for each in trackers.values()]
         frames = [frame_of(sent.frame) for out in outs for sent in out.frames]
-        signed = [
-            pipeline.signer.sequence_and_sign(frame, frame.sequence, time_us) for frame in frames
-        ]
-        return {frame.origin[0]: frame.signed for frame in signed}
+        sign = pipeline.signer.sequence_and_sign
+        return {f.origin[0]: sign(f, f.sequence, time_us).signed for f in frames}
 
     pipeline.feed(trackers[1].frame(0, LEVEL), 0)
     pipeline.sign_by("", {1: "mine", 3: "theirs"}, 1_000_000)
