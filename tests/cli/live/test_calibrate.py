@@ -11,10 +11,12 @@ from gateway.config import load, load_aircraft
 from gateway.recordings.table import TableHeader, encode_head
 from gateway.records import GpsFix, ImuFlags, ImuRaw, NodeId, Vec3
 from gateway.sensing.calibrating import NodeSamples
+from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.batch.season_flights import line_of
 from tests.estimation.samples import fix
 from tests.kit.cli import invoke
+from tests.kit.records import raw_at
 from tools.simulated_flight import fly
 
 pytestmark = pytest.mark.io
@@ -63,23 +65,25 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, link: Link) -> Path:
     return path
 
 
-def run(config: Path, *arguments: str, code: int = 0) -> str:
-    command = ["calibrate", *arguments, "--config", str(config), "--vehicle", "3"]
-    result = invoke(*command, answers="\n" * 40)
-    assert result.exit_code == code, result.output
-    return result.output
+def run(config: Path, *words: str, code: int = 0, answers: int = 40) -> str:
+    words = ("calibrate", *words, "--config", str(config), "--vehicle", "3")
+    return invoke(*words, answers="\n" * answers, code=code).output
+
+
+def saved(config: Path) -> NodeCalibration:
+    return load_aircraft(load(config))[3].calibration
 
 
 def test_steps_are_guided_and_saved_with_residuals(config: Path) -> None:
     output = run(config, "gyro", "accel", "mag")
     assert [f"{step}: done" in output for step in ("gyro", "accel", "mag")] == [True] * 3
     assert "5 of 6 sides are done. Lay the node on one of these and let it go: chips up" in output
-    saved = load_aircraft(load(config))[3].calibration
-    assert saved.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
-    assert saved.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.02)
-    assert saved.mag_hard_iron_ut == pytest.approx((10.0, 10.0, 10.0), abs=0.1)
-    assert 0.0 < saved.gyro_residual_radps < 0.01
-    assert 0.0 < saved.accel_residual_mps2 < 0.05
+    found = saved(config)
+    assert found.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
+    assert found.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.02)
+    assert found.mag_hard_iron_ut == pytest.approx((10.0, 10.0, 10.0), abs=0.1)
+    assert 0.0 < found.gyro_residual_radps < 0.01
+    assert 0.0 < found.accel_residual_mps2 < 0.05
 
 
 def test_steps_are_in_the_order_in_which_they_build_on_each_other(config: Path) -> None:
@@ -95,9 +99,7 @@ def test_rates_are_shown_in_degrees_per_second(config: Path) -> None:
 
 
 def test_missing_port_is_reported_before_the_first_question(tmp_path: Path) -> None:
-    command = ["calibrate", "gyro", "--port", str(tmp_path / "none")]
-    result = invoke(*command, answers="\n")
-    assert result.exit_code == 2
+    result = invoke("calibrate", "gyro", "--port", tmp_path / "none", answers="\n", code=2)
     assert "none: No such file or directory" in result.output
     assert "Lay the aircraft down" not in result.output
 
@@ -109,15 +111,9 @@ def test_dry_run_saves_nothing(config: Path) -> None:
 
 def test_failed_step_is_reported(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def moving(seconds: float) -> NodeSamples:
-        noise = np.random.default_rng(1).normal(0, 5.0, (300, 3))
-        return NodeSamples(
-            np.arange(300) / 100,
-            noise,
-            noise,
-            np.empty(0),
-            np.empty((0, 3)),
-            np.zeros(300, np.bool_),
-        )
+        noise, times_s = np.random.default_rng(1).normal(0, 5.0, (300, 3)), np.arange(300) / 100
+        mag = np.empty(0), np.empty((0, 3))
+        return NodeSamples(times_s, noise, noise, *mag, np.zeros(300, np.bool_))
 
     monkeypatch.setattr(calibrate, "capture_from", lambda serial, vehicle: moving)
     output = run(config, "gyro", code=1)
@@ -129,17 +125,13 @@ def test_interrupt_keeps_the_finished_steps(config: Path, link: Link) -> None:
     link.breaks_at = 4
     output = run(config, "gyro", "accel", "mag", code=1)
     assert "Cancelled (interrupted). Remaining steps: accel, mag." in output
-    saved = load_aircraft(load(config))[3].calibration
-    assert saved.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
-    assert saved.accel_bias_mps2 == (0.0, 0.0, 0.0)
+    assert saved(config).gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
+    assert saved(config).accel_bias_mps2 == (0.0, 0.0, 0.0)
 
 
 def test_end_of_input_keeps_the_finished_steps(config: Path) -> None:
-    command = ["calibrate", "gyro", "mag", "--config", str(config), "--vehicle", "3"]
-    result = invoke(*command, answers="\n")
-    assert result.exit_code == 1, result.output
-    assert "Remaining steps: mag" in result.output
-    assert load_aircraft(load(config))[3].calibration.gyro_residual_radps > 0.0
+    assert "Remaining steps: mag" in run(config, "gyro", "mag", code=1, answers=1)
+    assert saved(config).gyro_residual_radps > 0.0
 
 
 def gyro_bias_of(config: Path, records: Sequence[ImuRaw | GpsFix]) -> Vec3:
@@ -149,7 +141,7 @@ def gyro_bias_of(config: Path, records: Sequence[ImuRaw | GpsFix]) -> Vec3:
     (folder / "flight_01_v3.csv").write_text(head + "".join(map(line_of, records)))
     config.write_text(f'{config.read_text()}[recording]\nfolder = "{folder}"\n')
     assert "gyro: done" in run(config, "gyro", "--log", "flight")
-    return load_aircraft(load(config))[3].calibration.gyro_bias_radps
+    return saved(config).gyro_bias_radps
 
 
 def test_gyroscope_is_calibrated_from_a_recorded_flight(config: Path) -> None:
@@ -168,17 +160,10 @@ def test_steady_turn_is_not_taken_for_rest(config: Path) -> None:
     for time_us in range(0, 80_000_000, 20_000):
         turns = time_us >= 20_000_000
         if time_us % 200_000 == 0:
-            vel = (15.0 if turns else 0.0, 0.0, 0.0)
-            records.append(fix(time_us, vel=vel))
+            records.append(fix(time_us, vel=(15.0 if turns else 0.0, 0.0, 0.0)))
         rates = (np.array([5, -8, 330 if turns else 11]) + rng.normal(0, 1, 3)).round()
-        records.append(make_raw(time_us, rates))
+        x, y, z = map(int, rates)
+        raw = {"accel_raw": (0, 0, 4096), "gyro_raw": (x, y, z), "flags": ImuFlags(0)}
+        records.append(raw_at(time_us, node=NODE, **raw))
     expected = np.radians(np.array([5, -8, 11]) / 32.8)
     assert gyro_bias_of(config, records) == pytest.approx(tuple(expected), abs=1e-4)
-
-
-def make_raw(time_us: int, rates: np.ndarray) -> ImuRaw:
-    x, y, z = map(int, rates)
-    mag, no_flags = (200, 30, -400), ImuFlags(0)
-    return ImuRaw(
-        time_us, NODE, time_us, (0, 0, 4096), (x, y, z), mag, 500, 8, 1000, 1090, no_flags
-    )

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from typer.testing import Result
 
 from gateway.cli.live import calibrate, first_start
 from gateway.clock import GatewayClock
@@ -42,28 +41,26 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(first_start, "GPS_WAIT_S", 0.5)
 
 
-def setup(*words: str) -> Result:
-    return invoke("setup", *words, answers="\n" * 20)
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "gateway.toml"
+    path.write_text(f'aircraft_folder = "{tmp_path}"\n')
+    return path
+
+
+def setup(*words: object, code: int = 0) -> str:
+    return invoke("setup", *words, answers="\n" * 20, code=code).output
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-def test_every_step_passes_on_the_simulated_receiver_and_saves_nothing(tmp_path: Path) -> None:
-    config = tmp_path / "gateway.toml"
-    config.write_text(f'aircraft_folder = "{tmp_path}"\n')
-    done = setup("--simulated", "--config", str(config))
-    assert done.exit_code == 0, done.output
-    for text in (
-        "channel 76",
-        "MPU6050, HMC5883L, BMP180",
-        "gyro: done",
-        "5 of 6 sides are done",
-        "accel: done",
-        "level: done",
-        "mag: done",
-    ):
-        assert text in done.output
-    ending = done.output[done.output.index("5 of 5") :]
+def test_every_step_passes_on_the_simulated_receiver_and_saves_nothing(config: Path) -> None:
+    output = setup("--simulated", "--config", config)
+    for text in ("channel 76", "MPU6050, HMC5883L, BMP180", "5 of 6 sides are done"):
+        assert text in output
+    for step in ("gyro", "accel", "level", "mag"):
+        assert f"{step}: done" in output
+    ending = output[output.index("5 of 5") :]
     assert "not saved: the receiver is simulated" in ending
     assert "Done" in ending
     assert load_aircraft(load(config)) == {}
@@ -71,9 +68,7 @@ def test_every_step_passes_on_the_simulated_receiver_and_saves_nothing(tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-def test_calibrate_command_runs_on_the_simulated_receiver_and_saves_nothing(tmp_path: Path) -> None:
-    config = tmp_path / "gateway.toml"
-    config.write_text(f'aircraft_folder = "{tmp_path}"\n')
+def test_calibrate_command_runs_on_the_simulated_receiver_and_saves_nothing(config: Path) -> None:
     words = ("calibrate", "mounting", "gyro", "--simulated", "--vehicle", "2", "--config", config)
     done = invoke(*words, answers="\n" * 3, code=0)
     assert "mounting: done" in done.output
@@ -84,17 +79,13 @@ def test_calibrate_command_runs_on_the_simulated_receiver_and_saves_nothing(tmp_
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_calibration_of_a_receiver_at_a_port_is_saved(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(first_start, "STEPS", (calibrate.Step.GYRO,))
-    config = tmp_path / "gateway.toml"
-    config.write_text(f'aircraft_folder = "{tmp_path}"\n')
     with calibrate.simulated_receiver(SimulatorSettings(vehicle_id=3)) as (path, _):
-        wrong = setup("--port", path, "--vehicle", "4", "--config", str(config))
-        done = setup("--port", path, "--config", str(config))
-    assert wrong.exit_code == 2
-    assert "nothing is received from vehicle 4, but from 3" in wrong.output
-    assert done.exit_code == 0, done.output
+        wrong = setup("--port", path, "--vehicle", "4", "--config", config, code=2)
+        setup("--port", path, "--config", config)
+    assert "nothing is received from vehicle 4, but from 3" in wrong
     assert load_aircraft(load(config))[3].calibration.gyro_residual_radps > 0.0
 
 
@@ -102,14 +93,9 @@ def test_calibration_of_a_receiver_at_a_port_is_saved(
     ("is_simulated", "last"), [(False, "nothing to save"), (True, "not saved")]
 )
 def test_end_without_a_successful_step_names_what_was_saved(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    is_simulated: bool,
-    last: str,
-) -> None:
-    config = tmp_path / "gateway.toml"
-    config.write_text(f'aircraft_folder = "{tmp_path}"\n')
+    config: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    is_simulated: bool, last: str,
+) -> None:  # fmt: skip
     for name in ("capture_from", "calibrate_each"):
         monkeypatch.setattr(first_start, name, lambda *_: None)
     settings, bench = load(config), Workbench(SimulatorSettings()) if is_simulated else None
@@ -145,13 +131,10 @@ def test_port_that_is_no_receiver_is_named_with_what_to_do(
             assert select.select([port._port], [], [], 60.0)[0], "there before the look begins"
 
     monkeypatch.setattr(SerialPort, "start", start)
-    done = setup("--port", path)
-    assert done.exit_code == 2
-    assert f"{path} {said}" in done.output
-    assert f"mavgate flash --show --port {path}" in done.output
+    output = setup("--port", path, code=2)
+    assert f"{path} {said}" in output
+    assert f"mavgate flash --show --port {path}" in output
 
 
 def test_missing_port_ends_with_what_to_do(tmp_path: Path) -> None:
-    done = setup("--port", str(tmp_path / "none"))
-    assert done.exit_code == 2
-    assert "mavgate flash receiver" in done.output
+    assert "mavgate flash receiver" in setup("--port", tmp_path / "none", code=2)
