@@ -3,8 +3,6 @@
 import ast
 import json
 import os
-import subprocess
-import sys
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +24,7 @@ from gateway.compiled.entry_point import (
     stamp_of,
 )
 from gateway.geometry.quaternion import _from_euler_array
+from tests.kit.process import python
 from tools.build_kernels import (
     KERNEL_MODULES,
     MAX_CACHED,
@@ -228,7 +227,7 @@ def test_error_for_missing_library_names_build_command(
         f"e.LIBRARY = Path({str(path)!r}); sys.argv[1:] = ['demo', '--no-panel'];"
         "from gateway.cli.__main__ import main; main()"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = python("-c", code, check=False)
     assert done.returncode == 2
     [line] = done.stderr.splitlines()
     assert line.startswith(f"{path}: the library of compiled kernels ")
@@ -243,7 +242,7 @@ def test_no_compiler_is_needed_at_run_time() -> None:
         "from gateway.estimation.select import *;"
         "[make_estimator(EstimationSettings(estimator=name)) for name in ESTIMATORS]"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    python("-c", code)
 
 
 def test_entry_points_import_only_build_requirements() -> None:
@@ -251,8 +250,7 @@ def test_entry_points_import_only_build_requirements() -> None:
         f"import json, sys, {', '.join(KERNEL_MODULES)};"
         "print(json.dumps({n: getattr(m, '__file__', None) for n, m in sys.modules.items()}))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
-    files: dict[str, str | None] = json.loads(done.stdout)
+    files: dict[str, str | None] = json.loads(python("-c", code).stdout)
     with (ROOT / "pyproject.toml").open("rb") as file:
         required = tomllib.load(file)["build-system"]["requires"]
     for path in (ROOT / "gateway").rglob("*.py"):

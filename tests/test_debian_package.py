@@ -12,6 +12,7 @@ from gateway.config import aircraft_folder, load
 from gateway.live.control_socket import GROUP, SERVICE_FOLDER
 from gateway.live.serial_port import KNOWN_ADAPTERS
 from tests.conftest import ROOT
+from tests.kit.process import python
 
 pytestmark = [
     pytest.mark.io,
@@ -85,9 +86,7 @@ def test_program_starts_from_its_own_packages(unpacked: Path) -> None:
     program = unpacked / "usr/bin/mavgate"
     where = f"import runpy, sys; sys.argv[:] = [{str(program)!r}, '--version'];"
     where += f"runpy.run_path({str(program)!r}, run_name='__main__')"
-    done = subprocess.run(
-        [sys.executable, "-c", where], capture_output=True, text=True, check=True, cwd=unpacked
-    )
+    done = python("-c", where, cwd=unpacked)
     assert done.stdout.startswith("mavgate ")
     script = program.read_text()
     assert script.startswith("#!/usr/bin/python3\n")
@@ -104,9 +103,7 @@ atexit.register(subprocess.run, [sys.executable, "-c", where])
 sys.argv[:] = [{program!r}, "--version"]
 runpy.run_path({program!r}, run_name="__main__")
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=unpacked
-    )
+    done = python("-c", code, cwd=unpacked)
     assert done.stdout.splitlines()[1].startswith(str(unpacked))
 
 

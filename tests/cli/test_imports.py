@@ -1,10 +1,10 @@
 """What a command may import: to list, to ask and to run must not cost what others need."""
 
 import json
-import subprocess
-import sys
 
 import pytest
+
+from tests.kit.process import python
 
 pytestmark = pytest.mark.io
 
@@ -25,8 +25,7 @@ RUN_MAY_NOT = {
 
 def imported_by(*modules: str) -> set[str]:
     code = f"import json, sys, {', '.join(modules)}; print(json.dumps([*sys.modules]))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
-    return set(json.loads(done.stdout))
+    return set(json.loads(python("-c", code).stdout))
 
 
 @pytest.mark.parametrize("module", ["gateway.cli.app", "gateway.cli.live.clients"])
@@ -63,5 +62,4 @@ def test_recording_summary_imports_neither_settings_nor_stages() -> None:
 def test_list_of_commands_loads_no_extension() -> None:
     code = "from gateway.cli.app import app; app(['--help'], standalone_mode=False)"
     code = f"import sys; {code}; print('gateway.extensions' in sys.modules, 'numpy' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
-    assert done.stdout.splitlines()[-1] == "False False"
+    assert python("-c", code).stdout.splitlines()[-1] == "False False"

@@ -9,6 +9,7 @@ import textwrap
 import pytest
 
 from gateway.cli.__main__ import INTERRUPTED
+from tests.kit.process import python
 
 pytestmark = pytest.mark.io
 
@@ -35,14 +36,9 @@ PROGRAM = """
 
 
 def run(program: str, module: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(program), module],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        check=False,
-    )
+    path = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    words = ("-c", textwrap.dedent(program), module)
+    return python(*words, timeout=240, env=os.environ | path, check=False)
 
 
 @pytest.mark.parametrize("module", ["typer", "gateway.live.daemon"])

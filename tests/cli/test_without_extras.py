@@ -2,13 +2,13 @@
 
 import json
 import subprocess
-import sys
 from typing import Any
 
 import pytest
 
 from gateway.cli.app import COMMANDS, load_command
 from gateway.extras import EXTRAS
+from tests.kit.process import python
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -48,11 +48,9 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("home")
     lines = [*NEEDS, *(leaf for leaf in LEAVES if leaf not in ENDLESS)]
     blocked = [module for modules in EXTRAS.values() for module in modules]
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM.format(blocked=blocked, lines=lines)],
-        capture_output=True, text=True, check=False, cwd=folder, stdin=subprocess.DEVNULL,
-        env={"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder), "PATH": "/usr/bin:/bin"},
-    )  # fmt: skip
+    env = {"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder), "PATH": "/usr/bin:/bin"}
+    program = PROGRAM.format(blocked=blocked, lines=lines)
+    done = python("-c", program, check=False, cwd=folder, stdin=subprocess.DEVNULL, env=env)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout.splitlines()[-1])
 

@@ -33,6 +33,12 @@ async def until(condition: Callable[[], object], pause_s: float = 0.0) -> None:
             await asyncio.sleep(pause_s)
 
 
+def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run Python to its end, with options of `subprocess.run`; by default it must succeed."""
+    plain = {"capture_output": True, "text": True, "check": True}
+    return subprocess.run([sys.executable, *map(str, words)], **plain | options)
+
+
 class Process:
     """A command that runs until it is ended; settings, output and control socket are in `folder`.
 
