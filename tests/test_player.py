@@ -259,7 +259,7 @@ async def test_idle_player_repeats_the_state_without_gaps_in_the_numbers(
     [
         (("udp:127.0.0.1:14550", "tcp-listen:127.0.0.1:5760"),
          "playing a.tlog as vehicle 3 to udp:127.0.0.1:14550, tcp-listen:127.0.0.1:5760"),
-        ((), "playing a.tlog as vehicle 3 to nobody: no endpoint is set"),
+        ((), "playing a.tlog as vehicle 3 to no client: no endpoint is set"),
     ],
 )  # fmt: skip
 def test_vehicles_and_endpoints_are_printed(

@@ -1,20 +1,20 @@
-"""`python -m gateway.cli` is `mavgate`."""
+"""Run `mavgate` by `python -m gateway.cli`."""
 
 import gc
 import os
 import sys
 
 INTERRUPTED = 128 + 2
-"""Exit code of a program that Ctrl-C ended, as in shells."""
+"""Exit code after Ctrl-C, as in shells."""
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C ends it without a message at any time."""
-    # Imports leave hardly any garbage, and collecting it takes a tenth of the start. `load_command`
-    # enables the collector again.
+    """Run the command line; Ctrl-C at any time ends it without a message."""
+    # Imports produce hardly any garbage, and collecting it takes a tenth of the start-up time.
+    # `load_command` enables the collector again.
     gc.disable()
-    # For every Python process started from here, those of multiprocessing included: the current
-    # folder, which may be one of unpacked recordings, must not be on its module path.
+    # For all Python processes started from here, including those of multiprocessing: the current
+    # folder, which may contain unpacked recordings, must not be on their module path.
     os.environ["PYTHONSAFEPATH"] = "1"
     try:
         # Imported here, so that Ctrl-C works during half a second of imports.
@@ -28,7 +28,7 @@ def main() -> None:
 
 
 def _exit_without_hanging_threads() -> None:
-    """Exit here if a thread still waits for Zenoh: Python would wait for it too."""
+    """Exit immediately if a thread still waits for Zenoh, since Python would wait for it too."""
     link = sys.modules.get("gateway.hub.transports.zenoh.session")
     if link is None or link.end_calls():
         return

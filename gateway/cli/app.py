@@ -1,8 +1,8 @@
 """The command `mavgate`: its options, and its commands with their files.
 
-A file is imported when one of its commands is called, as some import much; listing all commands or
-running a small one must not cost that. Summaries and panels are here for the list, and again as the
-first line of the command's docstring in its file.
+A file is imported only when one of its commands is called, since imports are slow: listing all
+commands or running a small one must not cost that. The summaries are here for the list, and again
+in the first line of each command's docstring.
 """
 
 import gc
@@ -49,13 +49,13 @@ MODULES: Final = {
     "recorded.catalogue": ("catalogue",),
     "live.clients": ("status", "clients", "mark", "reload"),
 }
-"""The commands of each module below `gateway.cli`, which its `app` contains."""
+"""Commands by module below `gateway.cli`; the module's `app` contains them."""
 
 HELP: Final = {"help_option_names": ["-h", "--help"]}
 GROUPS: Final = {
     "Fly": {
         "run": "Run the gateway on the receiver's serial port until interrupted.",
-        "demo": "Fly the simulated tracker, over and over, until interrupted.",
+        "demo": "Fly the simulated tracker repeatedly until interrupted.",
         "panel": "Show the aircraft in a browser: instruments, map, link, recordings, calibration, "
         "tuning.",
         "status": "Show the status of the gateway: receiver, nodes, aircraft, clients.",
@@ -64,18 +64,18 @@ GROUPS: Final = {
     },
     "Recordings": {
         "record": "Start, stop, name and delete recordings, and add remarks.",
-        "play": "Play recordings to the ground stations, several at once if you like.",
+        "play": "Play one or several recordings to the ground stations.",
         "seek": "Seek in the running player.",
         "player": "Control the running player.",
-        "info": "Show what recordings hold: duration, vehicles, rates, gaps, distance, damage; "
+        "info": "Show duration, vehicles, rates, gaps, distance and damage of recordings; "
         "or list all.",
         "page": "Make one HTML file of a flight, which opens offline in any browser.",
         "convert": "Convert, trim, join, merge and edit recordings.",
         "diff": "Compare recordings, parameter files or running vehicles: parameters, missions, "
         "texts.",
         "extract": "Extract parameters, missions, texts, subtitles and geotags from a recording.",
-        "recover": "Write the intact part of a damaged recording to a new file, and list what was "
-        "left out.",
+        "recover": "Write the intact part of a damaged recording to a new file, and list the "
+        "damage.",
     },
     "Clients and fleet": {
         "clients": "List, add and remove clients and sources.",
@@ -87,9 +87,9 @@ GROUPS: Final = {
         "fuse": "Re-run the estimator on recordings, and write them with the new states in any "
         "format.",
         "sweep": "Try settings on one flight or many, and write the best as a settings file.",
-        "batch": "Judge every estimator, or try settings, on many recordings at once, here or on "
+        "batch": "Score every estimator, or try settings, on many recordings at once, here or on "
         "a cluster.",
-        "catalogue": "Index all recordings under a folder, and list and search what is in them.",
+        "catalogue": "Index all recordings under a folder, and list and search their flights.",
     },
     "Set-up": {
         "setup": "Guide through the first start: receiver, sensors, radio, GPS, calibration.",
@@ -104,10 +104,10 @@ GROUPS: Final = {
         "source": "Test a tracker that is to be a vehicle.",
     },
 }
-"""The headings of the list, and the summary of each command below it."""
+"""Summaries of the commands, under the headings of the list."""
 COMMANDS: Final = {name: text for below in GROUPS.values() for name, text in below.items()}
 HOISTED: Final = frozenset({"--config", "-c", "--socket"})
-"""Options of `mavgate` itself that may follow the command, too."""
+"""Options of `mavgate` itself that may also follow the command."""
 EPILOG: Final = "`mavgate --help` lists the options of all commands: --config, --socket, --verbose."
 FORMER: Final[dict[str, dict[str, str]]] = {
     "convert": {"--out": "--output"},
@@ -120,7 +120,7 @@ FORMER: Final[dict[str, dict[str, str]]] = {
         for words in ("play", "page", "report", "sweep", "batch report", "batch sweep")
     },
 }
-"""Former names of options, by command; for one release each leads to its present name."""
+"""Present names of renamed options, by command; the former names work for one release."""
 MOVED: Final = {
     "record save": "record rename",
     "record list": "info",
@@ -130,16 +130,16 @@ MOVED: Final = {
     **{f"convert {option}": "fuse" for option in ("--fuse", "--smooth", "--beside", "--position")},
     "convert --fuse-with": "fuse",
 }
-"""Former commands and options, with the commands that do their work now, for one release."""
+"""Replaced commands and options with the commands that replace them, for one release."""
 
 
 SMALL: Final = frozenset({"ports", "flash", "record", *MODULES["live.clients"]})
-"""Commands that mostly ask a gateway: the extensions are loaded if one reads the settings."""
+"""Commands that mostly send requests to a gateway; extensions are loaded only with settings."""
 ISO: Final = "%Y-%m-%d %H:%M:%S"
 
 
 def load_command(name: str) -> Any:
-    """Import the file of a command and create it."""
+    """Import the file of a command, and return the command."""
     if name not in SMALL:
         extend()
     module = next(module for module, names in MODULES.items() if name in names)
@@ -149,14 +149,14 @@ def load_command(name: str) -> Any:
 
 
 def tidied(command: Any, words: str = "") -> Any:
-    """Return a command whose help flows at any width, and names a type only where one is typed.
+    """Return a command whose help is reflowed, with no metavar for flags.
 
-    `words` are those that call it. Its former names lead to the present ones.
+    `words` is the command with its subcommands. Former names are accepted.
     """
     if command.help:
         paragraphs = command.help.split("\n\n")
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
-    # A context that parses nothing, since parsing loads what takes half of the time of `--help`.
+    # A context without parsing, since parsing imports half of what `--help` takes to load.
     for parameter in command.get_params(command.context_class(command, **HELP)):
         if getattr(parameter, "is_flag", False):
             parameter.metavar = ""
@@ -170,7 +170,7 @@ def tidied(command: Any, words: str = "") -> Any:
 
 
 def _present(command: str, words: list[str]) -> list[str]:
-    """Replace former names of options, with a message; a moved one ends the command."""
+    """Replace former names of options, with a message; a replaced command is an error."""
     found = list[str]()
     for at, word in enumerate(words):
         name, equals, value = word.partition("=")
@@ -186,35 +186,35 @@ def _present(command: str, words: list[str]) -> list[str]:
 
 
 def hoisted(words: list[str]) -> list[str]:
-    """Move the options of `mavgate` itself before the command that they follow."""
+    """Move the options of `mavgate` itself from after the command to before it."""
     end = words.index("--") if "--" in words else len(words)
     moved, left, at = list[str](), list[str](), 0
     while at < end:
         name, equals, _ = words[at].partition("=")
         size = 1 if name not in HOISTED or equals else 2
         if at + size > end:
-            return [name]  # Its value is missing, which is the error to show.
+            return [name]  # The value is missing, which will be reported.
         (moved if name in HOISTED else left).extend(words[at : at + size])
         at += size
     return [*moved, *left, *words[end:]]
 
 
 def group_of(name: str) -> str:
-    """Return the heading under which a command is listed."""
+    """Return the heading of a command in the list."""
     return next(group for group, below in GROUPS.items() if name in below)
 
 
 class LazyGroup(TyperGroup):
-    """The commands of `COMMANDS`, each imported when it is called."""
+    """Group of the commands in `COMMANDS`, each of which is imported when it is called."""
 
     _listing = False
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
-        """Return all names, in the order of the table."""
+        """Return all names in the order of the table."""
         return [*COMMANDS]
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command; errors that a user can mend end it with their text."""
+        """Run a command; a user error ends it with its text."""
         with refusing():
             try:
                 return super().invoke(ctx)
@@ -223,11 +223,11 @@ class LazyGroup(TyperGroup):
                 raise
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the options of `mavgate` itself, wherever they are."""
+        """Parse the options of `mavgate` itself, before or after the command."""
         return super().parse_args(ctx, hoisted(args))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command; the error for an unknown name suggests the nearest."""
+        """Find a command; the error for an unknown name suggests the nearest one."""
         self.commands = cast(Any, dict.fromkeys(COMMANDS))
         try:
             return super().resolve_command(ctx, args)
@@ -235,7 +235,7 @@ class LazyGroup(TyperGroup):
             self.commands = {}
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
-        """Return a command; only its summary while a list is made."""
+        """Return a command; only its summary while the list is written."""
         summary = COMMANDS.get(cmd_name)
         if summary is None:
             return None
@@ -307,7 +307,7 @@ def _options(
 
 
 def _settle_home() -> None:
-    """Take the root as the home of a user without one, as of an unknown uid in a container."""
+    """Use / as the home of a user without one, such as an unknown uid in a container."""
     try:
         Path.home()
     except RuntimeError:
@@ -329,12 +329,12 @@ def _begin_logging(*, verbose: bool) -> None:
     handler.addFilter(LogLimit())
     handler.setFormatter(PrintableFormatter(form))
     logging.basicConfig(level=level, handlers=[handler])
-    # It logs each font that it finds.
+    # matplotlib logs each font that it finds.
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
 
 
 class _CurrentStderr:
-    """`sys.stderr` as it is at each moment: a progress bar replaces it, to stay below the lines."""
+    """The present `sys.stderr`: a progress bar replaces it, so that log lines appear above it."""
 
     def write(self, text: str) -> int:
         return sys.stderr.write(text)
@@ -350,14 +350,14 @@ class _CurrentStderr:
 
 
 def _prepare_streams() -> None:
-    """Make sure that what is printed never ends a command, and no file takes a stream's place."""
+    """Ensure that printing cannot fail, and that no file is opened under a stream's descriptor."""
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
-            # It was closed: the next file that is opened would get its number.
+            # The stream was closed: the next file that is opened would get its descriptor.
             setattr(sys, name, Path(os.devnull).open("r+"))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            # Names of files need not be text, and not every terminal has all signs.
+            # File names may not be text, and terminals may lack characters.
             stream.reconfigure(errors="backslashreplace")
 
 

@@ -1,1 +1,1 @@
-"""Firmware images: the settings in them, and writing them to a board with avrdude."""
+"""Settings in firmware images, and writing images to a board with avrdude."""

@@ -1,8 +1,8 @@
-"""Firmware of the boards: the settings in an image, and avrdude, which writes and reads the flash.
+"""Firmware of the boards: settings in an image, and reading and writing flash with avrdude.
 
-The settings block is 46 bytes of the program that begin with the word `mavgate` and end with a
-CRC-16 of all before it, little-endian and packed. `firmware/common/settings_block.h` is the other
-side. Every access to a board resets it: its USB adapter does so whenever a program opens the port.
+The settings block is 46 bytes of the program, little-endian and packed, which begin with the word
+`mavgate` and end with a CRC-16 of all bytes before it. `firmware/common/settings_block.h` is its
+counterpart. Every access resets the board, since opening the port resets it by the USB adapter.
 """
 
 import contextlib
@@ -35,7 +35,7 @@ POWERS_DBM: Final = (-18, -12, -6, 0)
 
 _LAYOUT: Final = struct.Struct("<7s9BH2BI6B2xBIH5B")
 _LAYOUT_1: Final = struct.Struct("<7s9BH2BI6B2x")
-"""Of version 1, before there was a second radio; such a block is read, but no longer written."""
+"""Block of version 1, before there was a second radio; it is read, but no longer written."""
 _CRC: Final = struct.Struct("<H")
 SIZE: Final = _LAYOUT.size + _CRC.size
 PIPES_PER_VEHICLE: Final = 2
@@ -52,30 +52,30 @@ SX1276: Final = (
 )
 _NODE: Final = ("vehicle_id", "node_id", "radio_pipe", "soft_restart")
 IMU_SEND_HZ: Final[dict[Radio, tuple[int, int]]] = {"nrf24": (60, 250), "sx1276": (4, 20)}
-"""Least and most IMU samples per second, by radio."""
+"""Minimum and maximum number of IMU samples per second, by radio."""
 IMAGES: Final = Path(__file__).resolve().parent / "images"
-"""Built by `make firmware`, part of the package."""
+"""Images in the package, which `make firmware` builds."""
 CLOCKS_MHZ: Final = (16, 8)
 CHIP: Final = "atmega328p"
 GET_SYNC: Final = b"\x30\x20"
 IN_SYNC: Final = b"\x14\x10"
-"""STK500 version 1: the request, and the answer of a bootloader."""
+"""Answer of a bootloader to the synchronisation request of STK500 version 1."""
 RESET_PULSE_S: Final = 0.05
 SYNC_TRIES: Final = 12
 SYNC_WAIT_S: Final = 0.1
-"""Optiboot flashes its LED for 0.3 s before it listens, and waits 1 s for a request."""
+"""Timeout of one request; optiboot flashes its LED for 0.3 s, then waits 1 s for a request."""
 AVRDUDE_LIMIT_S: Final = 90.0
-"""For one try, which takes 20 s: after a lost byte avrdude may wait for ever."""
+"""Timeout of one try, which takes 20 s: after a lost byte avrdude may wait for ever."""
 AVRDUDE_TRIES: Final = 3
-"""A board that restarts slowly can miss the first requests."""
+"""Number of tries: a board that restarts slowly can miss the first requests."""
 
 
 class FlashError(Exception):
-    """A board or an image that cannot be used; the text says why, and what to do."""
+    """A board or an image that cannot be used; the text states the reason and the remedy."""
 
 
 class Program(IntEnum):
-    """Which of the three programs an image is."""
+    """The program of an image."""
 
     IMU = 1
     GPS = 2
@@ -83,7 +83,7 @@ class Program(IntEnum):
 
 
 class BoardSettings(Settings, frozen=True):
-    """What differs between users, in the order of the block."""
+    """Settings that differ between users, in the order of the block."""
 
     vehicle_id: Annotated[int, setting("MAVLink system id of the aircraft.", ge=1, le=31)] = 1
     node_id: Annotated[int, setting("Unique within the aircraft.", ge=0, le=7)] = 0
@@ -92,19 +92,19 @@ class BoardSettings(Settings, frozen=True):
         int, setting("2400 MHz plus this; the same on all boards.", "MHz", ge=0, le=125)
     ] = 76
     radio_kbps: Annotated[
-        Literal[250, 1000, 2000], setting("On the air; the same on all boards.", "kbit/s")
+        Literal[250, 1000, 2000], setting("Data rate on air; the same on all boards.", "kbit/s")
     ] = 1000
-    radio_power_dbm: Annotated[Literal[-18, -12, -6, 0], setting("Of the transmitter.", "dBm")] = 0
+    radio_power_dbm: Annotated[Literal[-18, -12, -6, 0], setting("Transmit power.", "dBm")] = 0
     imu_send_hz: Annotated[
         int, setting("IMU samples sent per second; by LoRa at most 20.", "Hz", ge=4, le=250)
     ] = 100
     radio_address: Annotated[
         int, setting("Upper four bytes of every pipe's address.", ge=0, le=0xFFFFFFFF)
     ] = 0xD35AC396
-    imu_raw: Annotated[bool, setting("Means without the node's filters.")] = False
-    accel_range_g: Annotated[Literal[2, 4, 8, 16], setting("Of the accelerometer.", "g")] = 8
+    imu_raw: Annotated[bool, setting("Send averages without the node's filters.")] = False
+    accel_range_g: Annotated[Literal[2, 4, 8, 16], setting("Range of the accelerometer.", "g")] = 8
     gyro_range_dps: Annotated[
-        Literal[250, 500, 1000, 2000], setting("Of the gyroscope.", "deg/s")
+        Literal[250, 500, 1000, 2000], setting("Range of the gyroscope.", "deg/s")
     ] = 1000
     gps_rate_hz: Annotated[int, setting("GPS fixes per second.", "Hz", ge=1, le=10)] = 5
     gps_dynamic_model: Annotated[
@@ -119,15 +119,15 @@ class BoardSettings(Settings, frozen=True):
         setting("Centre of the channel; the same on all boards.", "kHz", ge=433_050, le=928_000),
     ] = 868_300
     lora_bandwidth_khz: Annotated[
-        Literal[125, 250, 500], setting("Of the channel; the same on all boards.", "kHz")
+        Literal[125, 250, 500], setting("Bandwidth of the channel; the same on all boards.", "kHz")
     ] = 250
     lora_spreading: Annotated[
         int, setting("Spreading factor; the same on all boards.", ge=7, le=10)
     ] = 7
     lora_coding: Annotated[int, setting("Coding rate 4/5 to 4/8: 5 to 8.", ge=5, le=8)] = 5
-    lora_power_dbm: Annotated[int, setting("Of the transmitter.", "dBm", ge=2, le=20)] = 14
+    lora_power_dbm: Annotated[int, setting("Transmit power.", "dBm", ge=2, le=20)] = 14
     lora_sync_word: Annotated[
-        int, setting("Of the network; the same on all boards.", ge=0, le=0xFF)
+        int, setting("Sync word of the network; the same on all boards.", ge=0, le=0xFF)
     ] = 0x12
     lora_foreign: Annotated[
         bool, setting("The receiver passes packets of other programs on, as RadioHead's.")
@@ -151,10 +151,10 @@ def used_by(program: Program, radio: Radio) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class SettingsBlock:
-    """A settings block that was found in an image."""
+    """A settings block found in an image."""
 
     offset: int
-    """Its first byte in the image."""
+    """Offset of its first byte in the image."""
     program: Program
     clock_mhz: int
     firmware_version: tuple[int, int]
@@ -162,14 +162,14 @@ class SettingsBlock:
 
 
 def default_pipe(program: Program, vehicle_id: int) -> int:
-    """Return the receiver's pipe of a node: two for each of three vehicles, then shared."""
+    """Return a node's default pipe at the receiver: two for each of three vehicles, then shared."""
     return ((vehicle_id - 1) * PIPES_PER_VEHICLE + (program is Program.GPS)) % PIPES
 
 
 def find_block(image: bytes) -> SettingsBlock:
-    """Find and decode the settings block of a program, or of all that was read from a chip.
+    """Find and decode the settings block in a program, or in a whole flash memory.
 
-    Raises FlashError if there is none, or one that is damaged, of another version or out of range.
+    Raises FlashError if there is none, or it is damaged, of another version or out of range.
     """
     damaged = None
     offset = image.find(MAGIC)
@@ -197,7 +197,7 @@ def _decode(block: bytes, offset: int, layout: struct.Struct) -> SettingsBlock:
     values = layout.unpack(block[: layout.size])
     version, program, clock_mhz, major, minor = values[1:6]
     if version not in (1, VERSION):
-        raise FlashError(f"the settings block has version {version}, this mavgate knows {VERSION}")
+        raise FlashError(f"the settings block has version {version}; this mavgate reads {VERSION}")
     found = dict(zip(BoardSettings.__struct_fields__, values[6:], strict=False))
     try:
         found["radio"] = RADIOS[found.get("radio", 0)]
@@ -209,7 +209,7 @@ def _decode(block: bytes, offset: int, layout: struct.Struct) -> SettingsBlock:
         settings = msgspec.convert(found, BoardSettings)
         kind = Program(program)
     except (IndexError, ValueError) as error:
-        raise FlashError(f"the settings block holds a value out of range: {error}") from (error)
+        raise FlashError(f"the settings block contains a value out of range: {error}") from (error)
     return SettingsBlock(offset, kind, clock_mhz, (major, minor), settings)
 
 
@@ -226,12 +226,12 @@ def _encode(block: SettingsBlock, settings: BoardSettings) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Bootloader:
-    """A kind of bootloader, known by the speed at which it answers."""
+    """A type of bootloader, identified by its bit rate."""
 
     name: str
     baud: int
     leaves_watchdog_on: bool
-    """After a reset by the watchdog it would be reset again for ever."""
+    """Whether a reset by the watchdog would repeat for ever with this bootloader."""
 
 
 BOOTLOADERS: Final = (
@@ -246,13 +246,13 @@ def image_path(program: Program, clock_mhz: int, radio: Radio = "nrf24") -> Path
     path = IMAGES / f"{name}_{clock_mhz}mhz.hex"
     if not path.exists():
         raise FlashError(
-            f"{path} is not there: a checkout has to build the images first, `make firmware`"
+            f"{path} does not exist: in a checkout, build the images first with `make firmware`"
         )
     return path
 
 
 def read_image(path: Path) -> IntelHex:
-    """Read an Intel HEX file; raises FlashError if it cannot be."""
+    """Read an Intel HEX file; raises FlashError if it is invalid."""
     try:
         return IntelHex(str(path))
     except (OSError, HexReaderError, UnicodeDecodeError) as error:
@@ -265,7 +265,7 @@ def block_of(image: IntelHex) -> SettingsBlock:
 
 
 def with_settings(image: IntelHex, settings: BoardSettings) -> bytes:
-    """Return an image as an Intel HEX file, with other settings in it."""
+    """Return an image with other settings, as an Intel HEX file."""
     offset, block = patch(image.tobinstr(start=0), settings)
     image.puts(offset, block)
     text = io.StringIO()
@@ -275,9 +275,9 @@ def with_settings(image: IntelHex, settings: BoardSettings) -> bytes:
 
 @contextlib.contextmanager
 def reserved(device: str) -> Iterator[None]:
-    """Keep a port for this program, which a running gateway respects, and avrdude does not.
+    """Lock a port for this program; a running gateway respects the lock, avrdude does not.
 
-    Raises FlashError if it cannot be opened, or another program has it.
+    Raises FlashError if it cannot be opened, or another program has locked it.
     """
     try:
         file = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -288,7 +288,7 @@ def reserved(device: str) -> Iterator[None]:
         yield
     except BlockingIOError as error:
         raise FlashError(
-            f"{device}: another program has it open; end the gateway that reads it, or name "
+            f"{device}: another program has it open; stop the gateway that reads it, or give "
             "another port with --port"
         ) from error
     finally:
@@ -296,7 +296,7 @@ def reserved(device: str) -> Iterator[None]:
 
 
 def find_bootloader(device: str) -> Bootloader | None:
-    """Reset a board and ask its bootloader, at one speed after the other; None if none answers.
+    """Reset a board and query its bootloader at each bit rate; None if there is no response.
 
     Raises FlashError if the port cannot be opened.
     """
@@ -323,11 +323,11 @@ def _answers(device: str, baud: int) -> bool:
 
 
 def require_bootloader(device: str) -> Bootloader:
-    """Return a board's bootloader; raises FlashError if none answers."""
+    """Return a board's bootloader; raises FlashError if none responds."""
     found = find_bootloader(device)
     if found is None:
         raise FlashError(
-            f"{device}: no bootloader answers. Is it a Nano or Pro Mini with ATmega328P? "
+            f"{device}: no bootloader responds. Is it a Nano or Pro Mini with ATmega328P? "
             "Disconnect the GPS receiver from D0 and D1 while flashing; on a board without "
             "automatic reset, press reset as the command starts. A board without a bootloader "
             "needs an ISP programmer: write the image with --output and avrdude -c usbasp"
@@ -336,7 +336,7 @@ def require_bootloader(device: str) -> Bootloader:
 
 
 def write_flash(device: str, bootloader: Bootloader, image: bytes) -> None:
-    """Write an Intel HEX file and verify it; raises FlashError if avrdude is missing or fails."""
+    """Write an Intel HEX file, and verify it; raises FlashError if avrdude is missing or fails."""
     with tempfile.NamedTemporaryFile(suffix=".hex") as file:
         file.write(image)
         file.flush()
@@ -344,7 +344,7 @@ def write_flash(device: str, bootloader: Bootloader, image: bytes) -> None:
 
 
 def read_flash(device: str, bootloader: Bootloader) -> IntelHex:
-    """Read all of a board's flash; raises FlashError as `write_flash`."""
+    """Read the whole flash memory of a board; raises FlashError as `write_flash`."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "flash.hex"
         _avrdude(device, bootloader, "-U", f"flash:r:{path}:i")

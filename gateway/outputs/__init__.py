@@ -1,7 +1,7 @@
 """Endpoints that are not MAVLink: NMEA 0183, Cursor on Target, MQTT, GDL90, antenna rotators.
 
-They are added as any other package adds a kind of endpoint; see docs/extend.md. The module of a
-kind has its name, and is imported when an endpoint of it is used.
+They are added in the way other packages add kinds of endpoints; see docs/extend.md. Each kind has a
+module of the same name, which is imported when an endpoint of the kind is used.
 """
 
 from functools import partial
@@ -19,7 +19,7 @@ KINDS: Final = {
     "mqtt": ("rate", "vehicle", "topic", "login", "certificate", "key", "authority"),
     "rotator": ("rate", "vehicle", "station", "protocol"),
 }
-"""The options of each kind."""
+"""Options by kind."""
 
 
 def _output_class(kind: str) -> Any:
@@ -36,7 +36,7 @@ def _check(kind: str, endpoint: Endpoint) -> None:
 
 
 def extend() -> None:
-    """Add the kinds that are not there yet."""
+    """Add the kinds that do not exist yet."""
     for kind, options in KINDS.items():
         if kind not in ADDED_KINDS:
             add_endpoint_kind(kind, _make, options, partial(_check, kind))

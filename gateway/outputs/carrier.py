@@ -17,27 +17,27 @@ TLS: Final = "tls"
 NO_MESSAGE: Final = -1
 
 MakeContext = Callable[[], ssl.SSLContext]
-"""Makes the context of TLS, or raises OSError."""
+"""Makes a TLS context; raises OSError if that fails."""
 
 
 def target_of(location: str, kinds: Collection[str]) -> tuple[str, Endpoint]:
-    """Read the carrier and its address from the rest of an output's URL, as `udp:HOST:PORT`.
+    """Parse the carrier and its address in an output's URL, such as `udp:HOST:PORT`.
 
-    Raises ValueError if it is none of `kinds`.
+    Raises ValueError if the carrier is not one of `kinds`.
     """
     word, _, rest = location.partition(":")
     inner = parse_endpoint(f"tcp:{rest}" if word == TLS else location)
     kind = TLS if word == TLS else inner.kind
     if kind not in kinds:
-        raise ValueError(f"{location!r} is not carried by one of {', '.join(sorted(kinds))}")
+        raise ValueError(f"{location!r} has no carrier among {', '.join(sorted(kinds))}")
     return kind, inner
 
 
 class Carrier:
-    """Carry the bytes of an output to all present peers of its target.
+    """Sends the bytes of an output to all present peers of its target.
 
-    It stands between the hub and a transport: the transport's peers are no clients of the hub, and
-    what they send is dropped. `tls` makes the context of TLS.
+    It acts as the hub for a transport: the transport's peers are not clients of the hub, and data
+    received from them is dropped. `tls` makes the TLS context.
     """
 
     def __init__(self, output: Client, kinds: Collection[str], tls: MakeContext) -> None:
@@ -56,7 +56,7 @@ class Carrier:
         self.appear(link)
 
     def __getattr__(self, name: str) -> Any:
-        """Return all else that a transport uses of the hub."""
+        """Return any other attribute of the hub that a transport uses."""
         return getattr(self._output.context, name)
 
     @property
@@ -66,17 +66,17 @@ class Carrier:
 
     @property
     def reason(self) -> str:
-        """Why nothing is sent."""
+        """Reason why nothing is sent."""
         return self.link.reason
 
     def send(self, data: bytes) -> None:
-        """Send to every peer; one that reads too slowly loses whole messages."""
+        """Send to every peer; a peer that reads too slowly loses whole messages."""
         frame = MavFrame(data, b"", NO_MESSAGE, EVERYBODY, EVERYBODY, 0, False)
         for peer in tuple(self._peers.values()):
             peer.transmit(frame)
 
     def tick(self, now_us: int) -> None:
-        """Open the transport if it is not open."""
+        """Open the transport if it is closed."""
         self.link.tick(now_us)
 
     def close(self) -> None:
@@ -84,7 +84,7 @@ class Carrier:
         self.link.close()
 
     def appear(self, client: Client) -> None:
-        """Add a peer; it counts for the output."""
+        """Add a peer, and count it for the output."""
         client.counters = self._output.counters
         self._peers[client.client_id] = client
 
@@ -129,7 +129,7 @@ class TlsClient(TcpClient):
         return self._tls.wrap(frames)
 
     def accept(self, data: bytes, _now_us: int) -> None:
-        """Process received bytes: those of the handshake; all others are dropped."""
+        """Process received bytes: handshake data is used, all other data dropped."""
         assert self._socket is not None
         try:
             _, reply = self._tls.feed(data)
@@ -146,7 +146,7 @@ class TlsClient(TcpClient):
 
 
 def client_context(authority: str, certificate: str, key: str) -> ssl.SSLContext:
-    """Return the context of TLS to a server, with a certificate of our own if one is given.
+    """Return a TLS client context, with our own certificate if one is given.
 
     Raises OSError if a file cannot be read or is invalid.
     """

@@ -1,8 +1,8 @@
-"""Cursor on Target for TAK servers, ATAK and WinTAK: one event per vehicle.
+"""Cursor on Target for TAK servers, ATAK and WinTAK: one event for each vehicle.
 
     cot:udp-multicast:239.2.3.1:6969  cot:udp:HOST:PORT  cot:tcp:HOST:8087  cot:tls:HOST:8089
 
-Only vehicles with a valid position have an event; the last one becomes stale.
+Only vehicles with a valid position produce events; the last event becomes stale.
 
 References
 ----------
@@ -26,7 +26,7 @@ from gateway.units import US_PER_S
 
 HEADER: Final = '<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'
 UNKNOWN: Final = 9_999_999.0
-"""Of a height and of errors, by the specification."""
+"""Value for an unknown height or error, defined by the specification."""
 UNMANNED_PLANE, UNMANNED_ROTOR = "a-f-A-M-F-Q", "a-f-A-M-H-Q"
 ROTORS: Final = frozenset(
     (
@@ -43,15 +43,15 @@ TYPES: Final = {
     mavlink.MAV_TYPE_SURFACE_BOAT: "a-f-S",
     mavlink.MAV_TYPE_SUBMARINE: "a-f-U",
 }
-"""Friendly, by MAV_TYPE; all others are unmanned fixed-wing aircraft."""
+"""CoT types (friendly) by MAV_TYPE; all others are unmanned fixed-wing aircraft."""
 LEAST_STALE_S: Final = 10.0
 STALE_INTERVALS: Final = 3.0
-"""An event is stale after so many intervals without the next, but not sooner than the above."""
+"""Intervals without a new event after which one is stale, but at least the time above."""
 MAX_CALLSIGN: Final = 64
 
 
 class CotOutput(Output):
-    """Events of all vehicles, or of the chosen one."""
+    """Events of all vehicles, or of the selected one."""
 
     carriers = (
         EndpointKind.UDP,
@@ -63,7 +63,7 @@ class CotOutput(Output):
 
     @classmethod
     def check(cls, endpoint: Endpoint) -> None:
-        """Raise ValueError if the endpoint is not understood."""
+        """Raise ValueError if the endpoint is invalid."""
         super().check(endpoint)
         callsign = endpoint.added.get("callsign", "x")
         if not callsign.strip() or not callsign.isprintable() or len(callsign) > MAX_CALLSIGN:
@@ -93,7 +93,7 @@ def event_of(
     unix_us: int,
     stale_s: float,
 ) -> bytes:
-    """Return the event of a position of this civil time, as XML."""
+    """Return the event for a position at a civil time, as XML."""
     report, at = state.fix(), datetime.fromtimestamp(unix_us / US_PER_S, UTC)
     separation_m = report.separation_m if report else math.nan
     accuracies = (report.h_acc_m, report.v_acc_m) if report else (math.nan, math.nan)
@@ -114,7 +114,7 @@ def event_of(
     speed_mps, course_deg = position.groundspeed_mps, state.course_deg(position)
     if math.isfinite(speed_mps):
         track = ElementTree.SubElement(detail, "track", speed=f"{speed_mps:.2f}")
-        # A course is required; that of a vehicle at rest is not known.
+        # A course is required; the course of a vehicle at rest is unknown.
         track.set("course", f"{course_deg if math.isfinite(course_deg) else 0.0:.1f}")
     percent = state.battery()[1]
     if math.isfinite(percent):
@@ -124,7 +124,7 @@ def event_of(
 
 
 def remarks_of(state: NewestState, position: Position) -> str:
-    """Write mode, arming, battery and height in words."""
+    """Describe mode, arming state, battery and height."""
     volts, percent = state.battery()
     figures = (
         (volts, "{:.2f} V"),

@@ -3,7 +3,7 @@
     gdl90:udp:HOST:4000  gdl90:udp-broadcast:192.168.1.255:4000
 
 One vehicle is the ownship, the others are traffic. AHRS is sent at the rate of the endpoint, all
-else once a second. A vehicle without a valid position has no report.
+other messages once a second. There is no report of a vehicle without a valid position.
 
 References
 ----------
@@ -35,20 +35,20 @@ FPM_PER_MPS: Final = 60 * FEET_PER_M
 UNKNOWN_U12, UNKNOWN_CLIMB = 0xFFF, 0x800
 UNKNOWN_ANGLE, UNKNOWN_U16 = 0x7FFF, 0xFFFF
 SELF_ASSIGNED: Final = 1
-"""Type of our addresses; 24 bits, the last eight are the system id."""
+"""Address type of our addresses, which are 24 bits with the system id in the last eight."""
 FIRST_ADDRESS: Final = 0xF00000
 UNMANNED: Final = 14
 """Emitter category of an unmanned aircraft."""
 INTEGRITY: Final = 8
-"""Navigation integrity category of a receiver without monitoring whose accuracy is known."""
+"""Navigation integrity category for a receiver of known accuracy without integrity monitoring."""
 ACCURACIES_M: Final = ((3, 11), (10, 10), (30, 9), (92.6, 8), (185.2, 7), (555.6, 6), (926, 5))
-"""Bounds of the horizontal accuracy, and the categories for better ones; 0 is unknown."""
+"""Limits of the horizontal accuracy in m, and the category for better values; 0 is unknown."""
 PRESSURES: Final = ("SCALED_PRESSURE", "SCALED_PRESSURE2")
 LETTERS: Final = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789 ")
 IDENTIFICATION: Final = (
     bytes((EXTENDED, 0, 1)) + b"\xff" * 8 + b"mavgate\0" + b"mavgate".ljust(16, b"\0") + bytes(4)
 )
-"""Version 1, no serial number, names, and that geometric altitude is above the ellipsoid."""
+"""Version 1, no serial number, names, and geometric altitude relative to the ellipsoid."""
 
 
 class Gdl90Output(Output):
@@ -61,18 +61,18 @@ class Gdl90Output(Output):
 
     @classmethod
     def check(cls, endpoint: Endpoint) -> None:
-        """Raise ValueError if the endpoint is not understood."""
+        """Raise ValueError if the endpoint is invalid."""
         super().check(endpoint)
         callsign = endpoint.added.get("callsign", "X")
         if not 1 <= len(callsign) <= 8 or not set(callsign) <= LETTERS:
             raise ValueError(f"callsign {callsign!r} is not 1 to 8 of A to Z and 0 to 9")
 
     def compose(self, now_us: int) -> Iterable[bytes]:
-        """Return the messages that are due as one datagram."""
+        """Return the messages that are due, as one datagram."""
         own_id = next(iter(self.heard(now_us)), 0)
         own = self.vehicles.states.get(own_id)
         found = [] if own is None else [attitude(own, now_us)]
-        # A quarter of a turn early, since timers are not exact.
+        # A quarter of an interval early, since timers are not exact.
         if now_us - self._reported_us >= US_PER_S - self.interval_s * US_PER_S / 4:
             self._reported_us = now_us
             found += self._reports(own_id, now_us)
@@ -95,15 +95,15 @@ class Gdl90Output(Output):
 
 
 def framed(message: bytes) -> bytes:
-    """Return a message with its checksum, escaped, between flags."""
-    # The specification's checksum is XMODEM, but does not shift the last two bytes out.
+    """Return a message with checksum and escaping, between flag bytes."""
+    # The checksum is XMODEM, except that the last two bytes are not shifted through.
     crc = xmodem(message[:-2]) ^ int.from_bytes(message[-2:], "big")
     body = message + crc.to_bytes(2, "little")
     return FLAG + body.replace(b"\x7d", b"\x7d\x5d").replace(FLAG, b"\x7d\x5e") + FLAG
 
 
 def heartbeat(unix_us: int, *, is_valid: bool) -> bytes:
-    """Return the heartbeat: whether the ownship has a position, and the time of day."""
+    """Return the heartbeat, with validity of the ownship position, and time of day."""
     at = datetime.fromtimestamp(unix_us / US_PER_S, UTC)
     second = at.hour * 3600 + at.minute * 60 + at.second
     status = (0x80 if is_valid else 0) | 0x01, (second >> 16) << 7 | 0x01
@@ -152,7 +152,7 @@ def geometric_altitude(state: NewestState, position: Position) -> bytes | None:
 
 
 def attitude(state: NewestState, now_us: int) -> bytes:
-    """Return roll, pitch, true heading and indicated airspeed, those that are known and new."""
+    """Return roll, pitch, true heading and indicated airspeed, as far as known and recent."""
     is_new = state.age_us(now_us, "ATTITUDE", "ATTITUDE_QUATERNION") <= POSITION_OLD_US
     roll, pitch, _ = to_euler(state.attitude()[0]) if is_new else (math.nan,) * 3
     angles = (

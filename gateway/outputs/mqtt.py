@@ -1,9 +1,9 @@
-"""MQTT: the messages of all systems as JSON, each under a topic of its own.
+"""MQTT: the messages of all systems as JSON, each under its own topic.
 
     mqtt:tcp:HOST:1883  mqtt:tls:HOST:8883
 
-`mavgate/<system>/<MESSAGE>` is `{"header": ..., "message": ...}`, as the WebSocket of the REST API
-sends it. `mavgate/status` is retained: `online`, or `offline` by the last will.
+`mavgate/<system>/<MESSAGE>` contains `{"header": ..., "message": ...}`, as sent by the WebSocket of
+the REST API. `mavgate/status` is retained: `online`, or `offline` by the last will.
 """
 
 import asyncio
@@ -25,9 +25,9 @@ from gateway.wire.mavlink_json import json_from_frame
 from gateway.wire.mavlink_splitter import MavFrame
 
 MAX_WAITING: Final = 500
-"""Messages; while a broker is slow, further ones are dropped."""
+"""Maximum number of queued messages; while a broker is slow, further ones are dropped."""
 MAX_KINDS: Final = 4096
-"""Kinds of message whose rates are limited; more are forged."""
+"""Maximum number of kinds of messages with a rate limit; a greater number is forged."""
 CONNECT_LIMIT_S: Final = 10.0
 GOODBYE_LIMIT_S: Final = 1.0
 DEFAULT_TOPIC: Final = "mavgate"
@@ -41,16 +41,16 @@ class MqttOutput(Output):
     wanted_ids = frozenset()
 
     def __post_init__(self) -> None:
-        """Start without limits."""
+        """Start without rate limits."""
         super().__post_init__()
         self._limits: dict[bytes, RateLimit] = {}
 
     @classmethod
     def check(cls, endpoint: Endpoint) -> None:
-        """Raise ValueError if the endpoint is not understood."""
+        """Raise ValueError if the endpoint is invalid."""
         super().check(endpoint)
         with suppress(ModuleNotFoundError):
-            # While the settings are read: later it would stop the telemetry for a moment.
+            # Imported while the settings are read; later it would delay the telemetry.
             import_module("aiomqtt")
         topic = endpoint.added.get("topic", DEFAULT_TOPIC)
         if not topic.strip("/") or not topic.isprintable() or set(topic) & set("+#$"):
@@ -63,7 +63,7 @@ class MqttOutput(Output):
         self._limits = {}
 
     def transmit(self, frame: MavFrame) -> None:
-        """Publish a message, unless one of its kind was published just before."""
+        """Publish a message, unless the rate limit of its kind is exceeded."""
         if self.vehicle_id not in (0, frame.origin[0]) or self.carrier.state != "open":
             return
         if len(self._limits) >= MAX_KINDS:
@@ -75,7 +75,7 @@ class MqttOutput(Output):
             self.put((f"{self.topic}/{frame.origin[0]}/{name}", data))
 
     def compose(self, now_us: int) -> Iterable[bytes]:  # noqa: ARG002 -- of the base class
-        """Return nothing: messages are published when they come."""
+        """Return nothing: messages are published as they arrive."""
         return ()
 
     def put(self, message: Any) -> None:
@@ -91,7 +91,7 @@ class MqttOutput(Output):
 
 
 class Broker:
-    """A connection to a broker; `tls` makes the context of TLS."""
+    """A connection to a broker; `tls` makes the TLS context."""
 
     state, reason = "connecting", ""
     _retry_us = 0
@@ -104,7 +104,7 @@ class Broker:
         self._waiting: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue(MAX_WAITING)
         self._task: asyncio.Task[None] | None = None
         self.client: Any = None
-        """Of the present or last connection."""
+        """Client of the present or last connection."""
 
     def tick(self, now_us: int) -> None:
         """Connect if there is no connection."""
@@ -113,7 +113,7 @@ class Broker:
             self._task = asyncio.get_running_loop().create_task(self._run())
 
     def send(self, message: tuple[str, bytes]) -> bool:
-        """Queue a topic and its text; return whether there was room."""
+        """Queue a topic and its text; return whether the queue had room."""
         if self._waiting.full():
             return False
         self._waiting.put_nowait(message)
@@ -135,7 +135,7 @@ class Broker:
             self._task = None
 
     async def _connect(self) -> None:
-        # Imported here: it is an extra.
+        # Imported here, as it belongs to an extra.
         import aiomqtt
 
         user, _, password = self._read_login().partition(":")
@@ -157,7 +157,7 @@ class Broker:
                         tasks.create_task(self._publish(client))
                         tasks.create_task(_watch(client))
                 except asyncio.CancelledError:
-                    # The last will does not announce a regular end.
+                    # The broker does not send the last will after a regular disconnection.
                     last = client.publish(self._status, "offline", qos=1, retain=True)
                     await asyncio.wait_for(last, GOODBYE_LIMIT_S)
                     raise

@@ -28,15 +28,15 @@ from gateway.units import US_PER_S
 KNOTS_PER_MPS: Final = 3600 / 1852
 KMH_PER_MPS: Final = 3.6
 MINUTE_PARTS: Final = 10**5
-"""Of a written minute: 2 cm."""
+"""Units per minute in written coordinates; one is 2 cm."""
 QUALITIES: Final = {
     mavlink.GPS_FIX_TYPE_DGPS: (2, "D"),
     mavlink.GPS_FIX_TYPE_RTK_FLOAT: (5, "F"),
     mavlink.GPS_FIX_TYPE_RTK_FIXED: (4, "R"),
 }
-"""Quality of GGA and mode of RMC and VTG by GPS_FIX_TYPE; (1, A) of another fix."""
+"""Quality of GGA, and mode of RMC and VTG, by GPS_FIX_TYPE; (1, A) for other types."""
 ESTIMATED: Final = (6, "E")
-"""Of a position without a fix, as by visual navigation."""
+"""The same for a position without a GPS fix, for example by visual navigation."""
 
 
 def sentence(body: str) -> str:
@@ -59,12 +59,12 @@ class NmeaOutput(Output):
 
     @classmethod
     def check(cls, endpoint: Endpoint) -> None:
-        """Raise ValueError if the endpoint is not understood."""
+        """Raise ValueError if the endpoint is invalid."""
         super().check(endpoint)
         station_of(endpoint)
 
     def compose(self, now_us: int) -> Iterable[bytes]:
-        """Return the sentences of the present moment as one datagram."""
+        """Return the sentences for the present state as one datagram."""
         state = self.chosen(now_us)
         if state is None:
             return []
@@ -81,7 +81,7 @@ class NmeaOutput(Output):
 def bodies(
     state: NewestState, position: Position | None, unix_us: int, now_us: int
 ) -> Iterator[str]:
-    """Yield the sentences of a vehicle, without checksum."""
+    """Yield the sentences for a vehicle, without checksum."""
     at = datetime.fromtimestamp(unix_us / US_PER_S, UTC)
     clock, date = f"{at:%H%M%S}.{at.microsecond // 10_000:02d}", f"{at:%d%m%y}"
     satellites = _written(state.satellites(), "02.0f")
@@ -108,7 +108,7 @@ def bodies(
 
 
 def pointing_body(pointing: Pointing) -> str:
-    """Return the proprietary sentence of an antenna's direction, without checksum."""
+    """Return the proprietary sentence with an antenna's direction, without checksum."""
     return (
         f"PMAVG,POINT,{pointing.azimuth_deg:.2f},T,{pointing.elevation_deg:.2f},"
         f"{pointing.distance_m:.0f},M"
@@ -127,7 +127,7 @@ def _written(value: float, form: str) -> str:
 
 
 def _angle(angle_deg: float, digits: int, signs: str) -> str:
-    """Write degrees and minutes, and the hemisphere."""
+    """Format degrees and minutes, and the hemisphere."""
     degrees, parts = divmod(round(abs(angle_deg) * 60 * MINUTE_PARTS), 60 * MINUTE_PARTS)
     minutes = f"{parts // MINUTE_PARTS:02d}.{parts % MINUTE_PARTS:05d}"
     return f"{degrees:0{digits}d}{minutes},{signs[angle_deg < 0]}"

@@ -1,7 +1,7 @@
-"""Base of the outputs: the states of the vehicles, composed at a rate, given to a carrier.
+"""Base of the outputs: states of vehicles, formatted at a rate and passed to a carrier.
 
-An output is a client of the hub: the filters of its endpoint decide which frames it sees, and so
-which systems. It asks for no message that it does not read.
+An output is a client of the hub: the filters of its endpoint select the frames, and thereby the
+systems, that it receives. It only subscribes to messages that it reads.
 """
 
 import asyncio
@@ -23,20 +23,20 @@ MIN_RATE_HZ, MAX_RATE_HZ = 0.01, 50.0
 
 
 class Output(Client):
-    """An endpoint that sends the states of vehicles in a format of its own, and receives none."""
+    """An endpoint that sends the states of vehicles in its own format, and receives no data."""
 
     may_return = False
     carriers: ClassVar[Collection[str]] = ()
-    """The carriers that its URL may name."""
+    """Carriers that are allowed in its URL."""
     default_rate_hz: ClassVar[float] = 1.0
     wanted_ids: ClassVar[frozenset[int]] = STATE_IDS
-    """The messages that it reads; empty for all."""
+    """Ids of the messages that it reads; empty for all."""
     _timer: asyncio.TimerHandle | None = None
     unix_us = staticmethod(unix_time_us)
-    """The civil time."""
+    """Function that returns the civil time."""
 
     def __post_init__(self) -> None:
-        """Narrow the filter of its endpoint, and start without a connection."""
+        """Restrict the filter of the endpoint to messages that are read; start disconnected."""
         self.endpoint = self._narrowed(self.endpoint)
         super().__post_init__()
         self.vehicles = NewestVehicles()
@@ -45,7 +45,7 @@ class Output(Client):
 
     @classmethod
     def check(cls, endpoint: Endpoint) -> None:
-        """Raise ValueError if the endpoint is not understood."""
+        """Raise ValueError if the endpoint is invalid."""
         target_of(endpoint.host, cls.carriers)
         _rate_hz(endpoint, cls.default_rate_hz)
         _vehicle_id(endpoint)
@@ -64,7 +64,7 @@ class Output(Client):
         self.vehicles.feed(frame, self.context.now_us())
 
     def tick(self, now_us: int) -> None:
-        """Open the carrier if it is not open, and start the timer."""
+        """Open the carrier if it is closed, and start the timer."""
         self.carrier.tick(now_us)
         if self._timer is None:
             self._timer = self.loop.call_later(self.interval_s, self._turn)
@@ -75,7 +75,7 @@ class Output(Client):
         self.configure()
 
     def close(self) -> None:
-        """Close the carrier, and stop."""
+        """Close the carrier, and stop the timer."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -91,12 +91,12 @@ class Output(Client):
         return replace(found, state=self.carrier.state, reason=self.carrier.reason)
 
     def heard(self, now_us: int) -> dict[int, NewestState]:
-        """Return the chosen vehicle, or all that were heard lately, by their system ids."""
+        """Return the selected vehicle, or all recently received ones, by system id."""
         heard = self.vehicles.heard(now_us).items()
         return {key: state for key, state in heard if self.vehicle_id in (0, key)}
 
     def chosen(self, now_us: int) -> NewestState | None:
-        """Return the chosen vehicle, by default the one with the lowest system id."""
+        """Return the selected vehicle, by default the one with the lowest system id."""
         return next(iter(self.heard(now_us).values()), None)
 
     def position_unix_us(self, state: NewestState, now_us: int) -> int:
@@ -104,7 +104,7 @@ class Output(Client):
         return self.unix_us() - (now_us - state.position_us)
 
     def _turn(self) -> None:
-        # First, so that the next turn follows whatever happens below.
+        # First, so that the timer continues after an exception below.
         self._timer = self.loop.call_later(self.interval_s, self._turn)
         for data in self.compose(self.context.now_us()):
             self.put(data)
@@ -118,7 +118,7 @@ class Output(Client):
         return client_context(authority, given.get("certificate", ""), given.get("key", ""))
 
     def _narrowed(self, endpoint: Endpoint) -> Endpoint:
-        """Return the endpoint with the messages that are read here as the only ones that pass."""
+        """Return the endpoint with a filter that passes only the messages that are read."""
         if not self.wanted_ids:
             return endpoint
         allow = self.wanted_ids & endpoint.allow if endpoint.allow else self.wanted_ids
@@ -137,11 +137,11 @@ def _rate_hz(endpoint: Endpoint, default_hz: float) -> float:
 
 
 def station_of(endpoint: Endpoint) -> AntennaStation:
-    """Return the station of an antenna, by the option `station`; raises ValueError."""
+    """Return the antenna station in the option `station`; raises ValueError if it is invalid."""
     return station_from(endpoint.added.get("station", HOME))
 
 
 def _vehicle_id(endpoint: Endpoint) -> int:
-    """Return the system id of the chosen vehicle; 0 for any."""
+    """Return the system id of the selected vehicle; 0 for any."""
     text = endpoint.added.get("vehicle")
     return 0 if text is None else number_from(text, "vehicle", 1, 249)

@@ -1,8 +1,8 @@
-"""Antenna rotators: GS-232 and EasyComm II on a serial line, and hamlib's rotctld.
+"""Antenna rotators: GS-232 and EasyComm II on a serial line, and rotctld of Hamlib.
 
     rotator:serial:DEVICE:BAUD?protocol=gs232  rotator:tcp:HOST:4533?protocol=rotctld
 
-Without a valid position the antenna stays where it is.
+Without a valid position the antenna is not moved.
 
 References
 ----------
@@ -41,14 +41,14 @@ PROTOCOLS: Final[dict[str, Callable[[float, float], str]]] = {
 
 
 class RotatorOutput(Output):
-    """Commands that point an antenna at one vehicle."""
+    """Commands that point an antenna at a vehicle."""
 
     carriers = (EndpointKind.SERIAL, EndpointKind.TCP, EndpointKind.UDP)
     default_rate_hz = 1.0
 
     @classmethod
     def check(cls, endpoint: Endpoint) -> None:
-        """Raise ValueError if the endpoint is not understood."""
+        """Raise ValueError if the endpoint is invalid."""
         super().check(endpoint)
         station_of(endpoint)
         protocol = endpoint.added.get("protocol", "gs232")
@@ -56,7 +56,7 @@ class RotatorOutput(Output):
             raise ValueError(unknown_choice("protocol", protocol, sorted(PROTOCOLS)))
 
     def compose(self, now_us: int) -> Iterable[bytes]:
-        """Return the command for the present direction, if it is known."""
+        """Return the command for the present direction; empty if it is unknown."""
         state = self.chosen(now_us)
         if state is None:
             return []
@@ -67,7 +67,7 @@ class RotatorOutput(Output):
 
 
 def command(protocol: str, pointing: Pointing) -> bytes:
-    """Return the command of a protocol; an antenna does not point below the horizon."""
+    """Return the command in a protocol; an antenna is not pointed below the horizon."""
     elevation_deg = min(max(pointing.elevation_deg, 0.0), MAX_ELEVATION_DEG)
     return PROTOCOLS[protocol](pointing.azimuth_deg, elevation_deg).encode("ascii")
 

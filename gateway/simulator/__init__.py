@@ -1,1 +1,1 @@
-"""A seeded flight, its sensors and its radio; pure."""
+"""A seeded flight with its sensors and its radio; pure."""

@@ -18,19 +18,19 @@ from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import SensorMotion, Trajectory
 
 START_UNIX_US: Final = 1_781_402_400_000_000
-"""14 June 2026, 02:00 UTC, where the caller names no other moment."""
+"""Default time at the start: 14 June 2026, 02:00 UTC."""
 IMU_NODE: Final = 0
 GPS_NODE: Final = 1
 GPS_BOOT_US: Final = 3_141_592
 NEIGHBOUR_DEG: Final = 0.0006
-"""Each further aircraft's home is this much further south."""
+"""Distance between the homes of consecutive aircraft, southwards."""
 
 
 class SimulatedAircraft:
-    """One aircraft with its sensors, for an unlimited time, from a UTC time on.
+    """One aircraft with its sensors, for an unlimited time, starting at a UTC time.
 
-    The first one has the index 0; the next ones have the next ids, other gusts and another home. By
-    default its motion is the planned flight.
+    The first aircraft has the index 0; others have the next ids, other gusts and other homes. By
+    default the motion is the planned flight.
     """
 
     def __init__(
@@ -53,5 +53,5 @@ class SimulatedAircraft:
 
     @property
     def errors(self) -> SensorErrors:
-        """The ideal calibration of this aircraft's sensors."""
+        """Constant errors of this aircraft's sensors, as their ideal calibration."""
         return errors_of(self.imu.inertial, self.imu.magnetometer)

@@ -1,4 +1,4 @@
-"""The u-blox M8N: five fixes a second, with latency, drift and dropouts."""
+"""The GPS receiver, a u-blox M8N: five fixes per second, with latency, drift and dropouts."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ GPS_RATE_HZ: Final = 5
 EPOCH_US: Final = 1_000_000 // GPS_RATE_HZ
 MIN_LATENCY_S: Final = 0.01
 TIME_KNOWN_EARLIER_S: Final = 2.0
-"""The time is known from fewer satellites than a fix, so this much sooner."""
+"""Time between known GPS time and the first fix: time requires fewer satellites."""
 
 POSITION_WANDER_M: Final[FloatArray] = np.array([0.8, 0.8, 1.5])
 POSITION_NOISE_M: Final[FloatArray] = np.array([0.10, 0.10, 0.20])
@@ -33,38 +33,38 @@ V_ACC_M: Final = 1.8
 SPEED_ACC_MPS: Final = 0.12
 PDOP: Final = 1.4
 BLIND: Final = 99.99
-"""The DOP that the receiver reports without a fix."""
+"""DOP that the receiver reports without a fix."""
 SETTLING_S: Final = 3.0
-"""Accuracies come back to their usual values this fast after an outage."""
+"""Time constant with which accuracies return to their usual values after an outage."""
 SETTLING_FACTOR: Final = 4.0
 
 EARLIEST_UNIX_US: Final = 946_684_800_000_000
 LATEST_UNIX_US: Final = EARLIEST_UNIX_US + 255 * 365 * 86_400_000_000
-"""The last year that the node's byte, from 2000 on, can hold."""
+"""Latest time: the node encodes the year since 2000 in one byte."""
 
 
 def gps_start(unix_us: int) -> int:
-    """Return the UTC of the GPS at the start, limited to its range."""
+    """Return the GPS time at the start in UTC, limited to the valid range."""
     return min(max(unix_us, EARLIEST_UNIX_US), LATEST_UNIX_US)
 
 
 def itow_ms_of(unix_us: IntArray) -> IntArray:
-    """Return the ms of the GPS week at times in UTC, with the leap seconds of the first."""
+    """Return the time of week, ms, for UTC times, with the leap seconds of the first time."""
     first_us = int(unix_us[0]) if len(unix_us) else 0
     return (unix_us + (gps_us_of_unix(first_us) - first_us)) % WEEK_US // 1000
 
 
 @dataclass(frozen=True, slots=True)
 class GpsSamples:
-    """N messages of the GPS receiver; arrays of shape (N,) or (N, 3)."""
+    """N messages of the GPS receiver, as arrays of shape (N,) or (N, 3)."""
 
     time_s: FloatArray
-    """Arrival at the node, true time since the start."""
+    """Time of arrival at the node: true time since the start."""
     valid_time_s: FloatArray
-    """When the fix was true; earlier than `time_s` by the latency."""
+    """Time of validity of the fix, which is earlier than `time_s` by the latency."""
     itow_ms: IntArray
     unix_us: IntArray
-    """UTC of the fix."""
+    """UTC of the fix, µs since 1970."""
     time_valid: BoolArray
     has_fix: BoolArray
     satellites: IntArray
@@ -80,12 +80,12 @@ class GpsSamples:
 
     @property
     def fix_type(self) -> IntArray:
-        """`GpsFixType` of each message."""
+        """The `GpsFixType` of each message."""
         return np.where(self.has_fix, GpsFixType.FIX_3D, GpsFixType.NONE)
 
 
 class GpsSampler:
-    """Run the receiver along a trajectory."""
+    """Simulate the receiver along a trajectory."""
 
     def __init__(
         self,
@@ -107,7 +107,7 @@ class GpsSampler:
         self._sky = Wander(sky, 1.0, WANDER_S, interval_s)
 
     def take(self, until_s: float) -> GpsSamples:
-        """Run until every fix that is valid before a true time has come out; some arrive later."""
+        """Return all fixes that are valid before a true time; some arrive later than that."""
         end_epoch = math.ceil((self._start_unix_us + until_s * 1e6) / EPOCH_US)
         unix_us = np.arange(self._epoch, max(end_epoch, self._epoch)) * EPOCH_US
         self._epoch = max(end_epoch, self._epoch)
@@ -145,7 +145,7 @@ class GpsSampler:
     def _measure(
         self, valid_s: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Measure latitude, longitude, height and velocity with their errors."""
+        """Return latitude, longitude, height and velocity with their errors."""
         size = len(valid_s)
         truth = self._trajectory.truth_at(valid_s)
         off_m = POSITION_WANDER_M * self._position_wander.draw(size)
@@ -170,7 +170,7 @@ def _sees_sky(valid_s: FloatArray, first_fix_s: float, outages_s: GpsOutages) ->
 
 
 def _settling(valid_s: FloatArray, first_fix_s: float, outages_s: GpsOutages) -> FloatArray:
-    """Return by what factor the accuracies are worse since the fix came back."""
+    """Return the factor by which accuracies are degraded since the return of the fix."""
     factor = 1.0 + SETTLING_FACTOR * _decay(valid_s - first_fix_s)
     for start_s, length_s in outages_s:
         factor += SETTLING_FACTOR * _decay(valid_s % FLIGHT_S - start_s - length_s)

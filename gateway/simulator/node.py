@@ -1,4 +1,4 @@
-"""The two radio nodes of an aircraft: samples in, payloads out, each at its time."""
+"""The two radio nodes of an aircraft: convert samples to payloads, each with its time."""
 
 import heapq
 from collections.abc import Iterator, Sequence
@@ -30,16 +30,17 @@ from gateway.wire.payloads import (
 )
 
 IMU_READING_S: Final = 0.0011
-"""MPU6050 and HMC5883L over a 400 kHz bus."""
+"""Time to read MPU6050 and HMC5883L over a 400 kHz bus."""
 BARO_READING_S: Final = 0.0006
 GPS_READING_S: Final = 0.009
-"""100 bytes of UBX-NAV-PVT at 115 200 baud."""
+"""Time to receive the 100 bytes of UBX-NAV-PVT at 115 200 baud."""
 STATUS_S: Final = 1.0
 STARTING_US: Final = 600_000
-"""From reset to the first payload: self-test and settling of the sensors."""
+"""Time from reset to the first payload: self-test and settling of the sensors."""
 
 SAMPLES_AT_ONCE: Final = 20
-"""A few samples at once cost nearly as much as many, but many would block an event loop."""
+"""Samples per batch: a small batch costs nearly as much as a large one, but a large one would block
+an event loop."""
 FIXES_AT_ONCE: Final = 10
 PHASES: Final = 4
 
@@ -48,7 +49,7 @@ GPS_SENSORS: Final = 0b1000
 IMU_CHIPS: Final = Chips(imu=0x68, magnetometer=0x1E, barometer=0x55)
 """MPU6050, HMC5883L, BMP180."""
 GPS_CHIPS: Final = Chips(gps=8 | GPS_ACKNOWLEDGES, gps_baud_hundreds=576)
-"""A u-blox M8."""
+"""A u-blox M8, configured at 57 600 baud."""
 POWER_ON: Final = 1
 LOOP_US: Final = 1400
 SUPPLY_MV: Final = 3300
@@ -60,17 +61,17 @@ UNIX_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """One payload on its way to the node's radio."""
+    """A payload that a node passes to its radio."""
 
     time_s: float
-    """True time at which the node passes it to the radio."""
+    """True time at which the payload is passed to the radio."""
     node_time_us: int
-    """The payload's stamp on the node's clock, not wrapped."""
+    """Timestamp in the payload on the node's clock, not wrapped."""
     payload: Payload
 
 
 class Node:
-    """A source of payloads: those of its sensors, in order, and its own reports between them."""
+    """A source of payloads: samples of its sensors in order, and its own reports between them."""
 
     def __init__(
         self,
@@ -82,7 +83,7 @@ class Node:
     ) -> None:
         self.node_id = node_id
         self.restart_s = 0.0
-        """True time at which its watchdog resets it; 0 for never."""
+        """True time at which the watchdog resets the node; 0 for never."""
         self.radio_failed = 0
         self.radio_retries = 0
         self._clock = clock
@@ -91,7 +92,7 @@ class Node:
         self._samples = samples
 
     def sent(self) -> Iterator[Sent]:
-        """Yield every payload passed to the radio, in order, without end; call it once."""
+        """Yield all payloads passed to the radio, in order and without end; call it only once."""
         return filter(None, map(self._after_restart, self._with_reports()))
 
     def _with_reports(self) -> Iterator[Sent]:
@@ -106,7 +107,7 @@ class Node:
         yield from map(self._report, times)
 
     def _after_restart(self, sent: Sent) -> Sent | None:
-        """Stop a node while it restarts, with its clock from zero then."""
+        """Drop payloads while a node restarts; its clock then starts from zero."""
         if not 0.0 < self.restart_s <= sent.time_s:
             return sent
         node_time_us = sent.node_time_us - self._clock.at(self.restart_s)
@@ -132,9 +133,9 @@ class Node:
 
 
 def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[Node, Node]:
-    """Create the node with MPU6050, HMC5883L and BMP180, and that with the M8N, of an aircraft.
+    """Create the nodes of an aircraft: one with MPU6050, HMC5883L and BMP180, one with the M8N.
 
-    Samples are made a few at a time, as they are asked for.
+    Samples are computed in small batches, on demand.
     """
     imu = Node(
         NodeId(aircraft.vehicle_id, IMU_NODE),
@@ -182,7 +183,7 @@ def _gps_samples(aircraft: SimulatedAircraft, geoid_separation_m: float) -> Iter
 
 
 def _ends_of_pieces(aircraft: SimulatedAircraft, length_s: float) -> Iterator[float]:
-    """Yield when each piece of samples ends; those of the next aircraft end at other times."""
+    """Yield the end of each batch of samples; different for each aircraft."""
     first_s = length_s * (1.0 - aircraft.vehicle_id % PHASES / PHASES)
     return (first_s + k * length_s for k in count())
 
@@ -190,11 +191,11 @@ def _ends_of_pieces(aircraft: SimulatedAircraft, length_s: float) -> Iterator[fl
 def pack_imu(
     columns: Sequence[FloatArray | IntArray], ranges: tuple[int, int, int]
 ) -> Iterator[Sent]:
-    """Pack IMU readings.
+    """Pack IMU samples.
 
-    Columns: true time of sampling in s and node time in us, each (N,); accelerometer, gyroscope and
-    magnetometer counts, each (N, 3); temperature counts and flags, each (N,). Ranges: the codes of
-    the accelerometer's and gyroscope's ranges and of the magnetometer's gain.
+    Columns: true time of sampling in s and node time in µs, each (N,); accelerometer, gyroscope and
+    magnetometer counts, each (N, 3); temperature counts and flags, each (N,). Ranges: the codes for
+    the accelerometer's and gyroscope's ranges and for the magnetometer's gain.
     """
     accel_range, gyro_range, mag_gain = ranges
     for time_s, node_us, accel, gyro, mag, temperature, flags in zip(
@@ -214,14 +215,14 @@ def pack_imu(
 
 
 def pack_baro(columns: Sequence[FloatArray | IntArray]) -> Iterator[Sent]:
-    """Pack readings: true time of sampling in s, node time in us, pressure in Pa, deg C."""
+    """Pack barometer samples: true time in s, node time in µs, pressure in Pa, deg C."""
     for time_s, node_us, pressure_pa, degc in zip(*(c.tolist() for c in columns), strict=True):
         payload = BaroPayload(round(pressure_pa * 100.0), round(degc * 10.0))
         yield Sent(time_s + BARO_READING_S, node_us, payload)
 
 
 def gps_payloads(gps: GpsSamples, clock: DeviceClock, geoid_separation_m: float) -> Iterator[Sent]:
-    """Pack GPS messages, each as quality and fix."""
+    """Pack GPS messages, each as a quality payload and a fix payload."""
     h_acc_cm, v_acc_cm = _held(gps.h_acc_m), _held(gps.v_acc_m)
     speed_acc_cmps, course_acc_cdeg = _held(gps.speed_acc_mps), _held(gps.course_acc_deg)
     pdop_centi = _held(gps.pdop)
@@ -259,5 +260,5 @@ def gps_payloads(gps: GpsSamples, clock: DeviceClock, geoid_separation_m: float)
 
 
 def _held(values: FloatArray) -> IntArray:
-    """Scale to hundredths, saturated to 16 bits."""
+    """Convert to hundredths, saturated to 16 bits."""
     return np.clip(np.rint(values * 100.0), 0, UINT16_MAX).astype(np.int64)

@@ -1,12 +1,12 @@
 """The radio between nodes and receiver, the receiver, and its serial line.
 
-Theory of operation. Each node sends one payload after the other; a payload that meets noise is
-repeated by the radio chip, which delays it and all after it, and is lost after the last try. The
-receiver stamps arriving payloads with its own clock and queues them for the serial line; if the
-queue is full they are dropped and counted. A frame's time is that of its last bit on the line.
+Theory of operation. Each node sends one payload after the other. A payload that is disturbed is
+repeated by the radio chip, which delays it and all after it; it is lost after the last retry. The
+receiver timestamps arriving payloads with its own clock and queues them for the serial line; if the
+queue is full they are dropped and counted. The time of a frame is that of its last bit on the line.
 
-Nodes and radio run only as far as the next frame needs: memory use is constant, and no frame takes
-much longer to make than the others.
+Nodes and radio are simulated only as far as the next frame requires, so memory use is constant, and
+no frame takes much longer to compute than others.
 """
 
 import heapq
@@ -36,19 +36,19 @@ from gateway.wire.payloads import (
 )
 
 ATTEMPT_S: Final = 0.00045
-"""130 us of settling and 40 bytes with preamble, address and CRC at 1 Mbit/s."""
+"""Time on air at 1 Mbit/s: 130 us of settling, and 40 bytes with preamble, address and CRC."""
 RETRY_S: Final = 0.00075
-"""Wait for the acknowledgement, then the chip's auto-retransmit delay."""
+"""Time to a retry: the timeout of the acknowledgement and the chip's auto-retransmit delay."""
 RETRIES: Final = 5
 RETRY_SHARE: Final = 0.08
-"""Share of the attempts that have to be repeated."""
+"""Proportion of transmissions that must be repeated."""
 
 RECEIVER_BOOT_US: Final = 1_618_033
 RECEIVER_SKEW_SHARE: Final = 0.5
 HANDLING_S: Final = 0.0001
 LINE_BUFFER_BYTES: Final = 512
 REPORT_ROOM_BYTES: Final = 80
-"""Kept free for the status frame, or a full line could never report that it is full."""
+"""Bytes of the queue reserved for the status frame, so that a full line can still be reported."""
 BITS_PER_BYTE: Final = 10
 STATUS_S: Final = 1.0
 LAST_VEHICLE_ID: Final = 31
@@ -71,7 +71,7 @@ class _Arrival:
 
 
 class _RadioPath:
-    """One node's radio: order, retries, loss and duplicates."""
+    """Radio of one node: order, retries, losses and duplicates."""
 
     def __init__(
         self, node: Node, pipe: int, settings: SimulatorSettings, rng: np.random.Generator
@@ -84,13 +84,13 @@ class _RadioPath:
         self._seq = 0
         self._losing = False
         self._duplicates = settings.radio_duplicates
-        # Gilbert's two-state channel: its long-run share of losses is `radio_loss`.
+        # Gilbert's two-state channel: the long-term proportion of losses is `radio_loss`.
         self._leave_loss = 1.0 / settings.radio_burst
         enter = settings.radio_loss / (settings.radio_burst * (1.0 - settings.radio_loss))
         self._enter_loss = min(enter, 1.0)
 
     def arrivals(self) -> Iterator[_Arrival]:
-        """Send all payloads of the node; yield each, in the order of time."""
+        """Send all payloads of the node, and yield the arrivals in order of time."""
         for sent in self._node.sent():
             yield from self._send(sent)
 
@@ -100,7 +100,7 @@ class _RadioPath:
         self._losing = change >= self._leave_loss if self._losing else change < self._enter_loss
         retries = RETRIES
         if not self._losing:
-            # The number of attempts is geometric; those beyond the last retry are not losses here.
+            # The number of retries is geometric; it is limited, so this is never a loss.
             retries = min(int(math.log(1.0 - luck) / math.log(RETRY_SHARE)), RETRIES)
         start_s = max(sent.time_s, self._free_s)
         arrival_s = start_s + ATTEMPT_S + retries * RETRY_S
@@ -113,14 +113,14 @@ class _RadioPath:
             return
         yield _Arrival(arrival_s, self, header, sent.payload)
         if twice < self._duplicates:
-            # The acknowledgement was lost, and the chip's own duplicate check missed it.
+            # The acknowledgement was lost, and the chip did not detect the duplicate.
             self._free_s += RETRY_S
             self._node.radio_retries += 1
             yield _Arrival(self._free_s, self, header, sent.payload)
 
 
 class SimulatedReceiver:
-    """The receiver on the ground."""
+    """The receiver on the ground, with its serial line."""
 
     def __init__(self, settings: SimulatorSettings, nodes: Sequence[Node]) -> None:
         self._settings = settings
@@ -133,7 +133,7 @@ class SimulatedReceiver:
         self._line_free_s = 0.0
 
     def frames(self, until_s: float = math.inf) -> Iterator[TimedFrame]:
-        """Yield the serial frames in the order of time; call it once."""
+        """Yield the serial frames in order of time; must be called only once."""
         frames = self._clean_frames(until_s)
         if self._settings.corrupt_bytes > 0.0:
             rng = generator(self._settings, 0, Chance.LINE)
@@ -160,7 +160,7 @@ class SimulatedReceiver:
         self._received[path.pipe] += 1
         if path.last_seq is not None:
             gap = (arrival.header.seq - path.last_seq - 1) % UINT16
-            # A duplicate leaves a gap of 65 535.
+            # A duplicate appears as a gap of 65 535.
             self._lost[path.pipe] += gap if gap < UINT16 // 2 else 0
         path.last_seq = arrival.header.seq
         stamp_us = self._clock.at(arrival.time_s) % UINT32
@@ -182,7 +182,7 @@ class SimulatedReceiver:
         yield from self._write(time_s, encode_receiver_status(status), LINE_BUFFER_BYTES)
 
     def _write(self, time_s: float, content: bytes, room: int) -> Iterator[TimedFrame]:
-        # A dropped frame uses up its number, so that the gateway detects the gap.
+        # A dropped frame also has a number, so that the gateway detects the gap.
         self._frame_seq = (self._frame_seq + 1) % UINT8
         data = encode_frame(content)
         byte_s = BITS_PER_BYTE / self._settings.baud
@@ -196,14 +196,14 @@ class SimulatedReceiver:
 
 
 def simulate(settings: SimulatorSettings, start_unix_us: int = START_UNIX_US) -> SimulatedReceiver:
-    """Set up the receiver and all aircraft of the settings.
+    """Create the receiver and all aircraft in the settings.
 
-    `start_unix_us` is the UTC that the GPS reports at the start, limited to 2000 to 2254.
+    `start_unix_us` is the UTC that GPS reports at the start, limited to 2000 to 2254.
     Raises ValueError if the last aircraft's id is too large.
     """
     last_id = settings.vehicle_id + settings.vehicles - 1
     if last_id > LAST_VEHICLE_ID:
-        raise ValueError(f"vehicle ids up to {last_id}; the protocol ends at {LAST_VEHICLE_ID}")
+        raise ValueError(f"vehicle ids up to {last_id}; the protocol allows {LAST_VEHICLE_ID}")
     nodes: list[Node] = []
     for index in range(settings.vehicles):
         nodes += nodes_of(SimulatedAircraft(settings, index, start_unix_us), settings)
@@ -213,7 +213,7 @@ def simulate(settings: SimulatorSettings, start_unix_us: int = START_UNIX_US) ->
 def damage(
     frames: Iterator[TimedFrame], share: float, rng: np.random.Generator
 ) -> Iterator[TimedFrame]:
-    """Change a share of the bytes to any other value."""
+    """Replace a share of the bytes by any other value."""
     for frame in frames:
         data = np.frombuffer(frame.data, dtype=np.uint8)
         hit = rng.random(len(data)) < share

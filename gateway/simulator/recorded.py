@@ -1,8 +1,8 @@
-"""A recorded flight through the simulated receiver: SI columns in, the nodes' payloads out.
+"""Send a recorded flight through the simulated receiver: SI columns in, the nodes' payloads out.
 
-The recording's times of sampling and of arrival are kept, so its own GPS latency stays in it.
-Vectors become counts in sensor axes, in the finest ranges that hold them; the board is level and
-face up. Heights of the barometer become pressures of the standard atmosphere.
+The recorded times of sampling and of arrival are kept, including the GPS latency. Vectors are
+converted to counts in sensor axes, in the finest ranges that can represent them; the board is level
+and face up. Barometer heights are converted to pressures of the standard atmosphere.
 """
 
 import dataclasses
@@ -52,7 +52,7 @@ from gateway.units import STANDARD_GRAVITY_MPS2, UT_PER_GAUSS, counted
 from gateway.wire.payloads import ACCEL_RANGES_G, HMC5883L_LSB_PER_GAUSS
 
 ROWS: Final = 2048
-"""Rows that become payloads at once: bounds memory on long recordings."""
+"""Rows converted to payloads at a time, which bounds the memory for long recordings."""
 TEMPERATURE_DEGC: Final = 25.0
 SATELLITES: Final = 10
 H_ACC_M: Final = 2.0
@@ -69,35 +69,35 @@ IMU_COLUMNS: Final = ("time_s", "ax", "ay", "az", "gx", "gy", "gz")
 
 @dataclass(frozen=True, slots=True)
 class RecordedFlight:
-    """A tracker's log: N rows of the IMU, M fixes; NaN where there is no new sample."""
+    """A tracker's log: N rows of the IMU, M fixes; NaN means no new sample."""
 
     time_s: FloatArray
-    """Shape (N,), since the first row."""
+    """Shape (N,), time since the first row."""
     accel_b_mps2: FloatArray
     """Shape (N, 3), specific force in body FRD."""
     gyro_b_radps: FloatArray
     mag_b_ut: FloatArray
     """Shape (N, 3), hard iron removed."""
     baro_alt_m: FloatArray
-    """Shape (N,)."""
+    """Shape (N,), height from the barometer."""
     gps_time_s: FloatArray
-    """Shape (M,), arrival, since the first row; not negative."""
+    """Shape (M,), time of arrival since the first row; not negative."""
     gps_lat_deg: FloatArray
     gps_lon_deg: FloatArray
     gps_alt_m: FloatArray
     gps_vel_n_mps: FloatArray
-    """Shape (M, 3); NaN where the recording has none."""
+    """Shape (M, 3); NaN if the recording has no velocity."""
     gps_latency_s: float
-    """From a fix's validity to its arrival; used for its time of week and UTC alone."""
+    """Time from validity to arrival of a fix; used only for its time of week and UTC."""
 
     @property
     def duration_s(self) -> float:
-        """How long the recording runs, with time for the last payloads to come out."""
+        """Duration of the recording, plus time for the last payloads to be sent."""
         return float(self.time_s[-1]) + TAIL_S
 
     @property
     def rate_hz(self) -> float:
-        """Usual rate of the IMU."""
+        """Usual sample rate of the IMU."""
         return 1.0 / float(np.median(np.diff(self.time_s)))
 
     @staticmethod
@@ -111,9 +111,9 @@ class RecordedFlight:
         columns : mapping of str to ndarray, each (N,)
             `time_s`, `ax` `ay` `az` in m/s2 and `gx` `gy` `gz` in rad/s are required. Optional:
             `mx` `my` `mz` in uT, `baro_alt_m`, `gps_time_s`, `gps_lat`, `gps_lon`, `gps_alt_m`,
-            `gps_vn` `gps_ve` `gps_vd`. NaN is "no new one".
+            `gps_vn` `gps_ve` `gps_vd`. NaN means no new value.
         gps_latency_s : float
-            GPS latency given in the log.
+            GPS latency stated in the log.
 
         Returns
         -------
@@ -122,7 +122,7 @@ class RecordedFlight:
         Raises
         ------
         ValueError
-            If a column is missing, there are less than two rows, or time does not grow.
+            If a column is missing, there are fewer than two rows, or time does not increase.
         """
         missing = [name for name in IMU_COLUMNS if name not in columns]
         if missing:
@@ -140,10 +140,10 @@ class RecordedFlight:
             raise ValueError(f"{rows} with acceleration and rate; a flight has more")
         if (np.diff(time_s) <= 0.0).any():
             at_s = time_s[int(np.argmax(np.diff(time_s) <= 0.0)) + 1]
-            raise ValueError(f"time_s goes back at {at_s} s")
+            raise ValueError(f"time_s decreases at {at_s} s")
         begin_s = time_s[0]
         fixes = _complete(stack(*GPS_COLUMNS))
-        # A fix from before the first sample has no time on the nodes' clocks.
+        # A fix before the first sample has no time on the nodes' clocks.
         fixes &= columns.get("gps_time_s", blank) >= begin_s
         return RecordedFlight(
             time_s=time_s - begin_s,
@@ -163,7 +163,7 @@ class RecordedFlight:
 def in_rounds(
     frames: Iterator[TimedFrame], duration_s: float, on_round: Callable[[int], None]
 ) -> Iterator[TimedFrame]:
-    """Pass on the frames of an endless replay; report each round, from 2, before its first."""
+    """Yield the frames of an endless replay; report each round, from 2, before its first frame."""
     number, end_s = 1, duration_s
     for frame in frames:
         if frame.time_s >= end_s:
@@ -179,9 +179,9 @@ def replay(
     *,
     endless: bool = False,
 ) -> SimulatedReceiver:
-    """Set up the receiver and one aircraft that flies a recording, which has no UTC of its start.
+    """Create the receiver and one aircraft that replays a recording without a UTC start time.
 
-    If endless it begins again whenever it has ended, while the nodes' clocks and numbers go on.
+    If endless, the recording is repeated while the nodes' clocks and sequence numbers continue.
     """
     imu_clock = DeviceClock(IMU_BOOT_US, settings.clock_skew_ppm)
     inertial = _imu_payloads(flight, imu_clock, endless=endless)
@@ -219,7 +219,7 @@ def replay(
 
 
 def _rounds(flight: RecordedFlight, endless: bool) -> Iterator[RecordedFlight]:
-    """Yield the flight, then repeat it, each time after the one before."""
+    """Yield the flight, then repeat it endlessly, each time shifted after the one before."""
     yield flight
     for number in count(1) if endless else ():
         begin_s = number * flight.duration_s
@@ -258,7 +258,7 @@ def _imu_payloads(flight: RecordedFlight, clock: DeviceClock, *, endless: bool) 
 
 
 def _ranges(flight: RecordedFlight) -> tuple[int, int, int]:
-    """Choose the codes of the finest ranges that hold the whole recording."""
+    """Return the codes of the finest ranges that can represent the whole recording."""
     accel_limits = [g * STANDARD_GRAVITY_MPS2 * INT16_MAX / (INT16_MAX + 1) for g in ACCEL_RANGES_G]
     gyro_limits = [math.radians(INT16_MAX / lsb) for lsb in GYRO_LSB_PER_DPS]
     mag_limits = [MAG_LIMIT * UT_PER_GAUSS / lsb for lsb in HMC5883L_LSB_PER_GAUSS]
@@ -270,13 +270,13 @@ def _ranges(flight: RecordedFlight) -> tuple[int, int, int]:
 
 
 def _finest(limits: list[float], values: FloatArray) -> int:
-    """Choose the first limit that holds all values, the last if none does."""
+    """Return the index of the first limit that no value exceeds, otherwise the last index."""
     largest = float(np.nanmax(np.abs(values), initial=0.0))
     return next((code for code, limit in enumerate(limits) if largest < limit), len(limits) - 1)
 
 
 def _mag_words(field_b_ut: FloatArray, new: BoolArray, gain: int) -> IntArray:
-    """Convert to counts and hold each reading until the next one, as the registers do."""
+    """Convert to counts, and hold each sample until the next one, as the registers do."""
     words = np.zeros((np.count_nonzero(new) + 1, 3), dtype=np.int64)
     words[1:] = mag_counts(field_b_ut[new] * FACE_UP, gain)
     return words[np.cumsum(new)]
@@ -320,7 +320,7 @@ def _gps_samples(flight: RecordedFlight, start_unix_us: int) -> GpsSamples:
 
 
 def _complete(vectors: FloatArray) -> BoolArray:
-    """Return which rows have no NaN."""
+    """Return which rows contain no NaN."""
     return np.asarray(np.isfinite(vectors).all(axis=1))
 
 

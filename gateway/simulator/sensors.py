@@ -1,11 +1,11 @@
-"""The sensors of the tracker: true motion in, counts and messages out, by the clocks of the nodes.
+"""The sensors of the tracker: convert true motion to counts and messages, by the nodes' clocks.
 
-A sampler runs along a trajectory, a whole flight at once or second by second. Every source of noise
-owns its generator and carries its state, so both give the same numbers, bit for bit.
+A sampler runs along a trajectory, for a whole flight at once or second by second. Every source of
+noise has its own generator and keeps its state, so that both give bit-identical results.
 
-Sensor axes are those of the chips on a level board: x forward, y left, z up; a body vector (FRD)
-has the components `FACE_UP * v_b` in them, and the other way round. An inertial or magnetic sensor
-reads `matrix @ v_s + bias` plus noise; `SensorErrors` is the calibration that undoes it.
+Sensor axes are those of the chips on a level board: x forward, y left, z up. A body vector (FRD) is
+converted by `FACE_UP * v_b`, and so is the inverse. An inertial or magnetic sensor measures
+`matrix @ v_s + bias` plus noise; `SensorErrors` is the calibration that corrects this.
 
 References
 ----------
@@ -38,29 +38,29 @@ BoolArray = NDArray[np.bool_]
 Matrix3 = tuple[Vec3, Vec3, Vec3]
 FACE_UP: Final = np.array([1.0, -1.0, -1.0])
 ACCEL_RANGE: Final = 2
-"""+-8 g."""
+"""Range code: +-8 g."""
 GYRO_RANGE: Final = 2
-"""+-1000 deg/s."""
+"""Range code: +-1000 deg/s."""
 MAG_GAIN: Final = 1
 GYRO_LSB_PER_DPS: Final = (131.0, 65.5, 32.8, 16.4)
 INT16_MIN: Final = -32768
 INT16_MAX: Final = 32767
 ACCEL_DENSITY: Final = 400e-6 * STANDARD_GRAVITY_MPS2
-"""m/s2 per root hertz [1]_."""
+"""Noise density in m/s2 per root hertz [1]_."""
 GYRO_DENSITY: Final = math.radians(0.005)
-"""rad/s per root hertz [1]_."""
+"""Noise density in rad/s per root hertz [1]_."""
 FILTER_HZ: Final = 94.0
-"""Noise bandwidth of the chip's own low-pass in the firmware's setting."""
+"""Noise bandwidth of the chip's low-pass filter in the setting of the firmware."""
 ACCEL_BIAS_MPS2: Final = 0.10
 GYRO_BIAS_RADPS: Final = math.radians(1.5)
-"""Spread of the constant biases; those left after the user has picked a usable chip."""
+"""Standard deviations of the constant biases, for chips that a user would accept."""
 ACCEL_WALK: Final = 0.001
 GYRO_WALK: Final = math.radians(0.004)
 """Bias random walks, per root second."""
 SCALE_SPREAD: Final = 0.006
 MISALIGNMENT_RAD: Final = math.radians(0.4)
 GYRO_SHAKING: Final = 0.02
-"""rad/s of shaking for each m/s2 of it."""
+"""Angular rate of the shaking, in rad/s for each m/s2 of shaking."""
 START_DEGC: Final = 29.0
 WARMING_DEGC: Final = 7.0
 WARMING_S: Final = 240.0
@@ -76,7 +76,7 @@ BARO_NOISE_PA: Final = 3.0
 BARO_DRIFT_PA: Final = 8.0
 BARO_DRIFT_S: Final = 300.0
 IMU_BOOT_US: Final = 2_718_281
-"""The node's clock at the start of the simulation."""
+"""Time on the node's clock at the start of the simulation."""
 BARO_PHASE_US: Final = 3_300
 
 
@@ -95,8 +95,7 @@ class White:
 class Wander:
     """First-order Gauss-Markov noise on three axes: `x' = retain * x + step`.
 
-    Its standard deviation is `sigma` in the long run, and after `correlation_s` 37 % of a value is
-    left.
+    Its stationary standard deviation is `sigma`; after `correlation_s`, 37 % of a value remains.
     """
 
     def __init__(
@@ -141,7 +140,7 @@ class Walk:
 
 @dataclass(frozen=True, slots=True)
 class SensorErrors:
-    """The calibration that undoes the constant errors: `v_b = FACE_UP * (matrix @ (s - bias))`."""
+    """Calibration that corrects the constant errors: `v_b = FACE_UP * (matrix @ (s - bias))`."""
 
     accel_bias_mps2: Vec3
     accel_matrix: Matrix3
@@ -152,10 +151,10 @@ class SensorErrors:
 
 @dataclass(frozen=True, slots=True)
 class InertialCounts:
-    """The MPU6050's registers at N samples."""
+    """Registers of the MPU6050 for N samples."""
 
     accel: IntArray
-    """Shape (N, 3), sensor axes."""
+    """Shape (N, 3), in sensor axes."""
     gyro: IntArray
     temperature: IntArray
     """Shape (N,)."""
@@ -182,7 +181,7 @@ class Mpu6050:
         self._gyro_walk = Walk(gyro_walk, GYRO_WALK, 1.0 / rate_hz)
 
     def sample(self, truth: Truth) -> InertialCounts:
-        """Read the registers at the truth's times, which follow those of the call before."""
+        """Return the registers at the truth's times, which must follow the previous call's."""
         size = len(truth.time_s)
         power = (np.minimum(truth.airspeed_mps / CRUISE_MPS, 1.0) ** 2)[:, np.newaxis]
         accel = (truth.accel_b_mps2 * FACE_UP) @ self.accel_matrix.T + self.accel_bias_mps2
@@ -204,7 +203,7 @@ class Mpu6050:
 
 
 class Hmc5883l:
-    """Magnetometer in the field of the Earth and of the aircraft's hard and soft iron."""
+    """Magnetometer in the Earth's field, with hard and soft iron of the aircraft."""
 
     def __init__(self, settings: SimulatorSettings, rng: np.random.Generator) -> None:
         field = magnetic_field(
@@ -225,12 +224,12 @@ class Hmc5883l:
         self._noise = White(rng.spawn(1)[0], MAG_NOISE_UT)
 
     def sample(self, q_nb: FloatArray) -> IntArray:
-        """Read the registers at attitudes of shape (N, 4), which follow those of the call before.
+        """Return the registers at attitudes of shape (N, 4), which must follow the previous call's.
 
         Returns
         -------
         ndarray, shape (N, 3)
-            Counts; an axis beyond its range reads `MAG_OVERFLOW`.
+            Counts; an axis out of range reads `MAG_OVERFLOW`.
         """
         field_s = rotate_inverse(q_nb, self.field_n_ut) * FACE_UP
         measured_ut = field_s @ self.soft_iron.T + self.hard_iron_ut + self._noise.draw(len(q_nb))
@@ -238,7 +237,7 @@ class Hmc5883l:
 
 
 class Bmp180:
-    """Barometer in the standard atmosphere of a day with its own sea-level pressure."""
+    """Barometer in the standard atmosphere, with the sea-level pressure of the day."""
 
     def __init__(self, settings: SimulatorSettings, rng: np.random.Generator) -> None:
         self.sea_level_pa = SEA_LEVEL_PA + SEA_LEVEL_SPREAD_PA * float(rng.standard_normal())
@@ -247,7 +246,7 @@ class Bmp180:
         self._drift = Wander(drift, BARO_DRIFT_PA, BARO_DRIFT_S, 1.0 / settings.baro_rate_hz)
 
     def sample(self, truth: Truth) -> tuple[FloatArray, FloatArray]:
-        """Read pressure in whole pascals and temperature in tenths of a degree, shapes (N,)."""
+        """Return pressure in whole Pa and temperature in tenths of a degree, shapes (N,)."""
         size = len(truth.time_s)
         pressure_pa = pressure_at(truth.alt_amsl_m, self.sea_level_pa)
         pressure_pa += self._noise.draw(size)[:, 0] + self._drift.draw(size)[:, 0]
@@ -266,34 +265,34 @@ def errors_of(imu: Mpu6050, mag: Hmc5883l) -> SensorErrors:
 
 
 def pressure_at(alt_m: FloatArray, sea_level_pa: float) -> FloatArray:
-    """Compute the ICAO standard atmosphere's pressure at heights in the troposphere."""
+    """Return the pressure of the ICAO standard atmosphere at heights in the troposphere."""
     return np.array([pressure_at_height(one_m, sea_level_pa) for one_m in alt_m.tolist()])
 
 
 def warm_degc(time_s: FloatArray) -> FloatArray:
-    """Warm the closed fuselage after switching on."""
+    """Return the temperature in the closed fuselage, which rises after power-on."""
     return np.asarray(START_DEGC + WARMING_DEGC * (1.0 - np.exp(-time_s / WARMING_S)))
 
 
 def temperature_counts(temperature_degc: FloatArray) -> IntArray:
-    """Convert deg C to the MPU6050's temperature register."""
+    """Convert deg C to counts of the MPU6050's temperature register."""
     return np.rint((temperature_degc - 36.53) * 340.0).astype(np.int64)
 
 
 def to_int16(values: FloatArray) -> tuple[IntArray, BoolArray]:
-    """Round to 16-bit values of shape (N, 3), and return which rows saturated."""
+    """Round to 16-bit values, shape (N, 3); also return which rows saturated."""
     counts = np.clip(np.rint(values), INT16_MIN, INT16_MAX).astype(np.int64)
     return counts, np.any((counts == INT16_MIN) | (counts == INT16_MAX), axis=1)
 
 
 def mag_counts(field_ut: FloatArray, gain: int) -> IntArray:
-    """Convert uT to the HMC5883L's counts; its overflow value where an axis is out of range."""
+    """Convert µT to counts of the HMC5883L, with its overflow value for an axis out of range."""
     counts = np.rint(field_ut * (MAG_LSB_PER_GAUSS[gain] / UT_PER_GAUSS)).astype(np.int64)
     return np.where(np.abs(counts) > MAG_LIMIT, MAG_OVERFLOW, counts)
 
 
 def _imperfect(rng: np.random.Generator) -> FloatArray:
-    """Draw a scale and misalignment matrix."""
+    """Draw a matrix of scale and misalignment errors."""
     matrix = MISALIGNMENT_RAD * rng.standard_normal((3, 3))
     np.fill_diagonal(matrix, 1.0 + SCALE_SPREAD * rng.standard_normal(3))
     return matrix
@@ -310,7 +309,7 @@ def _inverse(matrix: FloatArray) -> Matrix3:
 
 
 class Chance(IntEnum):
-    """Streams of random numbers; each sensor draws from its own."""
+    """Streams of random numbers, one for each sensor."""
 
     GUSTS = 0
     IMU = 1
@@ -322,29 +321,29 @@ class Chance(IntEnum):
 
 
 def generator(settings: SimulatorSettings, vehicle_id: int, stream: Chance) -> np.random.Generator:
-    """Start one stream of random numbers of one aircraft."""
+    """Create the generator for one stream of random numbers of one aircraft."""
     return np.random.default_rng([settings.seed, vehicle_id, stream])
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceClock:
-    """A node's or receiver's own clock against true time."""
+    """The clock of a node or receiver, relative to true time."""
 
     boot_us: int
-    """Time of the clock at the start of the simulation."""
+    """Time on the clock at the start of the simulation."""
     skew_ppm: float
 
     def at(self, time_s: float) -> int:
-        """Return the time of the clock at a true time, in whole µs, not wrapped."""
+        """Return the time on the clock at a true time, in whole µs, not wrapped."""
         return self.boot_us + math.floor(time_s * 1e6 * (1.0 + self.skew_ppm * 1e-6))
 
     def true_s(self, clock_us: IntArray) -> FloatArray:
-        """Return the true times at which it shows the given times."""
+        """Return the true times for times on the clock."""
         return (clock_us - self.boot_us) / (1e6 * (1.0 + self.skew_ppm * 1e-6))
 
 
 class Ticks:
-    """Sampling instants of one node's timer."""
+    """Sampling times of one node's timer."""
 
     def __init__(self, clock: DeviceClock, rate_hz: float, phase_us: int = 0) -> None:
         self._clock = clock
@@ -353,7 +352,7 @@ class Ticks:
         self._next = math.ceil((clock.boot_us - phase_us) * rate_hz * 1e-6)
 
     def take(self, until_s: float) -> tuple[IntArray, FloatArray]:
-        """List the instants before a true time: on the node's clock and in true time."""
+        """Return the sampling times before a true time, on the node's clock and in true time."""
         end_us = self._clock.at(until_s) - self._phase_us
         end = max(math.ceil(end_us * self._rate_hz * 1e-6), self._next)
         count = np.arange(self._next, end)
@@ -364,25 +363,25 @@ class Ticks:
 
 @dataclass(frozen=True, slots=True)
 class ImuSamples:
-    """N readings of MPU6050 and HMC5883L; raw arrays in counts and sensor axes."""
+    """N samples of MPU6050 and HMC5883L; raw arrays are counts in sensor axes."""
 
     time_s: FloatArray
     """True time since the start, shape (N,)."""
     node_time_us: IntArray
-    """On the node's clock, not wrapped."""
+    """Times on the node's clock, not wrapped."""
     accel_raw: IntArray
     """Shape (N, 3)."""
     gyro_raw: IntArray
     mag_raw: IntArray
-    """The newest reading, held until the next one."""
+    """The newest magnetometer reading, held until the next one."""
     mag_new: BoolArray
     mag_time_s: FloatArray
-    """When the newest magnetometer reading was taken."""
+    """True time of the newest magnetometer reading."""
     temperature_raw: IntArray
     flags: IntArray
-    """`ImuFlags`."""
+    """The `ImuFlags` of each sample."""
     truth: Truth
-    """The aircraft at `time_s`."""
+    """True state of the aircraft at `time_s`."""
 
     @property
     def accel_b_mps2(self) -> FloatArray:
@@ -397,14 +396,14 @@ class ImuSamples:
 
     @property
     def mag_b_ut(self) -> FloatArray:
-        """Magnetic field in body FRD, not calibrated; NaN unless newly sampled and in range."""
+        """Magnetic field in body FRD, not calibrated; NaN unless it is a new reading in range."""
         field = self.mag_raw * FACE_UP * (UT_PER_GAUSS / MAG_LSB_PER_GAUSS[MAG_GAIN])
         usable = self.mag_new & ~np.any(self.mag_raw == MAG_OVERFLOW, axis=1)
         return np.where(usable[:, np.newaxis], field, np.nan)
 
 
 class ImuSampler:
-    """Read MPU6050 and HMC5883L along a trajectory at the node's rate."""
+    """Sample MPU6050 and HMC5883L along a trajectory at the node's rate."""
 
     def __init__(
         self, settings: SimulatorSettings, trajectory: SensorMotion, vehicle_id: int
@@ -418,7 +417,7 @@ class ImuSampler:
         self._mag_raw = np.zeros((1, 3), dtype=np.int64)
 
     def take(self, until_s: float) -> ImuSamples:
-        """Run up to a true time and return every sample taken before it."""
+        """Return all samples before a true time that were not returned yet."""
         node_us, time_s = self._ticks.take(until_s)
         truth = self._trajectory.truth_at(time_s)
         counts = self.inertial.sample(truth)
@@ -449,18 +448,18 @@ class ImuSampler:
 
 @dataclass(frozen=True, slots=True)
 class BaroSamples:
-    """N readings of the BMP180, shapes (N,)."""
+    """N samples of the BMP180, shapes (N,)."""
 
     time_s: FloatArray
     node_time_us: IntArray
     pressure_pa: FloatArray
     temperature_degc: FloatArray
     truth: Truth
-    """The aircraft at `time_s`."""
+    """True state of the aircraft at `time_s`."""
 
 
 class BaroSampler:
-    """Read the BMP180 along a trajectory; it is on the IMU node."""
+    """Sample the BMP180, which is on the IMU node, along a trajectory."""
 
     def __init__(
         self, settings: SimulatorSettings, trajectory: SensorMotion, vehicle_id: int
@@ -471,7 +470,7 @@ class BaroSampler:
         self._ticks = Ticks(clock, settings.baro_rate_hz, BARO_PHASE_US)
 
     def take(self, until_s: float) -> BaroSamples:
-        """Run up to a true time and return every sample taken before it."""
+        """Return all samples before a true time that were not returned yet."""
         node_us, time_s = self._ticks.take(until_s)
         truth = self._trajectory.truth_at(time_s)
         pressure_pa, temperature_degc = self.barometer.sample(truth)

@@ -16,14 +16,15 @@ class SimulatorSettings(Settings, frozen=True):
     seed: Annotated[
         int,
         setting(
-            "Start of every random number; the same seed flies the same flight.", ge=0, le=2**32 - 1
+            "Seed of all random numbers; the same seed gives the same flight.", ge=0, le=2**32 - 1
         ),
     ] = 1
     vehicle_id: Annotated[
         int, setting("Vehicle id in the frames of the first aircraft.", ge=1, le=31)
     ] = 1
     vehicles: Annotated[
-        int, setting("How many aircraft share the receiver; their ids follow on.", ge=1, le=6)
+        int,
+        setting("Number of aircraft; they have consecutive ids.", ge=1, le=6),
     ] = 1
     home_lat_deg: Annotated[
         float, setting("Latitude of the runway's threshold.", "deg", ge=-80, le=80)
@@ -47,10 +48,10 @@ class SimulatorSettings(Settings, frozen=True):
     ] = 0.5
     vibration_mps2: Annotated[
         float,
-        setting("Standard deviation of the motor's shaking, full power.", "m/s2", ge=0, le=30),
+        setting("Standard deviation of the motor's vibration at full power.", "m/s2", ge=0, le=30),
     ] = 0.5
-    imu_rate_hz: Annotated[int, setting("IMU payloads a second.", "Hz", ge=10, le=1000)] = 100
-    baro_rate_hz: Annotated[int, setting("Barometer payloads a second.", "Hz", ge=1, le=50)] = 25
+    imu_rate_hz: Annotated[int, setting("IMU payloads per second.", "Hz", ge=10, le=1000)] = 100
+    baro_rate_hz: Annotated[int, setting("Barometer payloads per second.", "Hz", ge=1, le=50)] = 25
     gps_latency_s: Annotated[
         float,
         setting("Mean time from a fix's validity to its arrival at the node.", "s", ge=0.02, le=1),
@@ -78,17 +79,18 @@ class SimulatorSettings(Settings, frozen=True):
     imu_restart_s: Annotated[
         float,
         setting(
-            "When the IMU node restarts, its clock at zero again; 0 for never.", "s", ge=0, le=1e6
+            "Time at which the IMU node restarts; 0 for never.",
+            "s",
+            ge=0,
+            le=1e6,
         ),
     ] = 0.0
-    radio_loss: Annotated[float, setting("Share of payloads that never arrive.", ge=0, le=0.9)] = (
-        0.01
-    )
+    radio_loss: Annotated[float, setting("Share of payloads that are lost.", ge=0, le=0.9)] = 0.01
     radio_burst: Annotated[
         float, setting("Mean number of payloads that are lost in a row.", ge=1, le=500)
     ] = 1.0
     radio_duplicates: Annotated[
-        float, setting("Share of payloads that arrive twice.", ge=0, le=0.5)
+        float, setting("Share of payloads that are duplicated.", ge=0, le=0.5)
     ] = 0.001
     baud: Annotated[
         int, setting("Speed of the receiver's serial line.", "baud", ge=9600, le=2e6)

@@ -1,4 +1,4 @@
-"""The simulated flight as bytes of other trackers: CRSF of a flight controller, lines, a phone."""
+"""The simulated flight in the bytes of other trackers: CRSF, lines of text, a phone."""
 
 import json
 import math
@@ -20,28 +20,28 @@ from gateway.units import DEG_PER_DEGE7, DEGE7_PER_DEG, STANDARD_GRAVITY_MPS2, U
 from gateway.wire.link import Link
 
 RADIO: Final = 0xEA
-"""Address of the radio control in CRSF."""
+"""CRSF address of the remote control."""
 CRSF_HZ: Final = 50
 KMH10: Final = 36.0
-"""Of m/s, in tenths of a km/h."""
+"""Tenths of km/h per m/s."""
 FLYING_MPS: Final = 3.0
 FULL_V, EMPTY_V, CAPACITY_MAH = 12.6, 10.8, 1300.0
 COUNTS: Final = 32768.0
 GYRO_LSB: Final = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
 PUSH_S: Final = 0.2
-"""Between two posts of the simulated phone."""
+"""Interval between two posts of the simulated phone."""
 
 
 def crsf_frame(kind: int, payload: bytes) -> bytes:
-    """Write one frame of CRSF."""
+    """Encode one CRSF frame."""
     body = bytes([kind]) + payload
     return bytes([RADIO, len(body) + 1]) + body + bytes([dvb_s2(body)])
 
 
 def crsf_bytes(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:
-    """Fly the simulated aircraft, with a flight controller that sends CRSF, for ever.
+    """Simulate the flight endlessly, with a flight controller that sends CRSF.
 
-    Attitude 25 times a second, position 5, link and climb 5, mode 2, battery once.
+    Rates: attitude 25 Hz, position 5 Hz, link and climb 5 Hz, mode 2 Hz, battery 1 Hz.
     """
     motion = SimulatedAircraft(settings, 0, start_unix_us).trajectory
     tick = 0
@@ -103,11 +103,11 @@ _CRSF: Final[tuple[tuple[int, int, Callable[[Truth, int], bytes]], ...]] = (
     (25, 7, _mode),
     (50, 9, _battery),
 )
-"""Every how many ticks of `CRSF_HZ`, at which of them, and the frame."""
+"""Period in ticks of `CRSF_HZ`, phase in ticks, and function that encodes the frame."""
 
 
 def lines_bytes(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:
-    """Fly the simulated boards, and print what they measure as JSON and NMEA, for ever."""
+    """Simulate the flight endlessly, with the measurements as lines of JSON and NMEA."""
     link = Link()
     for frame in simulate(settings, start_unix_us).frames():
         records = link.feed(frame.data, round(frame.time_s * US_PER_S))
@@ -117,7 +117,7 @@ def lines_bytes(settings: SimulatorSettings, start_unix_us: int) -> Iterator[Tim
 
 
 def line_of(record: RawRecord) -> str:
-    """Print one record as a line; empty for a record that no line holds."""
+    """Format one record as a line; empty if lines cannot represent it."""
     match record:
         case ImuRaw():
             content: dict[str, object] = {
@@ -140,7 +140,7 @@ def line_of(record: RawRecord) -> str:
 
 
 def phone_bytes(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:
-    """Fly the simulated boards as a phone whose app Sensor Logger posts its readings, for ever."""
+    """Simulate the flight endlessly, with a phone whose app Sensor Logger posts its readings."""
     link = Link()
     payload: list[dict[str, object]] = []
     posted_s, number = 0.0, 0
@@ -155,7 +155,7 @@ def phone_bytes(settings: SimulatorSettings, start_unix_us: int) -> Iterator[Tim
 
 
 def _readings(record: RawRecord, start_unix_us: int) -> Iterator[dict[str, object]]:
-    """Yield the readings that Sensor Logger makes of a record."""
+    """Yield the readings that Sensor Logger would produce for a record."""
 
     def reading(name: str, **values: float) -> dict[str, object]:
         time_ns = (start_unix_us + record.time_us) * 1000
@@ -166,7 +166,7 @@ def _readings(record: RawRecord, start_unix_us: int) -> Iterator[dict[str, objec
             x, y, z = _scaled(
                 record.accel_raw, record.accel_range_g * STANDARD_GRAVITY_MPS2 / COUNTS
             )
-            # The axes of a phone that lies with its top to the nose.
+            # The axes of a phone whose top points to the nose.
             yield reading("gravity", x=0.0, y=0.0, z=STANDARD_GRAVITY_MPS2)
             yield reading("accelerometer", x=-y, y=x, z=round(z - STANDARD_GRAVITY_MPS2, 5))
             rate = math.radians(1.0 / GYRO_LSB[record.gyro_range_dps])
@@ -196,7 +196,7 @@ def _scaled(counts: tuple[int, int, int], scale: float) -> list[float]:
 
 
 def nmea_of(fix: GpsFix) -> str:
-    """Print a fix as GGA and RMC."""
+    """Format a fix as GGA and RMC."""
     second = (fix.utc_us or 0) // US_PER_S
     time = f"{second // 3600 % 24:02d}{second // 60 % 60:02d}{second % 60:02d}"
     time += f".{(fix.utc_us or 0) % US_PER_S // 10_000:02d}"
@@ -229,4 +229,4 @@ SOURCE_BYTES: Final[dict[str, Callable[[SimulatorSettings, int], Iterator[TimedF
     "lines": lines_bytes,
     "phone": phone_bytes,
 }
-"""By the kind of source."""
+"""Functions that produce the bytes, by kind of source."""

@@ -1,20 +1,20 @@
-"""A fixed-wing flight whose position, velocity, attitude and rates are exactly one motion.
+"""A fixed-wing flight whose position, velocity, attitude and rates are exactly consistent.
 
 Theory of operation. A plan of legs commands heading, horizontal airspeed and height over time as
-straight lines between corners; three moving averages round the corners, so every command is three
-times differentiable. Wind and gusts add to the motion through the air and give the velocity over
-ground; the bank is that of a coordinated turn, the pitch that of the climb plus the angle of attack
-that carries the load.
+straight lines between corners. Three moving averages round the corners, so every command is three
+times differentiable. Wind and gusts are added to the motion through the air to give the velocity
+over ground. The bank is that of a coordinated turn; the pitch is that of the climb plus the angle
+of attack for the load factor.
 
-Velocity and Euler angles on a 50 Hz grid become quintic splines. Position is the velocity spline's
-integral and acceleration its derivative; the body rate follows from the angles' derivatives. So
-truth is closed form at any time: integrating one quantity gives the other to machine precision.
+Velocity and Euler angles on a 50 Hz grid are interpolated by quintic splines. Position is the
+integral of the velocity spline and acceleration its derivative; the body rate follows from the
+derivatives of the angles. So the truth is closed form at any time: integrating one quantity gives
+the other to machine precision.
+The lengths of seven straight legs are solved for, so that in any wind the aircraft comes to rest
+where it started, after exactly `FLIGHT_S`, and the flight can be repeated without a jump. The earth
+does not rotate in this model, and is flat around home (a few centimetres of error at 1 km).
 
-The lengths of seven straight legs are solved for, so that the aircraft comes to rest where it began
-whatever the wind, after exactly `FLIGHT_S`: the flight can be repeated without a jump. The Earth
-does not rotate here, and is flat around home (a few centimetres at one kilometre).
-
-`Workbench` is the other motion: an aircraft that lies as a person puts it, or is turned by hand.
+`Workbench` is the other motion: an aircraft that a person puts down or turns by hand.
 """
 
 import math
@@ -42,16 +42,16 @@ CRUISE_HEIGHT_M: Final = 80.0
 SPLINE_DEGREE: Final = 5
 
 RUNWAY_OFF_WIND_DEG: Final = 15.0
-"""Take-off and landing are into the wind, but not straight."""
+"""Angle between runway and wind: take-off and landing are into the wind, but not exactly."""
 
 HEADING_ROUNDING_S: Final = 2.4
 SPEED_ROUNDING_S: Final = 3.0
 HEIGHT_ROUNDING_S: Final = 3.6
 WIND_ROUNDING_S: Final = 6.0
-"""Wind gradient near the ground; long enough to keep its acceleration below 1 m/s2."""
+"""Duration of the rounded wind gradient near the ground, to keep its acceleration below 1 m/s2."""
 
 ATTACK_RAD: Final = math.radians(4.0)
-"""Angle of attack that carries the weight at cruise."""
+"""Angle of attack at which the lift equals the weight at cruise."""
 ATTITUDE_UNREST_RAD: Final = (math.radians(1.5), math.radians(0.8), math.radians(0.8))
 """Standard deviation of roll, pitch and yaw about the coordinated attitude, in flight."""
 GUST_BANDWIDTH_HZ: Final = 0.5
@@ -61,24 +61,24 @@ MIN_LEG_S: Final = 3.0
 CLOSURE_M: Final = 1e-6
 MAX_ITERATIONS: Final = 30
 STEP_WEIGHT: Final = 1e-2
-"""Weight of a second's change against a metre's gap: enough to choose the least change."""
+"""Weight of a change by 1 s relative to a gap of 1 m: enough to prefer the least changes."""
 LIFT_OFF: Final = 2
 ROLL_RADPS: Final = 1.1
 YAW_RADPS: Final = 0.8
 PITCH_RAD: Final = 1.3
 PITCH_RADPS: Final = 0.47
-"""Rates without a common period: within a minute every side of the aircraft points everywhere."""
+"""Rates without a common period, so that within a minute all sides point in all directions."""
 
 
 class Leg(NamedTuple):
-    """One stretch of the plan; speed and height are those at its end."""
+    """One part of the plan; speed and height are the values at its end."""
 
     duration_s: float
     turn_deg: float
     speed_mps: float
     height_m: float
     free: bool = False
-    """Whether its duration may be changed to bring the aircraft home."""
+    """Whether its duration can be changed to end the flight at home."""
 
 
 PLAN: Final = (
@@ -108,24 +108,24 @@ PLAN: Final = (
 """Rest, take-off roll, climb, left-hand circuit with a figure of eight, a steep full circle,
 descent, landing, roll-out, rest."""
 TOUCH_DOWN: Final = len(PLAN) - 2
-"""Legs at whose start the aircraft leaves and meets the ground."""
+"""Indices of the legs at whose start the aircraft leaves and touches the ground."""
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The aircraft's true state at N times; arrays of float64."""
+    """The aircraft's true state at N times, as arrays of float64."""
 
     time_s: FloatArray
-    """Shape (N,), since the start of the simulation."""
+    """Shape (N,), time since the start of the simulation."""
     lat_deg: FloatArray
     lon_deg: FloatArray
     alt_amsl_m: FloatArray
     pos_n_m: FloatArray
     """Shape (N, 3), NED from home."""
     vel_n_mps: FloatArray
-    """Shape (N, 3), over ground."""
+    """Shape (N, 3), velocity over ground."""
     accel_n_mps2: FloatArray
-    """Shape (N, 3), kinematic: zero at rest."""
+    """Shape (N, 3), kinematic acceleration: zero at rest."""
     q_nb: FloatArray
     """Shape (N, 4), scalar first, unit norm, continuous within one flight."""
     rate_b_radps: FloatArray
@@ -133,11 +133,11 @@ class Truth:
     accel_b_mps2: FloatArray
     """Shape (N, 3), specific force in body FRD: the reading of an ideal accelerometer."""
     airspeed_mps: FloatArray
-    """Shape (N,), mean motion through the air, gusts left out."""
+    """Shape (N,), mean airspeed, without gusts."""
 
 
 class SensorMotion(Protocol):
-    """Motion of the simulated sensors."""
+    """Motion that the simulated sensors measure."""
 
     def truth_at(self, time_s: FloatArray) -> Truth:
         """Return the true state at any times."""
@@ -147,7 +147,7 @@ class SensorMotion(Protocol):
 
 
 class Trajectory:
-    """One planned flight, repeated for ever; ValueError if no plan ends at home in this wind."""
+    """One planned flight, repeated endlessly; ValueError if no plan ends at home in this wind."""
 
     def __init__(self, settings: SimulatorSettings, rng: np.random.Generator) -> None:
         self._settings = settings
@@ -203,10 +203,10 @@ class Trajectory:
         return from_euler_array(self._angles(time_s % FLIGHT_S))
 
     def _close(self, gusts: FloatArray) -> FloatArray:
-        """Find leg durations that end the flight at home and in time, by Gauss-Newton steps.
+        """Solve for leg durations that end the flight at home and in time, by Gauss-Newton steps.
 
-        One second more on a straight leg moves the end by that leg's ground velocity; of all steps
-        that close the gap, the least one in duration is taken.
+        One second more on a straight leg moves the end by its ground velocity; of all steps that
+        close the gap, the one with the least change of durations is taken.
         """
         durations_s = np.array([leg.duration_s for leg in PLAN])
         free = np.array([leg.free for leg in PLAN])
@@ -223,7 +223,7 @@ class Trajectory:
             least = np.vstack([jacobian, np.eye(free.sum()) * STEP_WEIGHT])
             bounds = (MIN_LEG_S - 1e-9 - durations_s[free], np.inf)
             durations_s[free] += lsq_linear(least, -gap, bounds).x
-        raise ValueError(f"no way home in a wind of {self._settings.wind_mps} m/s")
+        raise ValueError(f"no flight ends at home in a wind of {self._settings.wind_mps} m/s")
 
     def _velocity(self, commands: "_Commands", gusts: FloatArray) -> BSpline:
         s = self._settings
@@ -231,7 +231,7 @@ class Trajectory:
         wind = np.array([math.cos(blows_to_rad), math.sin(blows_to_rad), 0.0]) * s.wind_mps
         aloft = commands.aloft
         gusts = gusts * aloft
-        # Up and down gusts cancel over the flight: it must end at the runway's height.
+        # Vertical gusts cancel over the flight, which must end at the height of the runway.
         gusts[:, 2] -= aloft[:, 0] * gusts[:, 2].sum() / aloft.sum()
         through_air = np.column_stack(
             [
@@ -252,9 +252,9 @@ class _Commands:
     speed_mps: FloatArray
     climb_mps: FloatArray
     airborne: FloatArray
-    """0 on the ground, 1 in the air, with a smooth step."""
+    """0 on the ground, 1 in the air, with a smooth transition."""
     aloft: FloatArray
-    """Shape (N, 1): share of the wind that blows at this height."""
+    """Shape (N, 1): share of the full wind at this height."""
 
     @staticmethod
     def of(durations_s: FloatArray, grid_s: FloatArray, runway_deg: float) -> "_Commands":
@@ -267,7 +267,7 @@ class _Commands:
             return _round(np.interp(grid_s, ends_s, corners), width_s)
 
         def step(start_s: float, end_s: float, width_s: float) -> FloatArray:
-            # The edge of a whole grid step keeps the result smooth in the times.
+            # Edges of a whole grid step make the result a smooth function of the durations.
             edges_s = np.array([start_s, start_s + 1 / GRID_HZ, end_s, end_s + 1 / GRID_HZ])
             return _round(np.interp(grid_s, edges_s, [0.0, 1.0, 1.0, 0.0]), width_s)
 
@@ -286,7 +286,7 @@ class _Commands:
 
 
 def rotate_inverse(q_nb: FloatArray, v_n: FloatArray) -> FloatArray:
-    """Take many vectors from NED to the body frame.
+    """Rotate many vectors from NED to the body frame.
 
     Parameters
     ----------
@@ -302,7 +302,7 @@ def rotate_inverse(q_nb: FloatArray, v_n: FloatArray) -> FloatArray:
     """
     w, x, y, z = q_nb.T * ((1.0,), (-1.0,), (-1.0,), (-1.0,))
     a, b, c = np.broadcast_to(v_n, (len(q_nb), 3)).T
-    # Written out: NumPy's cross product costs more than all the rest on short arrays.
+    # Written out: on short arrays NumPy's cross product takes longer than all the rest.
     ta, tb, tc = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
     return np.column_stack(
         [a + w * ta + y * tc - z * tb, b + w * tb + z * ta - x * tc, c + w * tc + x * tb - y * ta]
@@ -314,13 +314,13 @@ def _runway_deg(settings: SimulatorSettings) -> float:
 
 
 def _attitude(commands: _Commands) -> FloatArray:
-    """Fly the commands in coordination: roll, pitch and continuous yaw, shape (N, 3)."""
+    """Return roll, pitch and continuous yaw of coordinated flight, shape (N, 3)."""
     speed = commands.speed_mps
     sideways = speed * commands.turn_radps
     bank = np.arctan2(sideways, STANDARD_GRAVITY_MPS2)
     climb_angle = np.arctan2(commands.climb_mps, np.maximum(speed, 1.0))
     load = np.hypot(sideways, STANDARD_GRAVITY_MPS2) / STANDARD_GRAVITY_MPS2
-    # The constant added to the speed keeps the quotient smooth on the ground, where no lift is.
+    # The constant added to the speed keeps the quotient smooth on the ground, without lift.
     carrying = (CRUISE_MPS**2 + 25.0) / (speed**2 + 25.0)
     attack = ATTACK_RAD * load * carrying * commands.airborne
     path = Rotation.from_euler("ZYX", np.column_stack([commands.heading_rad, climb_angle, bank]))
@@ -330,7 +330,7 @@ def _attitude(commands: _Commands) -> FloatArray:
 
 
 def body_rates(angles: FloatArray, rates: FloatArray) -> FloatArray:
-    """Turn Euler angle rates into the body rate: the exact derivative of the quaternion."""
+    """Convert Euler angle rates to the body rate: the exact derivative of the quaternion."""
     roll, pitch, _ = angles.T
     roll_rate, pitch_rate, yaw_rate = rates.T
     return np.column_stack(
@@ -347,7 +347,7 @@ def _spline(grid_s: FloatArray, values: FloatArray) -> BSpline:
 
 
 def _round(values: FloatArray, width_s: float) -> FloatArray:
-    """Round corners by three moving averages of together `width_s`; ends keep their values."""
+    """Round corners by three moving averages of `width_s` in total; the ends are unchanged."""
     size = 2 * round(width_s * GRID_HZ / 6.0) + 1
     for _ in range(3):
         values = uniform_filter1d(values, size, mode="nearest")
@@ -358,7 +358,7 @@ def _coloured(rng: np.random.Generator, size: int, bandwidth_hz: float) -> Float
     """Draw smooth noise of unit variance on three axes, shape (size, 3)."""
     settled = round(5.0 * GRID_HZ / bandwidth_hz)
     white = rng.standard_normal((settled + size, 3))
-    # Third-order Butterworth by the bilinear transform; its wrap-around has settled by then.
+    # Third-order Butterworth by the bilinear transform; its wrap-around has decayed by then.
     half_rad = np.pi * np.fft.rfftfreq(len(white))
     s = 1j * np.tan(half_rad)[:, np.newaxis] / math.tan(math.pi * bandwidth_hz / GRID_HZ)
     gain = 1.0 / ((1.0 + s) * (1.0 + s + s**2))
@@ -368,7 +368,7 @@ def _coloured(rng: np.random.Generator, size: int, bandwidth_hz: float) -> Float
 
 
 class Workbench:
-    """The motion of an aircraft that a person holds."""
+    """The motion of an aircraft that a person handles."""
 
     def __init__(self, settings: SimulatorSettings) -> None:
         self._settings = settings
@@ -377,16 +377,16 @@ class Workbench:
         self._lies_rad = np.zeros(3)
 
     def lay(self, roll_rad: float, pitch_rad: float) -> None:
-        """Lay it down at this attitude, from the next sampled time on."""
+        """Put the aircraft down in this attitude, from the next sampled time on."""
         self._turned_from_s = np.inf
         self._lies_rad = np.array([roll_rad, pitch_rad, 0.0])
 
     def turn(self) -> None:
-        """Begin to turn it, from the last sampled time on."""
+        """Start turning the aircraft, from the last sampled time on."""
         self._turned_from_s = min(self._turned_from_s, self._sampled_s)
 
     def truth_at(self, time_s: FloatArray) -> Truth:
-        """Return the true state at any times, as `Trajectory.truth_at` does."""
+        """Return the true state at any times, as `Trajectory.truth_at`."""
         t = np.asarray(time_s, dtype=np.float64)
         self._sampled_s = max(self._sampled_s, float(t.max(initial=0.0)))
         angles, rates = self._angles(t)
@@ -413,7 +413,7 @@ class Workbench:
     def _angles(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return roll, pitch and yaw and their rates, shape (N, 3)."""
         since_s = np.maximum(time_s - self._turned_from_s, 0.0)
-        # It gathers speed within some seconds: s' = 1 - exp(-t).
+        # The rate increases gradually over some seconds: s' = 1 - exp(-t).
         s, s_rate = since_s + np.expm1(-since_s), -np.expm1(-since_s)
         pitch = PITCH_RAD * np.sin(PITCH_RADPS * s)
         pitch_rate = PITCH_RAD * PITCH_RADPS * np.cos(PITCH_RADPS * s)

@@ -1,1 +1,1 @@
-"""Sources other than the receiver: bytes of any tracker, radio or phone in, records out."""
+"""Sources other than the receiver: convert the bytes of a tracker, radio or phone to records."""

@@ -1,16 +1,16 @@
-"""CRSF: telemetry of ExpressLRS and Crossfire links, as EdgeTX mirrors it or a receiver sends it.
+"""CRSF: telemetry of ExpressLRS and Crossfire links, mirrored by EdgeTX or sent by a receiver.
 
 Theory of operation. A frame is address, length, type, payload and a CRC-8 of type and payload; any
 address is accepted, since each hop writes its own.
 
-Scales are those that Betaflight sends and EdgeTX shows; they differ from the published
-specification where that states 10 uV for a tenth of a volt, and 0.01 km/h for a tenth of a km/h.
-So do the axes of accelerometer and gyroscope (0x13): x forward, y right and z down, of both.
+Scales are those that Betaflight sends and EdgeTX displays. The published specification differs: it
+states 10 uV instead of 0.1 V, and 0.01 km/h instead of 0.1 km/h. It differs as well in the axes of
+accelerometer and gyroscope (0x13), which are x forward, y right and z down for both.
 
-ArduPilot's own frames (0x80) contain packets of FrSky's passthrough protocol. The mode, the arming
-and the type of the vehicle are taken from them where they come, and else from the text of the
-flight mode. Betaflight and INAV count the pitch positive with the nose down, in the specification
-it is positive with the nose up.
+ArduPilot's own frames (0x80) contain packets of FrSky's passthrough protocol. Mode, arming state
+and vehicle type are taken from them if they are received, otherwise from the text of the flight
+mode. Betaflight and INAV count pitch as positive with the nose down, the specification with the
+nose up.
 
 References
 ----------
@@ -53,19 +53,19 @@ from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
 
 MIN_LENGTH, MAX_LENGTH = 2, 62
-"""Of type, payload and CRC."""
+"""Limits of the length byte, which counts type, payload and CRC."""
 HEAD: Final = 2
 MSP_START, MSP_HEAD = b"$X", 8
-"""Of the packet, with a CRC at its end, in which an ExpressLRS Backpack sends a frame by UDP."""
+"""Start and header size of the packet with a CRC in which an ExpressLRS Backpack sends frames."""
 KMH10_MPS: Final = 1.0 / 36.0
 SPEED_RANGE, SPEED_LINEAR = 0.026, 100.0
-"""Of the packed vertical speed, cm/s: (exp(|n| * 0.026) - 1) * 100."""
+"""Encoding of the vertical speed, cm/s: (exp(|n| * 0.026) - 1) * 100."""
 ACCEL_LSB_MPS2: Final = 16.0 * STANDARD_GRAVITY_MPS2 / 32767.0
 GYRO_LSB_DPS: Final = 2000.0 / 32767.0
 MAG_LSB_UT: Final = 0.1 / 3.0
-"""A third of a milligauss."""
+"""A third of a milligauss, in µT."""
 EXTRA_AGE_US: Final = 2 * US_PER_S
-"""How long the extended frame and the time belong to later fixes."""
+"""Maximum age of the extended frame and of the time, to be used with a fix."""
 PERCENT: Final = 100
 UNUSED: Final = frozenset(
     {0x0B, 0x10, 0x15, 0x17, 0x18, 0x22, 0x28, 0x2B, 0x2C, 0x2D, 0x2E, 0x32, 0x34, 0x3A, 0x3C}
@@ -77,7 +77,7 @@ ADDRESSES: Final = frozenset(
     {0x00, 0x0E, 0x10, 0x12, 0x13, 0x14, 0x80, 0xC0, 0xC2, 0xC4, 0xC8, 0xCC, 0xCE, 0xEA, 0xEB}
     | {0xEC, 0xED, 0xEE, 0xEF}
 )
-"""Those of the specification."""
+"""Addresses in the specification."""
 SIZES: Final = {
     0x02: (15, 15), 0x03: (9, 9), 0x06: (20, 20), 0x07: (2, 4), 0x08: (8, 8), 0x09: (2, 4),
     0x0A: (2, 2), 0x0C: (4, 58), 0x0D: (3, 41), 0x0E: (3, 59), 0x11: (8, 8), 0x12: (6, 6),
@@ -85,9 +85,9 @@ SIZES: Final = {
     0x1C: (5, 5), 0x1D: (6, 6), 0x1E: (6, 6), 0x1F: (9, 9), 0x21: (1, 32), 0x29: (16, 60),
     0x7F: (3, 60), 0x80: (3, 60),
 }  # fmt: skip
-"""Least and greatest payload of the types that are read. Behind an address that is not of the
-specification only these are frames: eight bits of CRC fit one noise in 256, and a wrong length
-would hold back the frames behind it."""
+"""Minimum and maximum payload of the types that are read. After an address outside of the
+specification only these are accepted as frames: noise has a valid 8-bit CRC once in 256 times, and
+a wrong length would delay the frames after it."""
 Parts = dict[str, Any]
 
 
@@ -108,7 +108,7 @@ class CrsfDecoder(CheckedFrames):
         self._fix: GpsFix | None = None
         self._clock = SampleClock()
         self._mag_ut: Vec3 | None = None
-        """The compass's newest field, until a sample has it."""
+        """Newest magnetic field, until it is used in a sample."""
         self._readers: dict[int, Callable[[bytes, int], Any]] = {
             0x02: self._gps,
             0x03: self._gps_time,
@@ -138,7 +138,7 @@ class CrsfDecoder(CheckedFrames):
         return super().feed(data, arrival_us)
 
     def size_at(self, data: bytes, at: int) -> int:
-        """Return the size of the frame that begins there, complete or not; 0 if none does."""
+        """Return the size of a frame that begins here, complete or not; 0 if there is none."""
         length, end = data[at + 1], at + HEAD + data[at + 1]
         least, most = SIZES.get(data[at + HEAD], (0, -1))
         if data[at] in ADDRESSES:
@@ -149,7 +149,7 @@ class CrsfDecoder(CheckedFrames):
         return 0 if wrong else HEAD + length
 
     def read(self, frame: bytes, arrival_us: int) -> list[Any]:
-        """Return the records and faults of a frame."""
+        """Return the records and faults in a frame."""
         kind, payload = frame[HEAD], frame[HEAD + 1 : -1]
         read = self._readers.get(kind)
         if read is None:
@@ -216,7 +216,7 @@ class CrsfDecoder(CheckedFrames):
         self._mag_ut = (x, y, z)
 
     def _inertial(self, payload: bytes, arrival_us: int) -> ImuRaw | None:
-        """Read a sample, whose axes become x forward, y left and z up, as those of the compass."""
+        """Read a sample, with its axes converted to x forward, y left, z up, as for the compass."""
         stamp_us, *counts, centidegrees = struct.unpack_from(">I7h", payload)
         gx, gy, gz = (count * GYRO_LSB_DPS for count in counts[:3])
         ax, ay, az = (count * ACCEL_LSB_MPS2 for count in counts[3:])
@@ -237,7 +237,7 @@ class CrsfDecoder(CheckedFrames):
         if mode.nose_down and not self._fixed_sign:
             self._nose_down = True
         if not self._type_is_set and mode.vehicle_type is not None and self._type != FIXED_WING:
-            # One mode of an aeroplane decides; the others have the same names on a copter.
+            # This mode exists only on aeroplanes; all others have the same names on copters.
             self._type = mode.vehicle_type
         kind = self._type
         number = mode.plane if kind == FIXED_WING else mode.copter
@@ -245,7 +245,7 @@ class CrsfDecoder(CheckedFrames):
         return {"mode": mode.name, "custom_mode": number, "vehicle_type": kind, **armed}
 
     def _device(self, payload: bytes, _arrival_us: int) -> Parts:
-        """Betaflight and INAV write their names into the device information."""
+        """Read the device information, in which Betaflight and INAV send their names."""
         name = payload[2:].partition(b"\0")[0].lower()
         if name.startswith((b"betaflight", b"inav", b"emuflight")):
             self._nose_down = self._nose_down if self._fixed_sign else True
@@ -254,7 +254,7 @@ class CrsfDecoder(CheckedFrames):
         return {}
 
     def _ardupilot(self, payload: bytes, arrival_us: int) -> Parts:
-        """Read texts, and packets of FrSky's passthrough, one or several."""
+        """Read texts, and one or several packets of FrSky's passthrough protocol."""
         kind, body = payload[0], payload[1:]
         if kind == 0xF1:
             text = body[1:].partition(b"\0")[0].decode("utf-8", "replace")
@@ -281,7 +281,7 @@ class CrsfDecoder(CheckedFrames):
         return {}
 
     def _home(self, value: int, arrival_us: int) -> Parts:
-        """Distance and direction of home from the vehicle, and the height above it."""
+        """Read distance and direction from the vehicle to home, and the height above home."""
         distance_m = _number(value & 0xFFF, 2)
         height_m = 0.1 * _number(value >> 12 & 0xFFF, 2) * (-1.0 if value >> 24 & 1 else 1.0)
         found: Parts = {"alt_home_m": height_m}
@@ -298,7 +298,7 @@ class CrsfDecoder(CheckedFrames):
 
 
 def _number(bits: int, width: int) -> float:
-    """Read a number of the passthrough protocol: the power of ten in its lowest bits."""
+    """Decode a number of the passthrough protocol, with a power of ten in its lowest bits."""
     mantissa: float = (bits >> width) * 10.0 ** (bits & (1 << width) - 1)
     return mantissa
 
@@ -324,7 +324,7 @@ def _mavlink_fc(payload: bytes, _arrival_us: int) -> Parts:
 
 
 def _scaled(kind: str, at: int, name: str, unit: float) -> Callable[[bytes, int], Parts]:
-    """Return a reader of one number of a payload."""
+    """Return a reader for a scaled number in a payload."""
 
     def read(payload: bytes, _arrival_us: int) -> Parts:
         return {name: struct.unpack_from(kind, payload, at)[0] * unit}
@@ -382,7 +382,7 @@ def _cells(payload: bytes, _arrival_us: int) -> Parts:
 
 
 def _link(payload: bytes, _arrival_us: int) -> Parts:
-    """Read the signal of the downlink, by which telemetry comes, and the quality of the uplink."""
+    """Read the signal of the downlink, which carries telemetry, and the quality of the uplink."""
     first, second, quality, snr, antenna, _, _, down, _, down_snr = struct.unpack_from(
         ">BBBbBBBBBb", payload
     )
@@ -418,4 +418,4 @@ _STATELESS: Final[dict[int, Callable[[bytes, int], Parts]]] = {
     0x1D: _link_of_transmitter,
     0x1F: _mavlink_fc,
 }
-"""Readers of frames that depend on no other frame."""
+"""Readers of frames that do not depend on other frames."""

@@ -1,8 +1,8 @@
-"""Lines of CSV in a stream, by the map of columns that `--columns` reads for files.
+"""Lines of CSV in a stream, with the same column maps that `--columns` reads for files.
 
-The names of the columns come in a line of the stream, again after every restart of the sender, or
-in the option `names`. Axes and units are those of the map, but accelerometer, gyroscope and compass
-are taken for uncalibrated and in sensor axes, as of every source.
+The column names are in a line of the stream, repeated after every restart of the sender, or in the
+option `names`. Axes and units are those of the map, but accelerometer, gyroscope and compass are
+treated as uncalibrated and in sensor axes, as for every source.
 """
 
 import math
@@ -20,7 +20,7 @@ from gateway.wire.timesync import WRAP_MASK
 
 
 def read_column_map(text: str) -> ColumnMap:
-    """Read a map of columns; raises ValueError if it is wrong."""
+    """Read a column map; raises ValueError if it is invalid."""
     try:
         return msgspec.convert(tomllib.loads(text), ColumnMap)
     except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
@@ -28,7 +28,7 @@ def read_column_map(text: str) -> ColumnMap:
 
 
 class CsvLines:
-    """Read the lines of one sender."""
+    """Convert the lines of one sender to records."""
 
     def __init__(self, column_map: ColumnMap, names: str, node: NodeId) -> None:
         self._map = column_map
@@ -39,12 +39,12 @@ class CsvLines:
         self._wanted = {each if isinstance(each, str) else each.column for each in wanted}
 
     def line(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:
-        """Process one line: that with the names, or one with values."""
+        """Process a line with column names or with values."""
         if self._is_header(line):
             self._header = line
             return []
         if not self._header:
-            return [unusable("csv", line, "comes before the line with the names of the columns")]
+            return [unusable("csv", line, "comes before the line of column names")]
         reader = CsvReader(self._map, lenient=True)
         try:
             blocks = [*reader.blocks([self._header, line])]

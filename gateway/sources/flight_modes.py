@@ -1,7 +1,7 @@
-"""Names of flight modes to ArduPilot's numbers, by which ground stations name a mode.
+"""Map names of flight modes to ArduPilot's numbers, with which ground stations name modes.
 
-Flight controllers report the mode as a few letters: Betaflight, INAV and ArduPilot each have their
-own. A mark behind them (`*`, `!`, `?`) means that the vehicle is not armed.
+Flight controllers report the mode in a few letters; Betaflight, INAV and ArduPilot use different
+ones. A suffix (`*`, `!`, `?`) means that the vehicle is not armed.
 """
 
 from dataclasses import dataclass
@@ -25,16 +25,16 @@ NUMBERS: Final[dict[str, tuple[int | None, int | None]]] = {
     "SPRT": (13, None), "TRAN": (None, 8), "QSTB": (None, 17), "QHOV": (None, 18),
     "QLOT": (None, 19), "QLND": (None, 20), "QRTL": (None, 21),
 }  # fmt: skip
-"""Of a copter and of an aeroplane, by the letters."""
+"""Mode numbers of copter and aeroplane, by the letters."""
 OF_BETAFLIGHT: Final = frozenset({"ANGL", "HOR", "AIR", "RTH", "WAIT", "OK", "!ERR", "3CRS", "WP"})
-"""Written by Betaflight and INAV, never by ArduPilot."""
+"""Texts that Betaflight and INAV send, and ArduPilot never does."""
 NOT_ARMED: Final = frozenset({"OK", "WAIT", "!ERR"})
 FAILSAFE: Final = "!FS!"
 MARKS: Final = "*!?"
 
 
 def wanted_type(url: SourceUrl) -> int | None:
-    """Return the MAV_TYPE of the option `type`; raises ValueError for an unknown one."""
+    """Return the MAV_TYPE in the option `type`; raises ValueError for an unknown one."""
     name = url.options.get("type")
     found: int | None = getattr(mavlink, f"MAV_TYPE_{name.upper()}", None) if name else None
     if name is not None and found is None:
@@ -44,20 +44,20 @@ def wanted_type(url: SourceUrl) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class TextMode:
-    """A mode as its text describes it."""
+    """A flight mode, decoded from its text."""
 
     name: str
     copter: int | None
     plane: int | None
     armed: bool | None
-    """None where the text does not show it."""
+    """Whether the vehicle is armed; None if the text does not show it."""
     vehicle_type: int | None
     nose_down: bool
-    """Whether its autopilot counts the pitch positive with the nose down."""
+    """Whether the autopilot counts pitch as positive with the nose down."""
 
 
 def mode_of_text(text: str) -> TextMode:
-    """Read the letters of a mode and the mark behind them."""
+    """Decode the letters of a mode and the suffix."""
     whole = text in NOT_ARMED or text == FAILSAFE
     name = text if whole else text.rstrip(MARKS).strip()
     armed: bool | None = text not in NOT_ARMED and name == text
@@ -71,7 +71,7 @@ def mode_of_text(text: str) -> TextMode:
 
 
 def ardupilot_mode(vehicle_type: int | None, number: int) -> str:
-    """Name a mode of ArduPilot; of a type that is not known yet, by its number."""
+    """Return the name of an ArduPilot mode; its number if the vehicle type is unknown."""
     if vehicle_type is None:
         return f"MODE {number}"
     return mode_name(mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, vehicle_type, number) or f"MODE {number}"

@@ -1,4 +1,4 @@
-"""The kinds of sources by the scheme of their URLs; other packages may add some."""
+"""Kinds of sources by the scheme of their URLs; other packages can add more."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,8 +21,8 @@ from gateway.sources.settings import (
 from gateway.sources.source import PolledDecoder, SourceDecoder, SourceInput
 
 SourceKind = Callable[[SourceUrl, NodeId], SourceDecoder]
-"""Makes a decoder of the URL, for its options, and the node that its records are from; raises
-ValueError for an option that is wrong."""
+"""Makes a decoder from the URL with its options, and the node of its records; raises ValueError
+for an invalid option."""
 
 SOURCE_KINDS: Final[dict[str, tuple[SourceKind, tuple[str, ...]]]] = {
     "lines": (LinesDecoder, ("columns", "names")),
@@ -30,7 +30,7 @@ SOURCE_KINDS: Final[dict[str, tuple[SourceKind, tuple[str, ...]]]] = {
     "ltm": (LtmDecoder, ("type",)),
     "phone": (PhoneDecoder, ("sensors", "geoid_m")),
 }
-"""Decoder and options of each kind."""
+"""Decoder and options by kind."""
 
 
 def add_source_kind(name: str, make: SourceKind, options: tuple[str, ...] = ()) -> None:
@@ -39,24 +39,24 @@ def add_source_kind(name: str, make: SourceKind, options: tuple[str, ...] = ()) 
     Parameters
     ----------
     name : str
-        The scheme of its URLs.
+        Scheme of its URLs.
     make : callable
-        Makes its decoder of a parsed URL and the node of its records.
+        Makes the decoder from a parsed URL and the node of its records.
     options : tuple of str
-        The names that may follow `?`, in addition to those of every source.
+        Names of its URL options, in addition to those of all sources.
 
     Raises
     ------
     ValueError
-        If the name is taken.
+        If the name exists already.
     """
     if name in SOURCE_KINDS:
-        raise ValueError(f"source kind {name!r} is added twice")
+        raise ValueError(f"source kind {name!r} exists already")
     SOURCE_KINDS[name] = (make, options)
 
 
 def check_source(url: SourceUrl) -> None:
-    """Raise ValueError for an unknown kind or option, or a number that is none."""
+    """Raise ValueError for an unknown kind or option, or an option that is not a number."""
     if url.kind not in SOURCE_KINDS:
         raise ValueError(f"source {url.name!r}: {unknown_choice('kind', url.kind, SOURCE_KINDS)}")
     _, own = SOURCE_KINDS[url.kind]
@@ -87,7 +87,7 @@ def make_sources(
 ) -> list[SourceInput]:
     """Make all sources of the settings; raises ValueError as `make_decoder`.
 
-    `read` returns the text of a file, such as that of a map of columns.
+    `read` returns the text of a file, such as a column map.
     """
     found = []
     for each, node in zip(settings, nodes_of(settings), strict=True):

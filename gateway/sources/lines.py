@@ -1,11 +1,11 @@
 """Lines of text: JSON objects, NMEA 0183 sentences and CSV, mixed in one stream.
 
-| line begins with | is                                                                    |
-| ---------------- | --------------------------------------------------------------------- |
-| `{`              | a JSON object; its keys are those of `KEYS`                           |
-| `$` or `!`       | an NMEA 0183 sentence                                                 |
-| `#`              | a comment                                                             |
-| anything else    | CSV, by the map of columns of the option `columns`                    |
+| a line begins with | it is                                                             |
+| ------------------ | ----------------------------------------------------------------- |
+| `{`                | a JSON object; its keys are those of `KEYS`                       |
+| `$` or `!`         | an NMEA 0183 sentence                                             |
+| `#`                | a comment                                                         |
+| anything else      | CSV, with the column map in the option `columns`                  |
 """
 
 import json
@@ -34,7 +34,7 @@ from gateway.wire.timesync import WRAP_MASK
 
 MAX_LINE: Final = 4096
 PACKETS: Final = ("udp", "receiver")
-"""Transports that keep the bounds of what was sent."""
+"""Transports that preserve message boundaries."""
 
 DEG_PER_RAD: Final = math.degrees(1.0)
 VECTORS: Final = {
@@ -47,7 +47,7 @@ VECTORS: Final = {
     "vel_n_mps": ("vel", 1.0),
     "attitude_deg": ("attitude", math.radians(1.0)),
 }
-"""Quantity and factor of each key with three numbers."""
+"""Quantity and factor by key, for keys with three numbers."""
 NUMBERS: Final = {
     "pressure_pa": ("pressure", 1.0),
     "pressure_hpa": ("pressure", 100.0),
@@ -73,7 +73,7 @@ NUMBERS: Final = {
     "t_ms": ("t_ms", 1.0),
     "id": ("id", 1.0),
 }
-"""Quantity and factor of each key with a number."""
+"""Quantity and factor by key, for keys with one number."""
 TEXTS: Final = ("mode", "text")
 KEYS: Final = (*VECTORS, *NUMBERS, *TEXTS, "armed")
 _NOTICE: Final = 5
@@ -85,9 +85,9 @@ REPORTED: Final = frozenset(
 
 
 class LineSplitter:
-    """Lines of the bytes of a transport, of a greatest length.
+    """Split the bytes of a transport into lines of a maximum length.
 
-    A datagram or packet ends its last line, whether or not a line feed does.
+    A datagram or packet ends its last line, with or without a line feed.
     """
 
     def __init__(self, transport: str, max_line: int = MAX_LINE) -> None:
@@ -96,7 +96,7 @@ class LineSplitter:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[str | Fault]:
-        """Decode any chunk, and return the lines that it completes."""
+        """Process any chunk, and return the lines that it completes."""
         *lines, rest = (self._rest + data + self._end).split(b"\n")
         found: list[str | Fault] = [
             line.decode("utf-8", "replace").strip()
@@ -111,7 +111,7 @@ class LineSplitter:
         return found
 
     def reset(self) -> None:
-        """Discard a line that has not ended."""
+        """Discard an incomplete line."""
         self._rest = b""
 
 
@@ -131,7 +131,7 @@ class LinesDecoder:
         self._has_own_id = "id" in url.options
 
     def reset(self) -> None:
-        """Discard a line that has not ended."""
+        """Discard an incomplete line."""
         self._splitter.reset()
 
     def feed(self, data: bytes, arrival_us: int) -> list[SourceRecord | Fault]:
@@ -153,13 +153,13 @@ class LinesDecoder:
             return []
         if self._csv is not None:
             return self._csv.line(line, arrival_us)
-        return [unusable("text", line, "neither JSON, NMEA nor CSV of a map (?columns=FILE)")]
+        return [unusable("text", line, "neither JSON, NMEA nor CSV with a map (?columns=FILE)")]
 
     def _json(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:
         try:
             content = json.loads(line)
         except (ValueError, RecursionError):
-            return [unusable("json", line, "no JSON object")]
+            return [unusable("json", line, "not a JSON object")]
         values = read_keys(content)
         unknown = [key for key in content if key not in KEYS]
         vehicle = values.get("id")
@@ -177,14 +177,14 @@ class LinesDecoder:
         records = records_of(values, node, time_us)
         faults: list[SourceRecord | Fault] = []
         if unknown:
-            faults.append(unusable("json key", str(unknown[0]), "unknown key, not used"))
+            faults.append(unusable("json key", str(unknown[0]), "unknown key, ignored"))
         elif not records:
             faults.append(unusable("json", line, "has no key with a valid value"))
         return [*records, *faults]
 
 
 def read_keys(content: Mapping[str, Any]) -> dict[str, float | Vec3 | str | bool]:
-    """Read the known keys of an object by quantity, in SI but deg/s; leave out invalid values."""
+    """Read the known keys of an object by quantity, in SI except for deg/s; skip invalid values."""
     found: dict[str, float | Vec3 | str | bool] = {}
     for key, value in content.items():
         if key in VECTORS and isinstance(value, list) and len(value) == 3:
@@ -203,7 +203,7 @@ def read_keys(content: Mapping[str, Any]) -> dict[str, float | Vec3 | str | bool
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value of JSON is a finite number of a sane size."""
+    """Return whether a JSON value is a finite number of plausible size."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return abs(value) < 1e18
@@ -212,7 +212,7 @@ def is_number(value: object) -> bool:
 def records_of(
     values: Mapping[str, float | Vec3 | str | bool], node: NodeId, time_us: int
 ) -> list[SourceRecord]:
-    """Make the records of the quantities of one moment."""
+    """Make records from the quantities of one moment."""
     found: list[SourceRecord | None] = []
     get: Any = values.get
     if "pressure" in values:

@@ -1,6 +1,6 @@
-"""LTM, the Lightweight Telemetry of INAV and of older radios: frames `$T`, type, payload, XOR.
+"""LTM, the Lightweight Telemetry of INAV and older radios: frames of `$T`, type, payload, XOR.
 
-Heights are above home. The frame `O` has the home; without its height, home is at 0 m.
+Heights are above home. The frame `O` contains home; until it is received, home is at 0 m.
 """
 
 import struct
@@ -18,7 +18,7 @@ from gateway.wire.framing import Fault
 
 START: Final = b"$T"
 SIZES: Final = {b"G": 14, b"A": 6, b"S": 7, b"O": 14, b"N": 6, b"X": 6}
-"""Bytes of payload by type."""
+"""Payload size in bytes, by type."""
 FIX_TYPES: Final = (GpsFixType.NONE, GpsFixType.NONE, GpsFixType.FIX_2D, GpsFixType.FIX_3D)
 MODES: Final[tuple[tuple[str, int | None, int | None], ...]] = (
     ("MANUAL", None, 0), ("RATE", 1, 4), ("ANGLE", 0, 5), ("HORIZON", 0, 2), ("ACRO", 1, 4),
@@ -28,7 +28,7 @@ MODES: Final[tuple[tuple[str, int | None, int | None], ...]] = (
     ("FLYBYWIREB", None, 6), ("CRUISE", None, 7), ("UNKNOWN", None, None),
     ("LAUNCH", None, 13), ("AUTOTUNE", 15, 8),
 )  # fmt: skip
-"""Name, and ArduPilot's number of it on a copter and on an aeroplane."""
+"""Name, and ArduPilot's number of the mode on a copter and on an aeroplane."""
 
 
 class LtmDecoder(CheckedFrames):
@@ -42,7 +42,7 @@ class LtmDecoder(CheckedFrames):
         self._type = wanted_type(url) or QUADROTOR
 
     def size_at(self, data: bytes, at: int) -> int:
-        """Return the size of the frame that begins there, complete or not; 0 if none does."""
+        """Return the size of a frame that begins here, complete or not; 0 if there is none."""
         size = SIZES.get(data[at + 2 : at + 3])
         if size is None or not data.startswith(START, at):
             return 0
@@ -51,7 +51,7 @@ class LtmDecoder(CheckedFrames):
         return 0 if wrong else 4 + size
 
     def read(self, frame: bytes, time_us: int) -> list[Any]:
-        """Return the records and faults of a frame."""
+        """Return the records and faults in a frame."""
         kind, payload = frame[2:3], frame[3:-1]
         parts: dict[str, Any] = {}
         if kind == b"G":
@@ -71,7 +71,7 @@ class LtmDecoder(CheckedFrames):
         return [VehicleReport(time_us=time_us, node=self._node, **parts)] if parts else []
 
     def _gps(self, payload: bytes, time_us: int) -> list[Any]:
-        """Read a fix; its course is not sent, and the heading is taken for it."""
+        """Read a fix; LTM sends no course, so the heading is used instead."""
         lat, lon, speed, alt_cm, state = struct.unpack("<iiBiB", payload)
         height_m = alt_cm * M_PER_CM
         fix = fix_at(
@@ -85,7 +85,7 @@ class LtmDecoder(CheckedFrames):
             fix_type=FIX_TYPES[state & 3],
         )
         if fix is None:
-            return [Fault("payload", len(payload), "G has coordinates that are none")]
+            return [Fault("payload", len(payload), "G has invalid coordinates")]
         return [VehicleReport(time_us=time_us, node=self._node, alt_home_m=height_m), fix]
 
     def _state(self, payload: bytes) -> dict[str, Any]:

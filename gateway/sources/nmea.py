@@ -1,8 +1,8 @@
-"""NMEA 0183 sentences of any talker to fixes: GGA, RMC, VTG, GSA, GST and HDT.
+"""Convert NMEA 0183 sentences of any talker to fixes: GGA, RMC, VTG, GSA, GST and HDT.
 
-A receiver spreads one fix over several sentences of the same time of day, in an order of its own.
-A fix is complete with GGA and RMC of one time, or with the only one that a receiver sends.
-The others add to the next fix what they hold.
+Receivers distribute one fix over several sentences of the same time of day, in any order. A fix is
+complete with GGA and RMC of one time, or with one of them if the receiver sends only that. The
+content of the other sentences is added to the next fix.
 """
 
 import math
@@ -23,9 +23,9 @@ KNOTS_MPS: Final = 1852.0 / 3600.0
 KMH_MPS: Final = 1.0 / 3.6
 DEG_MIN: Final = re.compile(r"(\d{1,3})(\d\d(?:\.\d*)?)")
 UERE_M: Final = 4.0
-"""Error of a range, m, by which a dilution becomes an accuracy where GST gives none."""
+"""User-equivalent range error, m, which converts a DOP to an accuracy if there is no GST."""
 MAX_AGE_US: Final = 3 * US_PER_S
-"""How long VTG, GSA and GST count for later fixes."""
+"""Maximum age of VTG, GSA and GST, to be used with a fix."""
 FIX_TYPES: Final = {"1": GpsFixType.NONE, "2": GpsFixType.FIX_2D, "3": GpsFixType.FIX_3D}
 IGNORED: Final = frozenset({"GSV", "GLL", "TXT", "ZDA", "GNS", "GBS", "GRS", "DTM", "VLW"})
 
@@ -36,24 +36,24 @@ def checksum(text: str) -> int:
 
 
 class NmeaReader:
-    """Collect sentences of one receiver into fixes."""
+    """Combine the sentences of one receiver to fixes."""
 
     def __init__(self, node: NodeId) -> None:
         self._node = node
         self._epoch: dict[str, list[str]] = {}
-        """GGA and RMC of the time that is being collected."""
+        """GGA and RMC of the time in progress."""
         self._time = ""
         self._both = False
-        """Whether the last time had GGA and RMC."""
+        """Whether the previous time had both GGA and RMC."""
         self._done = False
         self._extra: dict[str, tuple[int, list[str]]] = {}
-        """Arrival and fields of the newest VTG, GSA and GST."""
+        """Arrival time and fields of the newest VTG, GSA and GST."""
 
     def line(self, line: str, arrival_us: int) -> list[GpsFix | VehicleReport | Fault]:
         """Process one sentence."""
         found = SENTENCE.fullmatch(line)
         if found is None:
-            return [unusable("nmea", line, "no NMEA sentence")]
+            return [unusable("nmea", line, "not an NMEA sentence")]
         _, kind, fields, check = found.groups()
         if check is not None and int(check, 16) != checksum(line[1:].partition("*")[0]):
             return [unusable("nmea checksum", line, "wrong checksum")]
@@ -120,7 +120,7 @@ class NmeaReader:
         )
 
     def _motion(self, rmc: list[str], arrival_us: int) -> tuple[float, float]:
-        """Return speed over ground in m/s and course in degrees."""
+        """Return ground speed in m/s and course in degrees."""
         if rmc:
             return _number(rmc[6]) * KNOTS_MPS, _number(rmc[7])
         vtg = self._newest("VTG", arrival_us)
@@ -146,7 +146,7 @@ def _number(text: str) -> float:
 
 
 def _degrees(text: str, side: str) -> float:
-    """Read degrees and minutes, such as 4807.038 and N; NaN if empty."""
+    """Convert degrees and minutes, such as 4807.038 and N, to degrees; NaN if empty."""
     if not text:
         return NAN
     found = DEG_MIN.fullmatch(text)

@@ -1,19 +1,19 @@
-"""A phone's sensors, as three apps send them: Sensor Logger, phyphox and HyperIMU.
+"""Sensors of a phone, sent by one of three apps: Sensor Logger, phyphox or HyperIMU.
 
 | app           | a line is                                                              | time    |
 | ------------- | ---------------------------------------------------------------------- | ------- |
 | Sensor Logger | a JSON object with `payload`, a list of readings [1]_                  | UTC, ns |
-| phyphox       | its answer to `/get?...`, with the values of each `buffer` [2]_        | s       |
-| HyperIMU      | numbers: the time, and three of each sensor of the option `sensors`    | ms      |
+| phyphox       | the answer to `/get?...`, with the values of each `buffer` [2]_        | s       |
+| HyperIMU      | numbers: the time, and three per sensor in the option `sensors`        | ms      |
 
-Theory of operation. An app sends each sensor's readings by themselves, and several at once. They
-are put into the order of their times; each reading of the gyroscope becomes a sample, with the
-newest accelerometer and the newest field that no sample has had. Readings that come again, or older
-ones of the same sensor, are dropped.
+Theory of operation. An app sends the readings of each sensor separately, several at a time. They
+are sorted by time; each gyroscope reading becomes a sample, together with the newest accelerometer
+reading and the newest magnetic field, if it was not used before. Repeated readings, and older ones
+of the same sensor, are dropped.
 
-A phone's axes are x to the right of the screen, y to its top and z out of it; it becomes a board
-that lies face up with its top to the nose. Specific force is that of Android, also in Sensor
-Logger on iOS with its setting "Standardise Units & Frames".
+The axes of a phone are x to the right of the screen, y to its top and z out of it. They are
+converted to those of a board that is face up with its top to the nose. Specific force has Android's
+sign, which Sensor Logger uses on iOS too with its setting "Standardise Units & Frames".
 
 References
 ----------
@@ -36,11 +36,11 @@ from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
 
 MAX_LINE: Final = 1 << 20
-"""Some seconds of all sensors."""
+"""Maximum size of a line, some seconds of all sensors."""
 OLDEST_ACCEL_US: Final = 200_000
-"""Before a reading of the gyroscope, with which it is fused."""
+"""Maximum age of an accelerometer reading, to be combined with a gyroscope reading."""
 RESTART_US: Final = 5 * US_PER_S
-"""A time that is so much older than the newest is that of a clock which was set or restarted."""
+"""A time older than the newest by more than this means that the clock was set or restarted."""
 
 UNREADABLE: Final = (
     ValueError,
@@ -50,13 +50,13 @@ UNREADABLE: Final = (
     ArithmeticError,
     RecursionError,
 )
-"""Raised by content in another form than that of the apps."""
+"""Exceptions raised by content that does not have the form of an app."""
 
 Reading = tuple[float, str, tuple[float, ...]]
-"""Time of the phone, µs, a quantity, and its values; an absent one is NaN."""
+"""Time of the phone in µs, quantity, and values; an absent value is NaN."""
 
 POSITION: Final = ("lat", "lon", "alt", "speed", "course", "h_acc", "v_acc", "satellites")
-"""The values of the quantity `position`."""
+"""Names of the values of the quantity `position`."""
 XYZ: Final = ("x", "y", "z")
 LOGGED: Final = {
     "totalacceleration": ("accel", XYZ),
@@ -71,7 +71,7 @@ LOGGED: Final = {
     )),
     "battery": ("battery", ("batteryLevel", "voltage")),
 }  # fmt: skip
-"""Quantity and keys of Sensor Logger's readings; its accelerometer has no gravity."""
+"""Quantity and keys of Sensor Logger's readings; its `accelerometer` excludes gravity."""
 BUFFERS: Final = {
     "accel": ("acc_time", "accX", "accY", "accZ"),
     "gyro": ("gyr_time", "gyrX", "gyrY", "gyrZ"),
@@ -82,19 +82,19 @@ BUFFERS: Final = {
         "locAccuracy", "locZAccuracy", "locSatellites",
     ),
 }  # fmt: skip
-"""Buffers of phyphox's simple experiments, that with the time first."""
+"""Buffers of phyphox's simple experiments; the first one contains the time."""
 STREAMED: Final = {
     "accelerometer": "accel",
     "gyroscope": "gyro",
     "magnetometer": "mag",
     "gps": "position",
 }
-"""Sensors of HyperIMU; others are skipped."""
+"""Quantities of HyperIMU's sensors; other sensors are skipped."""
 USUAL_SENSORS: Final = "accelerometer,gyroscope,magnetometer,gps"
 
 
 class PhoneDecoder:
-    """Decode the readings of one phone."""
+    """Decode the sensor readings of one phone."""
 
     def __init__(self, url: SourceUrl, node: NodeId) -> None:
         self._node = node
@@ -106,24 +106,24 @@ class PhoneDecoder:
             raise ValueError(f"source {url.name!r}: geoid_m must be a number") from error
         self._clock = SampleClock()
         self._newest_us: dict[str, float] = {}
-        """The newest time of each quantity."""
+        """Newest time by quantity."""
         self._values: dict[str, tuple[float, ...]] = {}
-        """The newest values of each quantity."""
+        """Newest values by quantity."""
         self._has_field = False
-        """Whether no sample has had the newest field yet."""
+        """Whether the newest magnetic field has not been used in a sample yet."""
         self._polled_s: dict[str, str] = {}
-        """The newest time of each quantity as phyphox wrote it."""
+        """Newest time by quantity, as phyphox wrote it."""
 
     def reset(self) -> None:
-        """Discard a line that has not ended."""
+        """Discard an incomplete line."""
         self._splitter.reset()
 
     def request(self) -> str:
-        """Return the path and query of phyphox for all that is newer than its last answer."""
+        """Return path and query of a phyphox request for all values newer than its last answer."""
         found = []
         for quantity, (time, *values) in BUFFERS.items():
             since = self._polled_s.get(quantity, "")
-            # Without a time, an answer has the newest value only.
+            # Without a time, the answer would contain only the newest value.
             found.append(f"{time}={since}")
             found += [f"{name}={since}|{time}" if since else f"{name}=" for name in values]
         return "/get?" + "&".join(found)
@@ -138,12 +138,12 @@ class PhoneDecoder:
                 try:
                     found += self._records(self._readings(line), arrival_us)
                 except UNREADABLE as error:
-                    why = str(error) if isinstance(error, ValueError) else "is of no known app"
+                    why = str(error) if isinstance(error, ValueError) else "is not from a known app"
                     found.append(unusable("phone", line, why))
         return found
 
     def _readings(self, line: str) -> list[Reading]:
-        """Read a line of any app; raises one of `UNREADABLE`."""
+        """Read a line of any of the apps; raises an exception of `UNREADABLE`."""
         if not line.startswith("{"):
             return [*self._of_hyperimu(line)]
         content = json.loads(line)
@@ -158,16 +158,16 @@ class PhoneDecoder:
                 continue
             columns = [buffers.get(name, {}).get("buffer", []) for name in names]
             rows = [*zip(*columns, strict=False)]
-            # Newest last; the number is sent back as it was written.
+            # The newest is last; its time is sent back as phyphox wrote it.
             rows = [row for row in rows if is_number(row[0])]
             if rows:
                 self._polled_s[quantity] = repr(float(rows[-1][0]))
             found += [(row[0] * US_PER_S, quantity, _numbers(row[1:])) for row in rows]
         if not found:
-            # After a restart its times begin at zero again.
+            # phyphox was restarted, so its times begin at zero again.
             self._polled_s.clear()
             if not status.get("measuring"):
-                raise ValueError("the measurement does not run: start it in the app")
+                raise ValueError("the measurement is not running: start it in the app")
         return found
 
     def _of_hyperimu(self, line: str) -> Iterator[Reading]:
@@ -180,7 +180,7 @@ class PhoneDecoder:
         for k, sensor in enumerate(self._sensors):
             quantity = STREAMED.get(sensor)
             reading = tuple(values[3 * k : 3 * k + 3])
-            # Each line repeats the newest field and position.
+            # Each line repeats the newest magnetic field and position.
             if quantity in ("mag", "position") and self._values.get(quantity) == reading:
                 continue
             if quantity is not None and (quantity != "position" or any(reading)):
@@ -190,12 +190,12 @@ class PhoneDecoder:
         found: list[SourceRecord | Fault] = []
         if not readings:
             return found
-        # Other quantities of a sample come before the gyroscope of the same time.
+        # At the same time, other quantities come before the gyroscope, as they complete its sample.
         readings.sort(key=lambda reading: (reading[0], reading[1] == "gyro"))
         last_us, late = readings[-1][0], 0
         if not 0.0 <= last_us < 1e17:
             raise ValueError("has an invalid time")
-        # The newest has waited least; the others are as much older as on the phone's clock.
+        # The newest reading has the least delay; the ages of others are those on the phone's clock.
         local_us = self._clock.local(round(last_us), arrival_us)
         if last_us < max(self._newest_us.values(), default=0.0) - RESTART_US:
             self._newest_us.clear()
@@ -209,11 +209,11 @@ class PhoneDecoder:
             record = self._record(stamp_us, quantity, local_us - round(last_us - stamp_us))
             found += [] if record is None else [record]
         if late:
-            found.append(Fault("late", late, f"{late} readings came after newer ones"))
+            found.append(Fault("late", late, f"{late} readings arrived after newer ones"))
         return found
 
     def _record(self, stamp_us: float, quantity: str, local_us: int) -> SourceRecord | None:
-        """Make the record that a reading completes."""
+        """Return the record that a reading completes, if any."""
         if quantity in ("accel", "motion", "gravity", "mag"):
             return None
         values, node = self._values[quantity], self._node
@@ -247,7 +247,7 @@ class PhoneDecoder:
 
     def _fix(self, time_us: int, values: tuple[float, ...]) -> SourceRecord | None:
         known = dict(zip(POSITION, values, strict=False))
-        # The apps write invalid values as negative ones.
+        # The apps encode invalid values as negative numbers.
         speed, course, h_acc, v_acc, satellites = (
             value if (value := known.get(name, NAN)) >= 0.0 else NAN for name in POSITION[3:]
         )
@@ -268,17 +268,17 @@ def _of_sensor_logger(entry: Mapping[str, Any]) -> Iterator[Reading]:
     quantity, keys = LOGGED.get(entry["name"], ("", ()))
     if quantity:
         values = dict(entry["values"])
-        # Before version 14 Android has only the height above the ellipsoid.
+        # On Android before version 14, only the height above the ellipsoid is available.
         values.setdefault("altitudeAboveMeanSeaLevel", values.get("altitude"))
         yield entry["time"] / 1000.0, quantity, _numbers(values.get(key) for key in keys)
 
 
 def _numbers(values: Iterable[object]) -> tuple[float, ...]:
-    """Return numbers, NaN in place of anything else."""
+    """Return the values as numbers, with NaN for anything else."""
     return tuple(float(v) if is_number(v) else NAN for v in values)  # type: ignore[arg-type]
 
 
 def _board(values: tuple[float, ...]) -> Vec3:
-    """Turn a phone's axes into those of a board: x forward, y left, z up."""
+    """Convert the axes of a phone to those of a board: x forward, y left, z up."""
     x, y, z = values
     return (y, -x, z)

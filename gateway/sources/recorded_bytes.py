@@ -1,4 +1,4 @@
-"""A source's bytes as TUNNEL messages of a tlog, from which they can be decoded again."""
+"""Store a source's bytes as TUNNEL messages in a tlog, so that they can be decoded again."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -10,19 +10,19 @@ from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 TUNNEL_ID: Final = MESSAGE_IDS["TUNNEL"]
 FIRST_TYPE: Final = 0x8000
-"""Payload types from here on are free for any program; the node's id is added."""
+"""First TUNNEL payload type that is free for any use; the id of the node is added to it."""
 PIECE: Final = 128
 
 
 class TunnelWriter:
-    """Pack the bytes of one source."""
+    """Pack the bytes of one source in TUNNEL messages."""
 
     def __init__(self, node: NodeId) -> None:
         self._type = FIRST_TYPE + node.node_id
         self._sender = mavlink.MAVLink(None, node.vehicle_id, mavlink.MAV_COMP_ID_LOG)
 
     def frames(self, data: bytes) -> Iterator[bytes]:
-        """Yield the frames that hold some bytes."""
+        """Yield frames that contain the given bytes."""
         for at in range(0, len(data), PIECE):
             piece = data[at : at + PIECE]
             padded = [*piece.ljust(PIECE, b"\0")]
@@ -32,7 +32,7 @@ class TunnelWriter:
 
 
 def tunnelled(frame: bytes, node: NodeId) -> bytes:
-    """Return the bytes of a source in a TUNNEL frame; none if it is another's, or damaged."""
+    """Return the bytes in a TUNNEL frame; empty if it is of another source, or damaged."""
     try:
         message = mavlink.MAVLink(None).decode(bytearray(frame))
     except mavlink.MAVError:

@@ -1,8 +1,8 @@
-"""Times and counts of samples that come in SI units.
+"""Times and counts of samples that a source sends in SI units.
 
-A calibration is that of counts in sensor axes, and a recording keeps counts: they can be calibrated
-and fused again. So a value in SI is written as counts of a fine fixed scale, a tenth of the noise
-of the sensors that trackers have: 0.6 mm/s2, 0.008 deg/s and 0.01 uT.
+A calibration applies to counts in sensor axes, and recordings store counts, so that they can be
+calibrated and fused again. SI values are therefore converted to counts of a fine fixed scale, a
+tenth of the noise of usual sensors: 0.6 mm/s2, 0.008 deg/s and 0.01 uT.
 """
 
 import math
@@ -19,11 +19,11 @@ COUNTS_PER_MPS2: Final = 32768.0 / (ACCEL_RANGE_G * 9.80665)
 COUNTS_PER_DPS: Final = 131.0
 COUNTS_PER_UT: Final = MAG_LSB_PER_GAUSS / 100.0
 MAX_COUNTS: Final = 1 << 30
-"""Beyond any sensor."""
+"""Maximum number of counts, beyond the range of any sensor."""
 OVERFLOW: Final = -4096
-"""Marks an overflow of the magnetometer on boards; a value of so many counts is moved by one."""
+"""Value with which boards mark an overflow of the magnetometer; a real value is moved by one."""
 ROOM_TEMPERATURE: Final = round((25.0 - 36.53) * 340.0)
-"""Counts of the IMU's temperature where none is measured."""
+"""Counts of the IMU's temperature (25 deg C) if none is measured."""
 MAX_AHEAD_US: Final = 50_000
 PACE_WEIGHT: Final = 8
 
@@ -36,7 +36,7 @@ def imu_raw(
     mag_ut: Vec3 | None = None,
     temperature_degc: float = NAN,
 ) -> ImuRaw | None:
-    """Write a sample in SI and sensor axes as counts; None if a value is not finite or absurd."""
+    """Convert a sample in SI and sensor axes to counts; None if a value is not finite or absurd."""
     accel, gyro = _counts(accel_mps2, COUNTS_PER_MPS2), _counts(gyro_dps, COUNTS_PER_DPS)
     mag = None if mag_ut is None else _counts(mag_ut, COUNTS_PER_UT)
     if accel is None or gyro is None:
@@ -49,7 +49,7 @@ def imu_raw(
         time_us,
         node,
         time_us & WRAP_MASK,
-        # All zero would be a sensor that could not be read.
+        # All zero would mean a sensor that could not be read.
         accel if any(accel) else (0, 0, -1),
         gyro,
         mag or (0, 0, 0),
@@ -69,7 +69,7 @@ def _counts(values: Vec3, per_unit: float) -> Int3 | None:
 
 
 class SampleClock:
-    """Times of a source's samples, which strictly grow: by its own clock, or by their arrival."""
+    """Strictly increasing times of a source's samples, from its own clock or from their arrival."""
 
     def __init__(self) -> None:
         self._tracker = ClockTracker()
@@ -77,17 +77,17 @@ class SampleClock:
         self._period_us = 0
 
     def own(self, stamp_us: int, arrival_us: int) -> int:
-        """Return the time of a sample that the source's clock has stamped."""
+        """Return the time of a sample with a timestamp of the source's clock."""
         return self.after_last(self.local(stamp_us, arrival_us))
 
     def local(self, stamp_us: int, arrival_us: int) -> int:
-        """Return a stamp of the source's clock on the gateway clock."""
+        """Convert a timestamp of the source's clock to the gateway clock."""
         return self._tracker.observe(stamp_us & WRAP_MASK, arrival_us)
 
     def arrival(self, arrival_us: int) -> int:
-        """Return the time of a sample without a stamp.
+        """Return the time of a sample without a timestamp.
 
-        Several in one chunk are spread by half of the usual distance, and not set at one time.
+        Several samples in one chunk are spaced by half of the usual interval.
         """
         gap_us = arrival_us - self._last_us
         if 0 < gap_us < US_PER_S:
@@ -95,7 +95,7 @@ class SampleClock:
         return self.after_last(arrival_us, max(self._period_us // 2, 1))
 
     def after_last(self, time_us: int, step_us: int = 1) -> int:
-        """Return a time, or one a step after the last sample's if it is not later."""
+        """Return the time if it is later than the last sample's, else one step after the last."""
         if self._last_us - time_us > MAX_AHEAD_US:
             step_us = 1
         self._last_us = max(time_us, self._last_us + step_us)
@@ -118,7 +118,7 @@ def fix_at(
     utc_us: int | None = None,
     pdop: float = NAN,
 ) -> GpsFix | None:
-    """Make a fix of what a source reports; None if its coordinates are none."""
+    """Make a fix from the values of a source; None if the coordinates are out of range."""
     if not (-90.0 <= lat_deg <= 90.0 and -180.0 <= lon_deg <= 180.0):
         return None
     if fix_type is None:
@@ -147,7 +147,7 @@ def fix_at(
 
 
 def velocity(speed_mps: float, course_deg: float, climb_mps: float = NAN) -> Vec3:
-    """Return the velocity of a speed and a course over ground."""
+    """Return the NED velocity for speed and course over ground, and climb."""
     course = math.radians(course_deg) if math.isfinite(course_deg) else NAN
     if speed_mps == 0.0 and math.isnan(course):
         course = 0.0

@@ -1,18 +1,18 @@
-"""The URL of a source: its kind, the transport that brings its bytes, and options.
+"""The URL of a source: its kind, the transport for its bytes, and options.
 
     KIND:/dev/ttyACM0            serial port; ?baud=420000
     KIND:usb:1a86:7523           serial port by its USB id, as [serial] port
     KIND:udp:HOST:PORT           datagrams to this address
-    KIND:tcp:HOST:PORT           connect, and reconnect when it breaks
+    KIND:tcp:HOST:PORT           connect, and reconnect after a failure
     KIND:tcp-listen:HOST:PORT    serve one client at a time
-    KIND:poll:HOST:PORT          ask a server by HTTP, again and again
-    KIND:push                    posts to the panel, with a token
-    KIND:receiver                packets of other programs that our receiver passes on
+    KIND:poll:HOST:PORT          query a server by HTTP repeatedly
+    KIND:push                    HTTP posts to the panel, with a token
+    KIND:receiver                packets of other programs, passed on by the receiver
     KIND:stdin                   standard input
     KIND:file:PATH               a file that grows
 
-`KIND-udp:HOST:PORT` is the same as `KIND:udp:HOST:PORT`, and so are the others. A listening address
-beyond loopback is opened only if it is written, as in every endpoint.
+`KIND-udp:HOST:PORT` is equivalent to `KIND:udp:HOST:PORT`, and likewise for the others. An address
+outside of loopback is listened on only if it is given explicitly, as for every endpoint.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ MAX_SOURCES: Final = 16
 MAX_PORT: Final = 65535
 MAX_VEHICLE: Final = 31
 OPTIONS: Final = ("baud", "id", "token")
-"""Of every kind."""
+"""Options of every kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,24 +43,24 @@ class SourceUrl:
     kind: str
     transport: str
     address: str
-    """Device, path, or host of a network."""
+    """Path of a device or file, or network host."""
     port: int
     options: dict[str, str]
 
     @property
     def name(self) -> str:
-        """The URL without its options, which may be secret."""
+        """The URL without its options, which may contain secrets."""
         return self.url.partition("?")[0]
 
 
 def parse_source(url: str) -> SourceUrl:
-    """Parse a URL; raises ValueError with the reason."""
+    """Parse a URL; raises ValueError that states the reason."""
     location, _, query = url.partition("?")
     head, colon, address = location.partition(":")
     kind, transport = head, ""
     for each in TRANSPORTS:
         if head.endswith(f"-{each}"):
-            # The longest, which is the last: tcp-listen ends in no other.
+            # The longest match is the last one: tcp-listen ends in no other.
             kind, transport = head.removesuffix(f"-{each}"), each
     if not transport:
         transport, address = _transport_of(address)
@@ -71,7 +71,7 @@ def parse_source(url: str) -> SourceUrl:
     if transport in NETWORK:
         address, port = _host_and_port(location, address)
     elif transport not in PLAIN and not address:
-        raise ValueError(f"source {location!r}: names no device or file")
+        raise ValueError(f"source {location!r}: has no device or file")
     return SourceUrl(url, kind, transport, address, port, options)
 
 
@@ -91,19 +91,19 @@ def _host_and_port(location: str, address: str) -> tuple[str, int]:
 
 
 class SourceSettings(Settings, frozen=True):
-    """A tracker, radio or phone that is a vehicle, next to those of the receiver."""
+    """A tracker, radio or phone that is a vehicle, in addition to those of the receiver."""
 
     url: Annotated[
         str,
         setting(
-            "Kind and place, such as crsf:/dev/ttyACM0, lines:udp:0.0.0.0:5600 or "
+            "Kind and location, such as crsf:/dev/ttyACM0, lines:udp:0.0.0.0:5600 or "
             "lines:file:/tmp/log; docs/sources.md lists the kinds and their options."
         ),
     ]
     vehicle: Annotated[
         int,
         setting(
-            "Vehicle id, which is its MAVLink system id; 0 for its place in the list. Several "
+            "Vehicle id, which is its MAVLink system id; 0 for its position in the list. Several "
             "sources may belong to one vehicle.",
             ge=0,
             le=MAX_VEHICLE,
@@ -111,12 +111,12 @@ class SourceSettings(Settings, frozen=True):
     ] = 0
 
     def __post_init__(self) -> None:
-        """Refuse a wrong URL when the settings are read."""
+        """Reject an invalid URL when the settings are read."""
         parse_source(self.url)
 
 
 def nodes_of(sources: tuple[SourceSettings, ...]) -> list[NodeId]:
-    """Return the node of each source: the vehicles' nodes of sources are counted from 8."""
+    """Return the node of each source; node ids of sources begin at 8 for each vehicle."""
     found: list[NodeId] = []
     for place, source in enumerate(sources, 1):
         wanted = parse_source(source.url).options.get("id", "")

@@ -1,10 +1,10 @@
-"""A source's bytes to records, with the counts of all that was dropped.
+"""Convert the bytes of a source to records, and count all that is dropped.
 
-Theory of operation. A kind of source is a decoder and nothing else: `feed` takes any chunk of bytes
-and the time of their arrival, and returns the records and faults in it. Two kinds of records come:
+Theory of operation. A kind of source consists only of a decoder: `feed` takes any chunk of bytes
+and its time of arrival, and returns the records and faults in it. There are two kinds of records:
 samples of sensors (`ImuRaw`, `BaroRaw`, `GpsFix`), which are calibrated and fused like those of
-boards, and reports of an autopilot (`VehicleReport`), which are passed on with their own time. A
-`GpsFix` of a vehicle without an IMU is its position as well.
+boards, and reports of an autopilot (`VehicleReport`), which are passed on with their own time. The
+`GpsFix` of a vehicle without an IMU is also its position.
 """
 
 from abc import ABC, abstractmethod
@@ -30,48 +30,48 @@ from gateway.wire.framing import Fault
 SourceRecord = ImuRaw | BaroRaw | GpsFix | VehicleReport
 
 MAX_ARRIVALS: Final = 2048
-"""For the rate; more than any source sends in a second."""
+"""Arrival times stored to compute the rate; more than any source sends in a second."""
 MAX_KINDS: Final = 32
-"""Kinds of faults that are counted by name."""
+"""Maximum number of kinds of faults that are counted by name."""
 MAX_DETAIL: Final = 200
 SHOWN: Final = 60
-"""Characters of a line that cannot be used."""
+"""Characters of an unusable line that are quoted."""
 
 
 class SourceDecoder(Protocol):
     """The decoder of one kind of source."""
 
     def feed(self, data: bytes, arrival_us: int) -> list[SourceRecord | Fault]:
-        """Decode any chunk, and return the records and faults that it completes; never raise."""
+        """Process any chunk, and return the records and faults that it completes; never raises."""
         ...
 
     def reset(self) -> None:
-        """Discard a part of a frame or line, as the transport was opened again."""
+        """Discard an incomplete frame or line, after the transport was reopened."""
         ...
 
 
 def unusable(kind: str, line: str, why: str) -> Fault:
-    """Return the fault of a line, with its beginning and the reason."""
+    """Return the fault for a line, with the start of the line and the reason."""
     return Fault(kind, len(line), f"{line[:SHOWN]!r}: {why}")
 
 
 class CheckedFrames(ABC):
-    """A decoder of frames with a checksum.
+    """Base of decoders for frames with a checksum.
 
-    They have no escape: the search moves on by one byte, and so finds the next frame behind any
-    damage and between bytes of other protocols. Bytes of no frame are one fault until the next.
+    The frames have no escaping: the search proceeds byte by byte, and finds the next frame after
+    damage, and between bytes of other protocols. Bytes between two frames are one fault.
     """
 
     HEAD: Final = 3
-    """Bytes that show the size of a frame."""
+    """Bytes that are needed to determine the size of a frame."""
     MAX_NOISE: Final = 64
-    """Bytes without a frame that are one fault."""
+    """Maximum number of bytes without a frame in one fault."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
-        """Discard a part of a frame."""
+        """Discard an incomplete frame."""
         self._rest, self._noise = b"", 0
 
     def feed(self, data: bytes, arrival_us: int) -> list[Any]:
@@ -91,21 +91,21 @@ class CheckedFrames(ABC):
 
     def _end_noise(self) -> list[Any]:
         dropped, self._noise = self._noise, 0
-        why = f"{dropped} bytes belong to no frame with a right checksum"
+        why = f"{dropped} bytes that belong to no valid frame"
         return [Fault("checksum", dropped, why)] if dropped else []
 
     @abstractmethod
     def size_at(self, data: bytes, at: int) -> int:
-        """Return the size of the frame that begins there, complete or not; 0 if none does."""
+        """Return the size of a frame that begins here, complete or not; 0 if there is none."""
 
     @abstractmethod
     def read(self, frame: bytes, arrival_us: int) -> list[Any]:
-        """Return the records and faults of a frame."""
+        """Return the records and faults in a frame."""
 
 
 @runtime_checkable
 class PolledDecoder(SourceDecoder, Protocol):
-    """A decoder of answers to requests of HTTP."""
+    """A decoder of HTTP answers that also makes the requests."""
 
     def request(self) -> str:
         """Return the path and query of the next request."""
@@ -114,7 +114,7 @@ class PolledDecoder(SourceDecoder, Protocol):
 
 @dataclass(slots=True)
 class _Node:
-    """What came from one vehicle of a source."""
+    """Counts of what was received from one vehicle of a source."""
 
     last_us: int
     received: int = 0
@@ -123,7 +123,7 @@ class _Node:
 
 
 class SourceInput:
-    """One source: its decoder, and the counts of its records and faults."""
+    """A source: its decoder, and the counts of its records and faults."""
 
     def __init__(self, url: SourceUrl, node: NodeId, decoder: SourceDecoder) -> None:
         self.url = url
@@ -140,7 +140,7 @@ class SourceInput:
     def feed(
         self, data: bytes, now_us: int, signal: RadioSignal | None = None
     ) -> list[SourceRecord]:
-        """Decode bytes that arrived now, with a signal if known; count what cannot be used."""
+        """Decode bytes that arrived now, with the signal strength if known; count unusable ones."""
         self._bytes += len(data)
         records: list[SourceRecord] = []
         for event in self.decoder.feed(data, now_us):
@@ -161,7 +161,7 @@ class SourceInput:
 
     @property
     def vehicles(self) -> frozenset[int]:
-        """The vehicles that records came from."""
+        """The vehicles from which records were received."""
         return frozenset(node.vehicle_id for node in self._nodes)
 
     def count(self, fault: Fault) -> None:
@@ -171,16 +171,16 @@ class SourceInput:
         self._newest_fault = (fault.detail or fault.kind)[:MAX_DETAIL]
 
     def opened(self) -> None:
-        """Note that the transport was opened, and discard an incomplete line or frame."""
+        """Set the state to open, and discard an incomplete line or frame."""
         self.decoder.reset()
         self.connected, self.reason = True, ""
 
     def lost(self, reason: str) -> None:
-        """Note that the transport is gone."""
+        """Set the state to lost, with the reason."""
         self.connected, self.reason = False, reason
 
     def report(self) -> SourceReport:
-        """Return the state for people."""
+        """Return the state of the source for display."""
         return SourceReport(
             self.url.name,
             self.node,
@@ -194,7 +194,7 @@ class SourceInput:
         )
 
     def links(self, now_us: int) -> list[NodeLink]:
-        """Return the counts as those of nodes, one for each vehicle; faults are the first's."""
+        """Return the counts as those of nodes, one per vehicle; faults are with the first."""
         faults = [sum(self._faults.values())]
         return [
             NodeLink(

@@ -1,4 +1,4 @@
-"""A trial of a source: each record and fault in words, rates, and what a vehicle would lack."""
+"""Test a source: describe records and faults, rates, and data that a vehicle would lack."""
 
 import math
 import re
@@ -23,7 +23,7 @@ GUESSES: Final = (
     (r"^(speed|gspeed|groundspeed)\b", "gps_speed_mps"),
     (r"^(course|heading|cog)\b", "gps_course_deg"),
 )
-"""Names that people give their columns, and ours."""
+"""Column names that users and this project use, by quantity."""
 DEGE7: Final = frozenset({"gps_lat_dege7", "gps_lon_dege7"})
 LEAST_NAMES: Final = 3
 KINDS: Final[dict[type, str]] = {
@@ -32,14 +32,14 @@ KINDS: Final[dict[type, str]] = {
     GpsFix: "GPS",
     VehicleReport: "states",
 }
-"""Names of the records of a source."""
+"""Names of the types of records."""
 
 
 def describe(event: SourceRecord | Fault) -> str:
     """Describe a record or a fault in one line."""
     match event:
         case Fault():
-            return f"not used ({event.kind}): {event.detail}"
+            return f"unused ({event.kind}): {event.detail}"
         case ImuRaw():
             accel = _vector(event.accel_raw, COUNTS_PER_MPS2)
             gyro = _vector(event.gyro_raw, COUNTS_PER_DPS)
@@ -61,7 +61,7 @@ def _vector(counts: tuple[int, int, int], per_unit: float) -> str:
 
 
 def _fields(report: VehicleReport) -> list[str]:
-    """Name the fields that a report has, with their values."""
+    """List the fields of a report with their values."""
     found = []
     for name in report.__struct_fields__[2:]:
         value = getattr(report, name)
@@ -80,16 +80,16 @@ def _fields(report: VehicleReport) -> list[str]:
 
 
 class SourceTrial:
-    """Count what a source brings, and sum it up."""
+    """Count the records and faults of a source, and summarise them."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
-        """By the kind of record, and of fault."""
+        """Number of records and faults, by kind."""
         self._has_mag = self._has_fix = self._has_height = self._has_attitude = False
         self._header = ""
 
     def feed(self, event: SourceRecord | Fault) -> int:
-        """Count a record or a fault; return how many of its kind there were."""
+        """Count a record or a fault; return the number of its kind so far."""
         kind = f"fault {event.kind}" if isinstance(event, Fault) else KINDS[type(event)]
         self.counts[kind] += 1
         if isinstance(event, ImuRaw):
@@ -102,14 +102,14 @@ class SourceTrial:
         return self.counts[kind]
 
     def look_at(self, text: str) -> None:
-        """Keep the first line that may hold names of columns, for a suggestion."""
+        """Store the first line that may contain column names, to suggest a map."""
         for line in text.splitlines():
             names = re.findall(r"[A-Za-z]\w*", line)
             if not self._header and len(names) >= LEAST_NAMES and suggested_map(line):
                 self._header = line
 
     def summary(self, seconds: float) -> list[str]:
-        """Sum up: rates, what is missing, and the map that would read CSV."""
+        """Summarise the test: rates, missing data, and a map with which CSV can be read."""
         lines = [f"{kind}: {n}, {n / seconds:.1f} a second" for kind, n in self.counts.items()]
         attitude = "yes" if self._has_attitude or self.counts[KINDS[ImuRaw]] else "no"
         why = (
@@ -119,7 +119,7 @@ class SourceTrial:
         )
         lines.append(f"attitude: {attitude}{why}")
         if self.counts[KINDS[ImuRaw]] and not self._has_mag:
-            lines.append("heading: only in flight, by GPS; it needs a compass (lines: mag_ut)")
+            lines.append("heading: only in flight, from GPS; else from a compass (lines: mag_ut)")
         place = "yes" if self._has_height else "no"
         missing = (
             "a height (lines: alt_m or GGA)"
@@ -133,7 +133,7 @@ class SourceTrial:
 
 
 def suggested_map(header: str) -> list[str]:
-    """Suggest a map of the columns that a line of names has; empty if it has none."""
+    """Suggest a map for the columns in a line of names; empty if it has no known ones."""
     cells = [cell.strip(' "') for cell in re.split(r"[,;\t]", header)]
     found = {}
     for cell in cells:

@@ -76,7 +76,7 @@ async def test_calibrate_uses_the_samples_of_the_running_gateway(
     finally:
         server.close()
     assert result.exit_code == 0, result.output
-    assert "the gateway uses it, and saves it" in result.output
+    assert "used and saved by the gateway" in result.output
     assert "sensors: MPU6500, QMC5883L, BMP280" in result.output
     assert kept[-1].gyro_bias_radps[0] == pytest.approx(np.radians(100 / 65.5), rel=0.01)
     assert kept[-1].mag_hard_iron_ut == (1.0, 2.0, 3.0)

@@ -164,7 +164,7 @@ class TestRefusals:
     def test_time_that_goes_back_is_refused(self) -> None:
         time_s = columns()["time_s"]
         time_s[20] = time_s[18]
-        with pytest.raises(ValueError, match=r"goes back at 100\.36 s"):
+        with pytest.raises(ValueError, match=r"decreases at 100\.36 s"):
             RecordedFlight.from_columns(columns(time_s=time_s))
 
     def test_flight_without_samples_is_refused(self) -> None:

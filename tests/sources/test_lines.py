@@ -54,7 +54,7 @@ def test_csv_is_read_by_the_map_of_columns_of_files() -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("1,2,3\n", "before the line with the names"),
+        ("1,2,3\n", "before the line of column names"),
         (HEADER + "x,1,1,1,1,1,1,1,1,1\n", "not a number"),
         (HEADER + "5\n", "no value of the map"),
     ],
@@ -78,7 +78,7 @@ def test_trial_names_rates_what_is_missing_and_a_map() -> None:
         trial.feed(event)
     shown = [*map(describe, events)]
     assert shown[-1] == "GPS fix 48.117300 11.516667 545.4 m, 9 satellites"
-    assert shown[0].startswith("not used (text): 'time,acc_x,acc_y,acc_z'")
+    assert shown[0].startswith("unused (text): 'time,acc_x,acc_y,acc_z'")
     summary = trial.summary(2.0)
     assert "fault text: 2, 1.0 a second" in summary
     assert "attitude: no; it needs accelerometer and gyroscope (lines: in one object)" in summary
@@ -217,9 +217,9 @@ def test_true_heading_is_reported_without_an_attitude() -> None:
     ("line", "kind", "why"),
     [
         ("hello", "text", "neither JSON"),
-        ('{"lat": 1', "json", "no JSON object"),
+        ('{"lat": 1', "json", "not a JSON object"),
         ("[" * 3000, "text", "neither"),
-        ('{"lat":' + "[" * 3000, "json", "no JSON object"),
+        ('{"lat":' + "[" * 3000, "json", "not a JSON object"),
         ('{"speed": 3}', "json key", "speed"),
         ('{"lat": NaN, "lon": 4}', "json", "valid value"),
         ('{"lat": 91, "lon": 4}', "json", "valid value"),
@@ -227,7 +227,7 @@ def test_true_heading_is_reported_without_an_attitude() -> None:
         ('{"pressure_hpa": 1' + "0" * 400 + "}", "json", "valid value"),
         ("$GPGGA,101530.20,4807.038*00", "nmea checksum", "checksum"),
         ("$GPGGA,x,y", "nmea", "cannot be read"),
-        ("$PUBX,00", "nmea", "no NMEA sentence"),
+        ("$PUBX,00", "nmea", "not an NMEA sentence"),
         ("x" * 5000, "too long", "longer"),
     ],
 )

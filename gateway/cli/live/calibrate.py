@@ -1,4 +1,4 @@
-"""`mavgate calibrate`: guide a person through a node's calibration, live or from a recording."""
+"""`mavgate calibrate`: guided calibration of a node, live or from a recording."""
 
 from __future__ import annotations
 
@@ -41,22 +41,22 @@ if TYPE_CHECKING:
     from gateway.simulator.trajectory import Workbench
 
 POLL_S: Final = 0.5
-"""Interval of the requests to a running gateway."""
+"""Interval of the requests to a running gateway, s."""
 SAMPLE_TIMEOUT_S: Final = 10.0
-"""Without a sample for so long, give up."""
+"""Timeout without any sample, s."""
 POSE_S: Final = 3.0
 REST_S: Final = 5.0
 MAG_S: Final = 15.0
 MAG_LIMIT_S: Final = 120.0
-"""The compass is turned for at least and at most this long."""
+"""Minimum and maximum duration of turning the compass, s."""
 SIDES_EVERY_S: Final = 0.5
 MAG_SIDES: Final = 20
-"""Of `calibrating.FIELD_SIDES`: enough to end the turning."""
+"""Sides, of `calibrating.FIELD_SIDES`, that are enough to end the turning."""
 MAX_TRIES: Final = 24
 MOVING_MPS: Final = 1.0
-"""GPS speed that is not rest; a receiver at rest reports up to 0.3 m/s."""
+"""Minimum GPS speed in motion; a receiver at rest reports up to 0.3 m/s."""
 MOVING_US: Final = 3 * US_PER_S
-"""A movement by GPS counts for this long."""
+"""Time for which a motion detected by GPS counts."""
 
 console = console_of()
 app = typer.Typer()
@@ -66,11 +66,11 @@ SIDES: Final = (
     *("x arrow up", "x arrow down", "y arrow up", "y arrow down"),
     *("chips up", "chips down"),
 )
-"""How the board lies when +x, -x, +y, -y, +z, -z reads gravity."""
+"""Orientation of the board when +x, -x, +y, -y, +z, -z measures gravity."""
 
 
 class Step(StrEnum):
-    """What can be calibrated."""
+    """The kinds of calibration."""
 
     MOUNTING = "mounting"
     GYRO = "gyro"
@@ -80,23 +80,23 @@ class Step(StrEnum):
 
 
 STEPS: Final = (Step.GYRO, Step.ACCEL, Step.LEVEL, Step.MAG)
-"""The steps of a first calibration, in their order."""
+"""The steps of a first calibration, in order."""
 ATTITUDES_DEG: Final = {
     Step.MOUNTING: ((0.0, 0.0), (0.0, 45.0)),
     Step.ACCEL: ((0.0, 0.0), (180.0, 0.0), (90.0, 0.0), (-90.0, 0.0), (0.0, 90.0), (0.0, -90.0)),
 }
-"""Roll and pitch of the poses of a step; of others it is level."""
+"""Roll and pitch of a step's poses, deg; in other steps the aircraft is level."""
 
 
 class Capture(Protocol):
-    """Waits for samples."""
+    """Function that waits for samples."""
 
     def __call__(self, seconds: float, *, turned: bool = False) -> NodeSamples:
-        """Return samples of so many seconds, or until the compass was turned to most sides."""
+        """Return samples over a time, or until the compass was turned to most sides."""
 
 
 Poses = Callable[[Step], list[NodeSamples]]
-"""Returns the samples of each pose of a step; raises CalibrationError with advice."""
+"""Function that returns the samples of each pose of a step; raises CalibrationError with advice."""
 
 
 @app.command()
@@ -126,9 +126,9 @@ def calibrate(
 ) -> None:
     """Calibrate an aircraft's sensors and save the result with its residuals.
 
-    Each step is saved when it is done; the exit code is 1 if one is not. A running
-    gateway gives the samples and uses the result at once; without one, or with --port, the receiver
-    is read.
+    Each step is saved when it is done; the exit code is 1 if one fails. A running gateway provides
+    the samples and uses the result at once; without one, or with --port, the receiver is read
+    directly.
     """
     settings = read_settings()
     aircraft = load_aircraft(settings).get(vehicle, settings.default_aircraft)
@@ -145,7 +145,7 @@ def calibrate(
         if is_live:
             values = msgspec.to_builtins(calibration)
             ask("imu.calibrate", {"vehicle_id": vehicle, "calibration": values})
-            console.print("the gateway uses it, and saves it")
+            console.print("used and saved by the gateway")
             return
         changed = msgspec.structs.replace(aircraft, calibration=calibration)
         console.print(f"saved in {save_aircraft(settings, vehicle, changed)}")
@@ -175,10 +175,10 @@ def calibrate_each(
     save: Callable[[NodeCalibration], None],
     field_ut: float | None = None,
 ) -> tuple[NodeCalibration, list[Step]]:
-    """Run the steps; each is saved when it is done, so aborting loses only the present one.
+    """Run the steps; each is saved when it is done, so an interruption loses only the present one.
 
-    A failed step is reported, and the next one starts. Returns the calibration, and the steps that
-    are missing.
+    A failed step is reported, and the next one starts. Returns the calibration and the missing
+    steps.
     """
     missing: list[Step] = []
     for number, step in enumerate(steps):
@@ -217,7 +217,7 @@ def _solve(
 
 
 def poses_from(capture: Capture) -> Poses:
-    """Return the poses that a person is asked for."""
+    """Return a function that asks a person for the poses."""
 
     def poses(step: Step) -> list[NodeSamples]:
         match step:
@@ -229,7 +229,7 @@ def poses_from(capture: Capture) -> Poses:
             case Step.MAG:
                 _ask(
                     "Away from steel, turn the aircraft slowly about all its axes, upside down "
-                    "too, until most sides were seen."
+                    "too, until most sides were measured."
                 )
                 return [capture(MAG_S, turned=True)]
         _ask("Set the aircraft level, as it flies.")
@@ -243,7 +243,7 @@ def poses_from(capture: Capture) -> Poses:
 
 
 def poses_on(bench: Workbench, capture: Capture) -> Poses:
-    """Return the poses of a simulated aircraft, which follows what a person is asked for."""
+    """Return the poses of a simulated aircraft, which follows the instructions to a person."""
 
     def poses(step: Step) -> list[NodeSamples]:
         attitudes = cycle(ATTITUDES_DEG.get(step, ((0.0, 0.0),)))
@@ -262,18 +262,18 @@ def poses_on(bench: Workbench, capture: Capture) -> Poses:
 @contextmanager
 def simulated_receiver(settings: SimulatorSettings) -> Iterator[tuple[str, Workbench]]:
     """Run a simulated receiver and an aircraft on a workbench behind a pseudo-terminal."""
-    # Imported here: SciPy draws the simulated flight, and a real first start needs none.
+    # Imported here: the simulated flight requires SciPy, which a real first start does not.
     from gateway.simulator.flight import SimulatedAircraft
     from gateway.simulator.node import nodes_of
     from gateway.simulator.receiver import SimulatedReceiver
     from gateway.simulator.trajectory import Workbench
 
     bench = Workbench(settings)
-    # The flight's dropouts do not occur on a workbench.
+    # The dropouts of the flight do not occur on a workbench.
     settings = msgspec.structs.replace(settings, gps_outages_s=())
     aircraft = SimulatedAircraft(settings, start_unix_us=unix_time_us(), motion=bench)
     receiver = SimulatedReceiver(settings, nodes_of(aircraft, settings))
-    # In a thread with a loop of its own, since a person is asked in between.
+    # In a thread with its own loop, since the main thread waits for input in between.
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, daemon=True)
     port = PtyPort(receiver.frames())
@@ -298,7 +298,7 @@ def _poses_of_log(samples: NodeSamples) -> Poses:
 
 
 def _six_sides(capture: Capture) -> list[NodeSamples]:
-    """Collect poses until the node was laid on all its sides."""
+    """Collect poses until the node has been laid on all its sides."""
     held: list[NodeSamples] = []
     for _ in range(MAX_TRIES):
         missing = _missing(held)
@@ -306,20 +306,20 @@ def _six_sides(capture: Capture) -> list[NodeSamples]:
             break
         done = len(SIDES) - len(missing)
         _ask(
-            f"{done} of {len(SIDES)} sides are done. Lay the node on one of these and let it "
-            f"go: {', '.join(missing)}."
+            f"{done} of {len(SIDES)} sides are done. Lay the node on one of these and release "
+            f"it: {', '.join(missing)}."
         )
         samples = capture(POSE_S)
         if not calibrating.still_windows(samples):
-            console.print("It moved; once more.")
+            console.print("It moved; trying again.")
         elif _missing([*held, samples]) == missing:
-            console.print("That side was done before, or it is too far from upright; once more.")
+            console.print("That side was done before, or it is too oblique; trying again.")
         held.append(samples)
     return held
 
 
 def _missing(samples: list[NodeSamples]) -> list[str]:
-    """Name the sides on which the node was not laid yet."""
+    """Return the names of the sides on which the node has not been laid yet."""
     seen = calibrating.sides_of(samples)
     return [name for number, name in enumerate(SIDES) if number not in seen]
 
@@ -343,7 +343,7 @@ def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSample
 
 def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
     """Return a capture from the receiver's port; raises PortNotFoundError if there is none."""
-    # Nobody shall lay an aircraft on its sides for a port that is not there.
+    # Fail before the person lays the aircraft on its sides, if the port does not exist.
     device = asyncio.run(find_receiver(serial))
     serial = msgspec.structs.replace(serial, port=device)
     shown: tuple[str, ...] = ()
@@ -355,7 +355,7 @@ def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
         with collecting.bar:
             _, is_done = asyncio.run(listen(serial, collecting.add, limit_s))
         if not is_done:
-            refuse(f"no samples of vehicle {vehicle}: is it on, and the port right?")
+            refuse(f"no samples of vehicle {vehicle}: is it on, and is the port right?")
         if collecting.chips not in ((), shown):
             shown = collecting.chips
             _show_chips(shown)
@@ -385,15 +385,15 @@ async def listen(
 
 
 class _Collecting:
-    """Collect one aircraft's samples over a time, until most sides were seen if asked."""
+    """Collect one aircraft's samples over a time, or until most sides were measured."""
 
     def __init__(self, vehicle: int, seconds: float, *, turned: bool) -> None:
         self._vehicle, self._seconds, self._turned = vehicle, seconds, turned
         self.raws: list[ImuRaw] = []
         self.chips: tuple[str, ...] = ()
-        """What the IMU node reported last."""
+        """Chips that the IMU node last reported."""
         self._shown_s = 0.0
-        label = "sides of the field seen" if turned else "listening"
+        label = "sides of the field measured" if turned else "listening"
         total = calibrating.FIELD_SIDES if turned else seconds
         unit = f"of {total}" if turned else "s"
         self.bar = Progress(
@@ -404,7 +404,7 @@ class _Collecting:
         self.limit_s = MAG_LIMIT_S if turned else seconds
 
     def add(self, records: Iterable[RawRecord]) -> bool:
-        """Process the next records; return whether they are enough."""
+        """Process the next records; return whether the samples are complete."""
         raws, seconds = self.raws, self._seconds
         for record in records:
             if record.node.vehicle_id != self._vehicle:
@@ -426,7 +426,7 @@ class _Collecting:
 
 
 def _capture_live(vehicle: int) -> Capture:
-    """Take the samples of the running gateway."""
+    """Return a capture from the running gateway."""
     for aircraft in ask("status")["aircraft"]:
         boards = aircraft["boards"] if aircraft["vehicle_id"] == vehicle else ()
         for board in boards:
@@ -460,7 +460,7 @@ def _ask(text: str) -> None:
 
 
 def _show(old: NodeCalibration, new: NodeCalibration) -> None:
-    """Print what changed."""
+    """Print the changes."""
     table = table_of("setting", "before", "after", left=3)
     for name in new.__struct_fields__:
         before, after = getattr(old, name), getattr(new, name)

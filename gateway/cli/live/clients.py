@@ -1,4 +1,4 @@
-"""`mavgate status`, `clients …`, `mark`, `reload`: a running gateway and its clients."""
+"""`mavgate status`, `clients …`, `mark`, `reload`: the clients of a running gateway."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ app = typer.Typer()
 group = typer.Typer(help="List, add and remove clients and sources.", no_args_is_help=True)
 app.add_typer(group, name="clients")
 MOST_SYSTEMS: Final = 8
-"""Shown of a client; one that floods may send as thousands."""
+"""Systems shown per client; a client that floods may send as thousands."""
 
 
 @app.command()
@@ -76,7 +76,7 @@ def status(
 
 @group.command("list")
 def list_clients(*, json: JsonOption = False) -> None:
-    """List the clients with the frames sent to them and dropped on this side."""
+    """List the clients, with the frames sent to them and dropped by the gateway."""
     if json:
         print_json(ask("clients.list"))
         return
@@ -102,7 +102,7 @@ def add(
 
 
 def _save(file: Path, url: str) -> None:
-    # Imported here: the settings import every stage.
+    # Imported here: the settings import all stages.
     from gateway.config import ConfigError, save_endpoint
 
     try:
@@ -113,7 +113,7 @@ def _save(file: Path, url: str) -> None:
 
 
 @group.command()
-def remove(name: Annotated[str, typer.Argument(help="Its name, or its URL.")]) -> None:
+def remove(name: Annotated[str, typer.Argument(help="Name or URL of the client.")]) -> None:
     """Remove a client, a source or a listening port."""
     print(*ask("clients.remove", {"name": name}), sep="\n")
 
@@ -250,7 +250,7 @@ def _name_of(record: Record, board: Record | None = None) -> str:
 
 
 def _board(board: Record | None, overruns: str) -> tuple[str, ...]:
-    """Show a node's report of its board."""
+    """Return the cells of a node's report on its board."""
     if board is None:
         return (*(UNKNOWN,) * 4, overruns, UNKNOWN)
     counts = (str(board[key]) for key in ("bus_errors", "radio_failed", "radio_retries"))
@@ -272,7 +272,7 @@ def _print_clients(console: Console, snapshot: Record) -> None:
 
 
 def _listeners(listeners: Sequence[Record]) -> Table:
-    table = table_of("listening", "state", "clients", "turned away")
+    table = table_of("listening", "state", "clients", "rejected")
     for port in listeners:
         figures = (str(port[key]) for key in ("clients", "turned_away"))
         table.add_row(port["name"], port["reason"] or port["state"], *figures)
@@ -294,7 +294,7 @@ def _clients(clients: Sequence[Record], now_us: int) -> Table:
 
 
 def _first_systems(systems: Sequence[tuple[int, int]]) -> list[str]:
-    """Return system and component ids as text, and how many more there are."""
+    """Return system and component ids as text, and the number of further ones."""
     named = [f"{system}.{component}" for system, component in systems[:MOST_SYSTEMS]]
     more = len(systems) - len(named)
     return [*named, f"and {more} more"] if more else named

@@ -1,6 +1,6 @@
 """`mavgate demo`: the whole gateway on a simulated receiver.
 
-Its frames are made by a process of their own, or by simulated boards.
+The frames are produced by a separate process, or by the firmware on simulated chips.
 """
 
 import importlib
@@ -47,12 +47,12 @@ log = logging.getLogger(__name__)
 NOT_RECORDED: Final = "not recording without --record or `mavgate record start`"
 app = typer.Typer()
 AT_ONCE: Final = 16
-"""Frames that cross at once; the pipe holds some hundreds, which are made ahead."""
+"""Frames per message of the pipe, which buffers some hundreds in advance."""
 CHECKOUT: Final = Path(__file__).resolve().parents[3]
 
 
 class SourceName(StrEnum):
-    """The kinds of sources that are simulated."""
+    """Kinds of simulated sources."""
 
     CRSF = "crsf"
     LINES = "lines"
@@ -83,18 +83,18 @@ def demo(
     panel: Annotated[bool, typer.Option("--panel/--no-panel", help="Start the panel too.")] = True,
     force: ForceOption = False,
 ) -> None:
-    """Fly the simulated tracker, over and over, until interrupted.
+    """Fly the simulated tracker repeatedly until interrupted.
 
     The simulated receiver sends the real protocol on a pseudo-terminal, at true rates. A recording
     that is flown instead restarts at its end, with a message.
     """
-    file = CONFIG.get()  # A reload reads in another thread, without the context's value.
+    file = CONFIG.get()  # Read here: a reload runs in another thread, without the context.
 
     def read() -> GatewaySettings:
         return with_endpoints(read_settings(file), endpoint)
 
     settings = _without_conflicts(read(), one=flight is not None, force=force)
-    # First of all, as it loads for seconds; so the simulator is imported after this.
+    # First, as it takes seconds to load; the simulator is therefore imported later.
     page = launched_panel(wanted=panel)
     load_entry_points()
     daemons: list[Daemon] = []
@@ -114,7 +114,7 @@ def demo(
             aircraft = calibrated_aircraft(settings)
     except (BenchError, ValueError) as error:
         refuse(str(error))
-    # Settings that a ground station stores in the demo must not become the real aircraft's.
+    # Parameters that a ground station stores in the demo must not affect the real aircraft's.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
 
         def own(settings: GatewaySettings) -> GatewaySettings:
@@ -130,14 +130,14 @@ def demo(
 
 
 def _without_conflicts(settings: GatewaySettings, *, one: bool, force: bool) -> GatewaySettings:
-    """Return the settings, unless another gateway sends the ids of the simulated aircraft too."""
+    """Return the settings; refuse if another gateway sends the ids of the simulated aircraft."""
     first, count = settings.simulator.vehicle_id, 1 if one else settings.simulator.vehicles
     refuse_conflicts(range(first, first + count), settings, force=force)
     return settings
 
 
 def simulated_line(settings: SimulatorSettings, source: SourceName | None) -> Iterator[TimedFrame]:
-    """Fly the simulated aircraft, by the receiver's frames or a source's bytes."""
+    """Simulate the aircraft, as frames of the receiver or bytes of another source."""
     from gateway.simulator.receiver import simulate
     from gateway.simulator.source_bytes import SOURCE_BYTES
 
@@ -152,7 +152,7 @@ def recorded_line(
     columns: Path | None = None,
     report: Callable[[str], None] = log.info,
 ) -> tuple[Iterator[TimedFrame], dict[int, AircraftSettings]]:
-    """Send a recording as its nodes would have, with its calibrated values unchanged."""
+    """Send a recording as its nodes would have sent it, with unchanged calibrated values."""
     from gateway.recordings.flown import open_flown
     from gateway.recordings.fuse import with_reference
     from gateway.simulator.recorded import in_rounds, replay
@@ -172,7 +172,7 @@ def recorded_line(
 
 
 def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
-    """Calibrate the simulated aircraft, as their owner would do before the flight."""
+    """Return the simulated aircraft with the calibration that a user would have made before."""
     from gateway.simulator.flight import SimulatedAircraft
 
     found = {}
@@ -184,7 +184,7 @@ def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings
 
 
 def made_ahead(frames: Iterator[TimedFrame]) -> Generator[TimedFrame]:
-    """Let a background process make frames, so that the event loop that plays them need not."""
+    """Produce frames in a background process, to relieve the event loop that plays them."""
     return _take(begin_copy(_make, frames))
 
 
@@ -201,7 +201,7 @@ def _take(receiver: Connection) -> Generator[TimedFrame]:
 
 
 def _make(frames: Iterator[TimedFrame], sender: Connection) -> None:
-    # A terminal's Ctrl+C, and its end, are for the gateway, which ends this process.
+    # Ctrl+C and hang-up of the terminal are handled by the gateway, which ends this process.
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     while made := [(f.time_s, f.data, f.damaged) for f in islice(frames, AT_ONCE)]:

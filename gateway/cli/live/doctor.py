@@ -45,7 +45,7 @@ app = typer.Typer()
 
 TTY: Final = Path("/sys/class/tty")
 SLOW_LATENCY_MS: Final = 4
-"""FTDI's timer: how long bytes wait in the adapter; 16 is its default."""
+"""Greatest acceptable latency timer of an FTDI adapter, which delays bytes; its default is 16."""
 EXTRA_USES: Final = {
     "plot": "`mavgate report`",
     "panel": "`mavgate panel`",
@@ -56,9 +56,9 @@ EXTRA_USES: Final = {
 }
 ENOUGH_HOURS: Final = 4.0
 MB_PER_HOUR: Final = 100.0
-"""Of one aircraft, tlog and table together."""
+"""Size of recordings of one aircraft, tlog and table together."""
 SOON_S: Final = 14 * 86_400
-"""A certificate that ends within this time should have been renewed."""
+"""Remaining time at which a certificate should have been renewed."""
 
 
 class Grade(StrEnum):
@@ -76,7 +76,7 @@ class Diagnosis:
     grade: Grade
     what: str
     text: str
-    """The result, and how to fix it."""
+    """The result, and its remedy."""
 
 
 ok: Final = partial(Diagnosis, Grade.OK)
@@ -87,7 +87,7 @@ Check = Callable[[GatewaySettings], Iterator[Diagnosis]]
 
 
 def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check the aircraft's files, and whether they can be written."""
+    """Check the aircraft's files, and write access to them."""
     folder = aircraft_folder(settings)
     try:
         found = load_aircraft(settings)
@@ -100,14 +100,14 @@ def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
 
 
 def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check for the receiver's port, and whether it may be opened."""
+    """Check the receiver's port, and access to it."""
     try:
         fitting = fitting_ports(settings.serial.port, list_serial_ports())
     except PortNotFoundError as error:
         yield fail("receiver", f"{error}; plug it in, or set serial.port")
         return
     if len(fitting) > 1:
-        text = f"several adapters fit, the gateway asks each: {', '.join(fitting)}"
+        text = f"several adapters match, the gateway tries each: {', '.join(fitting)}"
         yield info("receiver", text)
     for device in fitting:
         yield from _check_port(device)
@@ -116,7 +116,7 @@ def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
 def _check_port(device: str) -> Iterator[Diagnosis]:
     path = Path(device)
     if not path.exists():
-        yield fail("receiver", f"{device} is not there; `mavgate ports` lists all")
+        yield fail("receiver", f"{device} does not exist; `mavgate ports` lists all")
     elif not os.access(path, os.R_OK | os.W_OK):
         yield fail("receiver", f"{device} may not be opened: {_membership(path)}")
     else:
@@ -129,7 +129,7 @@ def _membership(path: Path) -> str:
     try:
         group = grp.getgrgid(owner)
     except KeyError:
-        return f"it is for the group {owner}"
+        return f"it is accessible to the group {owner}"
     if user in group.gr_mem:
         return f"{user} is in the group {group.gr_name} only from the next log-in on"
     return f"`sudo usermod -aG {group.gr_name} {user}`, then log in again"
@@ -146,8 +146,8 @@ def _latency(device: Path) -> Iterator[Diagnosis]:
     else:
         yield fail(
             "latency timer",
-            f"the adapter holds bytes back for {latency_ms} ms: `echo 1 | sudo tee {timer}`, and "
-            "for good the rule of tools/debian/60-mavgate.rules",
+            f"the adapter delays bytes by {latency_ms} ms: `echo 1 | sudo tee {timer}`, and "
+            "permanently by the rule tools/debian/60-mavgate.rules",
         )
 
 
@@ -162,9 +162,9 @@ def check_kernels(_: GatewaySettings) -> Iterator[Diagnosis]:
 
 
 def check_clock(_: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check whether the system time is right, after which recordings are named."""
+    """Check whether the system time is synchronised, as recordings are named by it."""
     if not shutil.which("timedatectl"):
-        yield info("clock", "unknown whether it is right")
+        yield info("clock", "synchronisation unknown")
         return
     asked = ["timedatectl", "show", "--property=NTPSynchronized", "--value"]
     said = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=10)
@@ -201,7 +201,7 @@ def _writable(what: str, folder: Path, text: str) -> Diagnosis:
 
 
 def check_ports(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check whether a gateway runs already, and otherwise whether its ports are free."""
+    """Check whether a gateway runs, otherwise whether its ports are free."""
     if running := live_sockets("run"):
         yield ok("gateway", f"runs, and listens at {', '.join(map(str, running))}")
         return
@@ -215,11 +215,11 @@ def check_ports(settings: GatewaySettings) -> Iterator[Diagnosis]:
 
 
 def _trouble_of(endpoint: Endpoint) -> str:
-    """Return why a listening endpoint could not be bound now."""
+    """Return the reason why a listening endpoint could not be bound now."""
     if endpoint.kind is EndpointKind.SERIAL:
         allowed = os.access(endpoint.host, os.R_OK | os.W_OK)
         there = Path(endpoint.host).exists()
-        return "" if allowed else _membership(Path(endpoint.host)) if there else "is not there"
+        return "" if allowed else _membership(Path(endpoint.host)) if there else "does not exist"
     kinds: dict[str, socket.SocketKind] = {
         EndpointKind.UDP_LISTEN: socket.SOCK_DGRAM,
         EndpointKind.TCP_LISTEN: socket.SOCK_STREAM,
@@ -238,7 +238,7 @@ def _trouble_of(endpoint: Endpoint) -> str:
 
 
 def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check whether the certificates of hub and panel can be used, and for how long."""
+    """Check the validity of the certificates of hub and panel."""
     hub, panel = settings.hub, settings.panel
     for what, certificate, key in (
         ("hub.tls_certificate", hub.tls_certificate, hub.tls_key),
@@ -260,20 +260,20 @@ def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
 
 
 def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check which optional parts are installed."""
+    """Check which extras are installed."""
     for extra, use in EXTRA_USES.items():
         if missing(extra):
             yield info("extra", how_to_add(use, extra))
 
 
 def _write_template(text: str) -> None:
-    """Write the settings file, which is never replaced."""
+    """Write the settings file, which is never overwritten."""
     file = CONFIG.get() or USER_CONFIG.expanduser()
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
         write_new(file, [text.encode()], rights=PRIVATE)
     except FileExistsError:
-        refuse(f"{file}: is there, and is kept; `mavgate check-config {file}` checks it")
+        refuse(f"{file}: exists, and is not overwritten; `mavgate check-config {file}` checks it")
     print(f"wrote {file}")
 
 
@@ -340,8 +340,8 @@ def check_config(
     for endpoint in map(parse_endpoint, settings.hub.endpoints):
         if endpoint.port == 0 and endpoint.kind in LISTENING:
             refuse(
-                f"{file}: hub.endpoints: {endpoint.url!r} takes any free port, which no ground "
-                "station can know; name one of 1 to 65535"
+                f"{file}: hub.endpoints: {endpoint.url!r} uses any free port, which no ground "
+                "station can know in advance; set one of 1 to 65535"
             )
     others = f", and of {len(aircraft)} aircraft in {aircraft_folder(settings)}" if aircraft else ""
-    print(f"{file}: all settings are right{others}")
+    print(f"{file}: all settings are valid{others}")

@@ -1,4 +1,4 @@
-"""`mavgate setup`: a guided first start, on the real receiver or on the simulated one."""
+"""`mavgate setup`: a guided first start, with the real receiver or a simulated one."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ if TYPE_CHECKING:
     from gateway.simulator.trajectory import Workbench
 
 LOOK_S: Final = 5.0
-"""After opening: a bootloader takes up to 2 s, and every board reports once a second."""
+"""Listening time after opening: a bootloader takes up to 2 s, boards report once a second."""
 GPS_WAIT_S: Final = 60.0
 NOISY_PERCENT: Final = 30
 LOSSY_PERCENT: Final = 5.0
 FEW_LOST: Final = 3
-"""So many may be chance in so short a time."""
+"""Lost payloads that may be chance in this short time."""
 WEAK_SATELLITES: Final = 6
 SENSORS: Final = {
     SENSOR_IMU: "IMU",
@@ -49,14 +49,14 @@ SENSORS: Final = {
     SENSOR_BARO: "barometer",
     SENSOR_GPS: "GPS",
 }
-"""Bits of a node's report."""
+"""Names of the sensors' bits in a node's report."""
 console = console_of()
 app = typer.Typer()
 
 
 @dataclass
 class Observed:
-    """The records that were received within a time."""
+    """The records received within a time."""
 
     statuses: dict[tuple[int, int], NodeStatus] = field(default_factory=dict)
     """The newest report of each node, by vehicle and node id."""
@@ -122,9 +122,9 @@ def _find(serial: SerialSettings) -> SerialSettings:
     except PortNotFoundError as error:
         _stop(
             str(error),
-            "Connect the receiver by USB. A new board gets its program by `mavgate flash receiver`",
+            "Connect the receiver by USB. Program a new board with `mavgate flash receiver`",
             "`mavgate doctor` checks whether this user may open the port",
-            "A gateway that runs (`mavgate status`) has to be stopped first",
+            "A running gateway (`mavgate status`) must be stopped first",
         )
     return replace(serial, port=device)
 
@@ -135,7 +135,7 @@ def _check_receiver(report: LinkReport, serial: SerialSettings) -> None:
         sent = "bytes that are not frames" if report.bytes_received else "nothing"
         _stop(
             f"{serial.port} sends {sent}",
-            f"`mavgate flash --show --port {serial.port}` reads which program is on the board",
+            f"`mavgate flash --show --port {serial.port}` reads the program of the board",
             f"The receiver's line has {serial.baud} baud in these settings (serial.baud)",
         )
     if receiver is None:
@@ -149,7 +149,7 @@ def _check_receiver(report: LinkReport, serial: SerialSettings) -> None:
             "The channel is noisy: flash all boards with another --frequency of the band"
             if receiver.channel == LORA_CHANNEL
             else "The channel is noisy: move the receiver away from Wi-Fi routers, or flash all "
-            "boards with another --channel (76 and above lie beyond Wi-Fi)"
+            "boards with another --channel (76 and above are outside the Wi-Fi band)"
         )
 
 
@@ -159,10 +159,10 @@ def _choose(report: LinkReport, vehicle: int | None) -> int:
     if not received:
         _stop(
             "no aircraft is received",
-            "Is it powered? A node whose LED flashes once every 2 s gets no answer: channel, rate "
-            "and address, or the LoRa settings, must be the receiver's, compare them by "
+            "Is it powered? A node whose LED flashes every 2 s is not acknowledged: channel, rate "
+            "and address, or the LoRa settings, must be those of the receiver; compare them with "
             "`mavgate flash --show`",
-            "Three flashes: its radio module does not answer: check its wiring and 3.3 V supply",
+            "Three flashes: its radio module does not respond: check its wiring and 3.3 V supply",
         )
     listed = ", ".join(map(str, received))
     if vehicle is not None and vehicle not in received:
@@ -237,7 +237,7 @@ def _check_gps(serial: SerialSettings, vehicle: int) -> None:
 def _calibrate(
     settings: GatewaySettings, serial: SerialSettings, vehicle: int, bench: Workbench | None
 ) -> int:
-    """Run the calibration and save it; return the number of steps that succeeded."""
+    """Calibrate and save; return the number of successful steps."""
     _head("4 of 5: calibration of gyroscope, accelerometer, level and magnetometer")
     aircraft = load_aircraft(settings).get(vehicle, settings.default_aircraft)
     capture = capture_from(serial, vehicle)
@@ -297,5 +297,5 @@ def _hint(text: str) -> None:
 
 
 def _stop(text: str, *hints: str) -> NoReturn:
-    """End the command with the reason and the remedy."""
+    """End the command with the reason and remedies."""
     refuse("\n".join([text, *(f"- {hint}" for hint in hints)]))

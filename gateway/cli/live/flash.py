@@ -1,4 +1,4 @@
-"""`mavgate flash` and `ports`: programs and settings of boards, and the ports that they are at."""
+"""`mavgate flash` and `ports`: programs and settings of boards, and their serial ports."""
 
 import asyncio
 from enum import StrEnum
@@ -61,7 +61,7 @@ app = typer.Typer()
 
 
 class Board(StrEnum):
-    """The programs as they are named on the command line."""
+    """The programs by their names on the command line."""
 
     IMU = "imu"
     GPS = "gps"
@@ -92,10 +92,10 @@ def flash(
         str, typer.Option("--port", "-p", help="As serial.port: device, usb:VID:PID or auto.")
     ] = "auto",
     show: Annotated[
-        bool, typer.Option("--show", help="Read a board's program, version and settings back.")
+        bool, typer.Option("--show", help="Read the program, version and settings of a board.")
     ] = False,
     keep: Annotated[
-        bool, typer.Option("--keep", help="Keep the board's present settings where not given.")
+        bool, typer.Option("--keep", help="Keep present settings that are not given.")
     ] = False,
     clock: Annotated[int, typer.Option("--clock", help="Crystal: 16 or 8 MHz.")] = 16,
     output: Annotated[
@@ -110,7 +110,7 @@ def flash(
     rate: Annotated[int | None, _option("radio_kbps")] = None,
     power: Annotated[
         int | None,
-        typer.Option("--power", help="Of the transmitter. -18, -12, -6, 0 dBm; by LoRa 2 to 20."),
+        typer.Option("--power", help="Transmit power: -18, -12, -6, 0 dBm; with LoRa 2 to 20."),
     ] = None,
     address: Annotated[str | None, _option("radio_address")] = None,
     send_rate: Annotated[int | None, _option("imu_send_hz")] = None,
@@ -134,7 +134,7 @@ def flash(
     duty: Annotated[
         float | None,
         typer.Option(
-            "--duty", help="LoRa: most time on the air, percent; by default 45, and a warning."
+            "--duty", help="LoRa: maximum time on air, percent; by default 45, with a warning."
         ),
     ] = None,
 ) -> None:
@@ -192,7 +192,7 @@ def _list() -> None:
         refuse("no USB adapter is connected: connect a board by USB, then list again")
     table = table_of("device", "USB id", "adapter", "bootloader", left=4)
     for port in found:
-        answer = _bootloader_text(port.device) if port.usb_id else "not asked"
+        answer = _bootloader_text(port.device) if port.usb_id else "not tried"
         table.add_row(port.device, port.usb_id, port.description, answer)
     console.print(table)
     console.print("Next: `mavgate flash imu --port DEVICE`, or gps, or receiver")
@@ -204,7 +204,7 @@ def _bootloader_text(device: str) -> str:
             loader = boards.find_bootloader(device)
     except FlashError as error:
         return str(error).removeprefix(f"{device}: ")
-    return "no answer" if loader is None else f"{loader.name}, {loader.baud} baud"
+    return "no response" if loader is None else f"{loader.name}, {loader.baud} baud"
 
 
 def _write(
@@ -217,7 +217,7 @@ def _write(
     duty: float | None,
 ) -> None:
     """Patch an image and write it to a board."""
-    # Settings that do not fit are refused before a port is opened.
+    # Invalid settings are refused before a port is opened.
     settings = _changed(program, boards.block_of(image).settings, changes, duty)
     device = find_port(port, list_serial_ports())
     with boards.reserved(device):
@@ -235,7 +235,7 @@ def _write(
 
 
 def _check(program: Program, radio: Radio, changes: dict[str, Any]) -> None:
-    """End the command if an option does not concern the program, or has an invalid value."""
+    """End the command if an option does not apply to the program, or its value is invalid."""
     for name, value in changes.items():
         option = OPTIONS[name]
         if name not in used_by(program, radio):
@@ -265,20 +265,20 @@ def _changed(
 
 
 def _check_airtime(program: Program, settings: BoardSettings, duty: float | None) -> None:
-    """Refuse what does not fit the channel, and warn of what the band does not allow."""
+    """Refuse settings that overload the channel; warn if they exceed the limit of the band."""
     most = airtime.MOST_SHARE if duty is None else duty / 100
     used = airtime.check(program, settings, most)
-    console.print(f"on the air {100 * used:.1f} % of the time")
+    console.print(f"time on air: {100 * used:.1f} %")
     allowed = airtime.duty_cycle(settings.lora_frequency_khz)
     if duty is None and allowed is not None and used > allowed:
         console.print(
             f"warning: {settings.lora_frequency_khz / 1000:g} MHz allows {100 * allowed:g} % in "
-            f"Europe; --duty {100 * allowed:g} refuses what does not fit"
+            f"Europe; --duty {100 * allowed:g} refuses longer times on air"
         )
 
 
 def _print(device: str, block: SettingsBlock) -> None:
-    """Print a table of the program and settings of a board."""
+    """Print the program and settings of a board."""
     major, minor = block.firmware_version
     name = block.program.name.lower()
     console.print(f"{device}: {name}, version {major}.{minor}, for {block.clock_mhz} MHz")
@@ -294,7 +294,7 @@ def _print(device: str, block: SettingsBlock) -> None:
 def ports() -> None:
     """List the serial ports, and the one that `auto` selects.
 
-    If several USB adapters fit, each is opened and asked for the receiver's frames.
+    If several USB adapters match, each is opened and checked for the receiver's frames.
     """
     found = list_serial_ports()
     table = table_of("device", "setting by USB id", "serial number", "description", left=4)
@@ -306,8 +306,8 @@ def ports() -> None:
     try:
         fitting = fitting_ports("auto", found)
         if len(fitting) > 1:
-            console.print(f"asking {', '.join(fitting)} for the receiver's frames")
+            console.print(f"checking {', '.join(fitting)} for the receiver's frames")
             fitting = [asyncio.run(find_receiver(SerialSettings()))]
-        console.print(f'port = "auto" takes {fitting[0]}')
+        console.print(f'port = "auto" uses {fitting[0]}')
     except PortNotFoundError as error:
         console.print(f'port = "auto": {error}')

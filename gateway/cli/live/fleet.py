@@ -28,7 +28,7 @@ from gateway.units import US_PER_S, counted
 log = logging.getLogger(__name__)
 
 DISK_S: Final = 60.0
-"""Longest wait for a file to be written: a worn card takes seconds for each step."""
+"""Timeout for writing a file: a worn memory card takes seconds per step."""
 
 app = typer.Typer()
 group = typer.Typer(
@@ -49,7 +49,7 @@ def fleet(
     *,
     listen: Annotated[
         str | None,
-        typer.Option("--listen", help="Be the router, as in tls/0.0.0.0:7447."),
+        typer.Option("--listen", help="Run the router here, e.g. tls/0.0.0.0:7447."),
     ] = None,
     connect: Annotated[
         str | None, typer.Option("--connect", help="Router to connect to: tls/HOST:7447.")
@@ -82,7 +82,7 @@ def status(*, json: JsonOption = False) -> None:
         return
     console = console_of()
     role = "router at" if found["is_router"] else "connected to"
-    lost = "" if found["is_linked"] else ", which does not answer"
+    lost = "" if found["is_linked"] else ", which does not respond"
     console.print(f"{role} {found['router']}{lost}")
     table = table_of("site", "", "RTT ms", "system", "id here", "Hz", "age s", "lost", left=2)
     for each in found["sites"]:
@@ -99,7 +99,7 @@ def status(*, json: JsonOption = False) -> None:
     if found["overflowed"]:
         console.print(f"{counted(found['overflowed'], 'message')} dropped: they arrived too fast")
     for site in found["sites"]:
-        # Those that its passphrase has rejected.
+        # Frames rejected because of their signature.
         counts = [f"{site[k]} {k}" for k in ("unsigned", "forged", "replayed") if site[k]]
         if counts:
             console.print(f"frames of {site['name']} dropped: {', '.join(counts)}")
@@ -192,7 +192,7 @@ def get(
     *,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Folder; by default one called as the site."),
+        typer.Option("--output", "-o", help="Folder; by default one named after the site."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that differ.")] = False,
 ) -> None:
@@ -201,7 +201,7 @@ def get(
         refuse(f"site {site!r}: letters, digits, . _ and - only")
     listed = ask("fleet.recordings", {"site": site}, of="fleet").get(site)
     if listed is None:
-        refuse(f"site {site} does not answer for recordings; see `mavgate fleet status`")
+        refuse(f"site {site} does not serve recordings; see `mavgate fleet status`")
     recording = next((each for each in listed if each["name"] == name), None)
     if recording is None and name == NEWEST and listed:
         recording = listed[-1]

@@ -1,4 +1,4 @@
-"""`mavgate map get`: an area of a map for the panel, for use without a network."""
+"""`mavgate map get`: copy an area of a map for the panel, for use without a network."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -79,7 +79,7 @@ def get(
 
 
 def _coordinates(text: str) -> tuple[float, float] | None:
-    """Return latitude and longitude if a text is such a pair within its ranges."""
+    """Return latitude and longitude if the text is a valid pair of them."""
     try:
         lat_deg, lon_deg = (float(part) for part in text.split(","))
     except ValueError:

@@ -1,4 +1,4 @@
-"""`mavgate panel`: the page in a browser, also as a child process of the gateway."""
+"""`mavgate panel`: run the panel, also as a child process of the gateway."""
 
 import asyncio
 import logging
@@ -24,18 +24,18 @@ log = logging.getLogger(__name__)
 app = typer.Typer()
 
 NICENESS: Final = 5
-"""The gateway has priority over the panel, from the panel's imports on."""
+"""Niceness of the panel, set before its imports, so that the gateway has priority."""
 LINK: Final = "panel: "
-"""Begin of the line with the page's address."""
+"""Prefix of the line with the page's address."""
 RESTART_S: Final = 5.0
 LONGEST_RESTART_S: Final = 300.0
 """Longest pause between restarts, so that repeated failures do not fill the log."""
 LINE_BREAK: Final = "\x1e"
-"""Between the lines of one record of the panel's log, whose own control characters are escaped."""
+"""Separator of the lines of a record in the panel's log; control characters in it are escaped."""
 LONGEST_RECORD: Final = 15_000
-"""Characters of a record, which fit into a line of 64 kB; of a longer one the end is kept."""
+"""Characters of a record, to fit in a line of 64 kB; of a longer one the end is kept."""
 END_S: Final = 3.0
-"""Within which it ends by itself when asked to; the loop must not close before it has."""
+"""Timeout for the panel to end by itself; the loop must not close before that."""
 
 
 @app.command()
@@ -50,7 +50,7 @@ def panel(
     ] = None,
     port: Annotated[int | None, typer.Option("--port", "-p", min=0, max=65535)] = None,
     hash_password: Annotated[
-        bool, typer.Option("--hash-password", help="Ask for a password and print its hash.")
+        bool, typer.Option("--hash-password", help="Prompt for a password and print its hash.")
     ] = False,
     attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
 ) -> None:
@@ -71,13 +71,13 @@ def panel(
         print(f'password = "{hashed(typer.prompt("Password", hide_input=True))}"')
         return
     if attached:
-        # Its important lines come into the gateway's own log, which stamps them; so does the
-        # traceback of what ends it.
+        # Warnings are passed to the gateway's log, which adds timestamps; so is the traceback of
+        # an exception that ends the panel.
         sys.excepthook = lambda *failed: log.critical("the panel failed", exc_info=failed)
         logging.getLogger().setLevel(logging.WARNING)
         for handler in logging.getLogger().handlers:
             handler.setFormatter(OneLineFormatter("%(message)s"))
-        # The gateway sends the path once its socket listens, later than this process starts.
+        # The gateway sends the path once its socket listens, after this process has started.
         line = sys.stdin.buffer.readline()
         if not line:
             return
@@ -98,7 +98,7 @@ def panel(
 
 
 def launched_panel(*, wanted: bool) -> "PanelProcess | None":
-    """Return the panel, which begins to load, or None if it is not wanted or not installed."""
+    """Return the panel while it loads; None if it is not wanted or not installed."""
     if not wanted:
         return None
     if missing("panel"):
@@ -110,10 +110,10 @@ def launched_panel(*, wanted: bool) -> "PanelProcess | None":
 
 
 class OneLineFormatter(PrintableFormatter):
-    """Formats each record as one line, so that the gateway logs a traceback as one record."""
+    """Formatter of a record as one line, so that the gateway logs a traceback as one record."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line of a record."""
+        """Return the record as one line."""
         text = super().format(record)
         if len(text) > LONGEST_RECORD:
             head = text.partition("\n")[0][:LONGEST]
@@ -122,11 +122,11 @@ class OneLineFormatter(PrintableFormatter):
 
 
 class PanelProcess:
-    """The panel as a child process of the gateway; restarted when it dies."""
+    """The panel as a child process of the gateway; it is restarted if it dies."""
 
     def __init__(self) -> None:
         self.link = ""
-        """The page's address; empty while there is none."""
+        """Address of the page; empty before it is known."""
         self._command = own_command("panel", "--attached")
         if (config := CONFIG.get()) is not None:
             self._command += ["--config", str(config)]
@@ -134,7 +134,7 @@ class PanelProcess:
         self._child: subprocess.Popen[bytes] | None = None
 
     def launch(self) -> None:
-        """Start the process; it loads its libraries, then waits for the control socket's path."""
+        """Start the process, which loads its libraries and waits for the control socket's path."""
         log.info("the panel is loading; its address follows")
         pipe = subprocess.PIPE
         self._child = subprocess.Popen(
@@ -142,11 +142,11 @@ class PanelProcess:
         )
 
     def start(self, control_socket: Callable[[], Awaitable[Path]]) -> None:
-        """Connect it to the gateway, and keep it running; needs a running event loop."""
+        """Connect it to the gateway, and restart it when it ends; requires a running event loop."""
         self._task = asyncio.get_running_loop().create_task(self._keep(control_socket))
 
     async def close(self) -> None:
-        """End it, and wait until it has ended."""
+        """End the process, and wait for its end."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait([self._task])
@@ -196,7 +196,7 @@ class PanelProcess:
             try:
                 line = await output.readline()
             except ValueError:
-                continue  # too long a line, which is gone
+                continue  # The line exceeded the limit, and was discarded.
             text = line.decode(errors="replace").rstrip()
             if text.startswith(LINK):
                 self.link = text.removeprefix(LINK)

@@ -74,12 +74,12 @@ def rename(
 def delete(
     name: NameArgument,
     *,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")] = False,
 ) -> None:
     """Delete a recording, after asking."""
     running = is_running()
     folder = Path(ask("record.status")["folder"]) if running else _folder()
-    # `last` may have become another one while the user was asked.
+    # `last` may mean another recording after the user has answered.
     found = find_recording(folder, name)
     if not yes:
         what = f"{found.name!r}: {counted(len(found.files), 'file')}, {found.size / 1e6:.2f} MB"
@@ -93,7 +93,7 @@ def delete(
 
 
 @group.command()
-def note(text: Annotated[str, typer.Argument(help="What happens now.")]) -> None:
+def note(text: Annotated[str, typer.Argument(help="Text of the remark.")]) -> None:
     """Add a remark to the recording at this moment, and send it to the ground stations."""
     _show(ask("record.note", {"text": text}))
 
@@ -126,7 +126,7 @@ def _show(status: dict[str, Any]) -> None:
 
 
 def _size(status: dict[str, Any]) -> int:
-    """Return the size of a recording; of its last part where the files are not readable."""
+    """Return the size of a recording; only that of its last part if files cannot be accessed."""
     try:
         return find_recording(Path(status["folder"]), status["name"]).size
     except (RecordingError, OSError):

@@ -1,4 +1,4 @@
-"""The commands that run the gateway: on a real receiver, or on the simulated one."""
+"""Run the gateway, on a real receiver or on a simulated one."""
 
 import asyncio
 import gc
@@ -33,18 +33,18 @@ log = logging.getLogger(__name__)
 app = typer.Typer()
 
 VIEW_INTERVAL_S: Final = 0.5
-"""Twice a second: drawing takes some milliseconds, during which no frame is sent."""
+"""Interval of the live view: drawing takes some milliseconds, in which no frame is sent."""
 LOG_INTERVAL_S: Final = 10.0
 SWITCH_S: Final = 0.0001
 
 PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines instead of the live view.")]
 ForceOption = Annotated[
     bool,
-    typer.Option("--force", help="Send, though another gateway sends the same vehicle id there."),
+    typer.Option("--force", help="Send even if another gateway sends the same vehicle id there."),
 ]
 EndpointOption = Annotated[
     list[str] | None,
-    typer.Option("--endpoint", "-e", help="Where MAVLink goes, instead of the settings'."),
+    typer.Option("--endpoint", "-e", help="Endpoint for MAVLink, instead of the settings'."),
 ]
 
 
@@ -69,7 +69,7 @@ def run_gateway(
     ] = False,
 ) -> None:
     """Run the gateway on the receiver's serial port until interrupted."""
-    # Taken here: a reload reads in another thread, which does not have the context's value.
+    # Read here: a reload runs in another thread, without the context.
     file = CONFIG.get()
 
     def read() -> GatewaySettings:
@@ -85,14 +85,14 @@ def run_gateway(
     aircraft = load_aircraft(settings)
     page = launched_panel(wanted=panel or settings.panel.enabled)
     if settings.serial.port != NO_RECEIVER or settings.sources:
-        # A router has no estimator, and its hub forwards without them, too.
+        # A router has no estimator, and its hub also forwards without compiled functions.
         load_entry_points()
     daemon = serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page)
     run_event_loop(daemon, settings.hub.event_loop)
 
 
 def with_sources(settings: GatewaySettings, urls: list[str] | None) -> GatewaySettings:
-    """Replace the settings' sources by those of the command line."""
+    """Replace the sources in the settings by those of the command line."""
     if not urls:
         return settings
     try:
@@ -103,7 +103,7 @@ def with_sources(settings: GatewaySettings, urls: list[str] | None) -> GatewaySe
 
 
 def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:
-    """Replace the settings' endpoints by those of the command line."""
+    """Replace the endpoints in the settings by those of the command line."""
     if not endpoints:
         return settings
     try:
@@ -114,7 +114,7 @@ def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> Ga
 
 
 def refuse_conflicts(systems: Collection[int], settings: GatewaySettings, *, force: bool) -> None:
-    """End the command where another gateway sends one of its vehicle ids to the same endpoint."""
+    """End the command if another gateway sends one of its vehicle ids to the same endpoint."""
     for text in conflicts(systems, settings.hub.endpoints):
         if not force:
             refuse(f"{text}; choose another id or endpoint, or --force")
@@ -129,7 +129,7 @@ async def serve(
 ) -> None:
     """Run a daemon until SIGINT or SIGTERM, showing its status.
 
-    SIGHUP reports the end of the terminal, which ends the daemon as well; without a terminal, as
+    SIGHUP means that the terminal was closed, and ends the daemon as well; without a terminal, as
     in a service, it reloads the settings.
     """
     stopped = asyncio.Event()
@@ -154,16 +154,16 @@ async def serve(
 
 @contextmanager
 def loop_comes_first(start: Callable[[], None]) -> Iterator[None]:
-    """Start something on the event loop, and prevent what would stop the loop afterwards."""
-    # The threads of the files may keep the interpreter for so long whenever the loop has let it go,
-    # as it does with every frame that it sends; the default is 5 ms.
+    """Start something on the event loop, and prevent delays of the loop afterwards."""
+    # Whenever the loop releases the interpreter, as for every frame that it sends, file threads
+    # may hold it for this interval; the default is 5 ms.
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
         with detached_output():
             start()
-            # All that exists by now is there to stay, as the library of the metrics that the start
-            # has loaded: a full garbage collection of it would stop telemetry for 0.1 s.
+            # Objects that exist now, such as the metrics library, are permanent: a full garbage
+            # collection of them would stop telemetry for 0.1 s.
             gc.collect()
             gc.freeze()
             yield
@@ -172,7 +172,7 @@ def loop_comes_first(start: Callable[[], None]) -> Iterator[None]:
 
 
 def _open_view() -> "LiveView":
-    # Imported here: a service draws nothing.
+    # Imported here: a service has no live view.
     from gateway.live.console import LiveView
 
     view = LiveView()
@@ -215,7 +215,7 @@ async def _live_view(
             held = not held
 
     keyboard = Keyboard(on_key)
-    # Without rich's own thread: it draws on request, between two samples.
+    # Without rich's own thread: it draws when requested, between two samples.
     with Live(screen=True, auto_refresh=False) as live:
         keyboard.start()
         try:

@@ -1,4 +1,4 @@
-"""`mavgate source test`: what a tracker sends, in words."""
+"""`mavgate source test`: describe the data that a tracker sends."""
 
 import asyncio
 from typing import Annotated
@@ -19,17 +19,17 @@ group = typer.Typer(help="Test a tracker that is to be a vehicle.", no_args_is_h
 app.add_typer(group, name="source")
 
 SHOWN = 5
-"""Records of a kind that are shown; the rest is counted."""
+"""Records of each kind that are shown; further ones are counted."""
 
 
 @group.command("test")
 def try_source(
     url: Annotated[str, typer.Argument(help="Such as lines:/dev/ttyUSB0 or crsf:/dev/ttyACM0.")],
     seconds: Annotated[
-        float, typer.Option("--seconds", min=0.1, max=3600, help="How long it listens, s.")
+        float, typer.Option("--seconds", min=0.1, max=3600, help="Duration of the test, s.")
     ] = 10.0,
 ) -> None:
-    """Show what a tracker sends, its rates, and what is missing for attitude and position.
+    """Show the data of a tracker, its rates, and data missing for attitude and position.
 
     The exit code is 1 if nothing was received.
     """

@@ -1,4 +1,4 @@
-"""`mavgate batch`: one work on many recordings, here or on a cluster."""
+"""`mavgate batch`: one task on many recordings, on this machine or on a cluster."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from gateway.batch.statistics import Versus
 
 FAILED: Final = 1
-"""Exit code of the command if a recording failed."""
+"""Exit code if a recording failed."""
 FLIGHTS_CSV: Final = "flights.csv"
 BEST_TOML: Final = "best.toml"
 SWEEP_CSV: Final = "sweep.csv"
@@ -42,7 +42,7 @@ Metric = Literal["held", "interpolated", "reference", "attitude"]
 
 app = typer.Typer()
 group = typer.Typer(
-    help="Judge every estimator, or try settings, on many recordings at once, here or on a "
+    help="Score every estimator, or try settings, on many recordings at once, here or on a "
     "cluster.",
     no_args_is_help=True,
 )
@@ -51,7 +51,7 @@ app.add_typer(group, name="batch")
 OutputOption = Annotated[
     Path,
     typer.Option(
-        "--output", "-o", help="Folder of the results; what is done there is not done again."
+        "--output", "-o", help="Folder of the results; finished tasks in it are not repeated."
     ),
 ]
 AgainstOption = Annotated[
@@ -75,7 +75,7 @@ def report(
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
 ) -> None:
-    """Judge every estimator on every flight by withheld fixes; make a page of each, and of all."""
+    """Score every estimator on every flight at withheld fixes; make a page of each, and of all."""
     if pages:
         require("a report", "plot")
     work = SeasonWork(files, jobs, scheduler)
@@ -92,7 +92,9 @@ def sweep(
         typer.Option(help="alpha=0.1:0.9:9, gps_latency_s=0:0.4:9, estimator=eskf,paper, …"),
     ],
     output: OutputOption,
-    metric: Annotated[Metric, typer.Option(help="What judges, as for `mavgate sweep`.")] = "held",
+    metric: Annotated[
+        Metric, typer.Option(help="Error to minimise, as in `mavgate sweep`.")
+    ] = "held",
     hold_out: HoldOutOption = 5,
     gps_interval: IntervalOption = 0.0,
     columns: ColumnsOption = None,
@@ -114,7 +116,7 @@ def sweep(
 
 
 def _finish(results: Sequence[FlightResult], output: Path, against: Path | None) -> None:
-    """Show the season as a table, and write its page."""
+    """Show the results of the season as a table, and write its page."""
     from gateway.batch.statistics import errors_by_group, flight_table, why_leads, write_season_page
 
     compared = None if against is None else _compare(results, against)

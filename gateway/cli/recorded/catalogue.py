@@ -1,4 +1,4 @@
-"""`mavgate catalogue`: the catalogue of all recordings under a folder."""
+"""`mavgate catalogue`: catalogue of all recordings under a folder."""
 
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -40,7 +40,7 @@ class _IndexByDefault(TyperGroup):
     """A command group; a first argument that is not one of its commands is a folder to index."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the command in its place."""
+        """Insert the command `index` if the first argument is not a command."""
         if not args or (args[0] not in self.commands and args[0] not in ctx.help_option_names):
             args = [INDEX, *args]
         return super().parse_args(ctx, args)
@@ -48,7 +48,7 @@ class _IndexByDefault(TyperGroup):
 
 group = typer.Typer(
     cls=_IndexByDefault,
-    help="Index all recordings under a folder, and list and search what is in them.",
+    help="Index all recordings under a folder, and list and search their flights.",
 )
 app.add_typer(group, name="catalogue")
 
@@ -63,7 +63,7 @@ def index(
     columns: ColumnsOption = None,
     jobs: JobsOption = None,
 ) -> None:
-    """Bring the catalogue of a folder up to date; the word `index` may be left out."""
+    """Update the catalogue of a folder; the word `index` may be left out."""
     settings = read_settings()
     root = (folder or folder_of(settings)).expanduser()
     if not root.is_dir():
@@ -90,7 +90,7 @@ def list_flights(
     json: JsonOption = False,
     geojson: GeojsonOption = False,
 ) -> None:
-    """List the flights of the catalogue, or those for which a condition holds."""
+    """List the flights of the catalogue, or those that satisfy a condition."""
     root = _folder(folder)
     if geojson or json:
         print_json(geojson_of(root, where) if geojson else find_flights(root, where))

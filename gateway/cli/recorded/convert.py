@@ -1,4 +1,4 @@
-"""`mavgate convert` and `fuse`: files that are made of recordings."""
+"""`mavgate convert` and `fuse`: write files from recordings."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -41,9 +41,9 @@ from gateway.wire.system_ids import LAST_ID
 app = typer.Typer()
 
 OF_ONE_MESSAGE: Final = (".parquet", ".csv")
-"""Formats that can hold all messages of one type in place of the table."""
+"""Formats that can contain all messages of one type instead of the table."""
 FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
-"""Formats made from a recording's tlogs, which hold all its vehicles and messages."""
+"""Formats that are made from a recording's tlogs, which contain all vehicles and messages."""
 
 
 PANEL: Final = "Tlog to tlog"
@@ -51,7 +51,7 @@ PANEL: Final = "Tlog to tlog"
 
 
 def _option(name: str, text: str, **how: Any) -> Any:
-    """Return an option for tlogs that are made of tlogs."""
+    """Return an option for writing tlogs from tlogs."""
     return typer.Option(name, help=text, rich_help_panel=PANEL, **how)
 
 
@@ -97,7 +97,7 @@ def convert(
         float,
         _option(
             "--margin",
-            "Keep so much before and after --while and --from-mode, s.",
+            "Margin before and after --while and --from-mode, s.",
             min=0.0,
             max=MAX_MARGIN_S,
         ),
@@ -106,7 +106,7 @@ def convert(
         bool | None,
         _option(
             "--merge/--join",
-            "Leave out the copies of frames that several files hold, and align their clocks; or "
+            "Leave out copies of frames that are in several files, and align their clocks; or "
             "keep all. By default files are merged if they overlap.",
         ),
     ] = None,
@@ -168,9 +168,9 @@ def _write(
     force: bool,
     **parts: Any,
 ) -> FlightToWrite:
-    """Write a flight in the format of the ending, and print the remarks and the size.
+    """Write a flight in the format of the suffix, and print the remarks and the size.
 
-    `how` are options of reading, `parts` arguments of `FlightToWrite`.
+    `how` are options for reading, `parts` are arguments of `FlightToWrite`.
     """
     with progress_of(files) as advance:
         options = read_options(read_settings(), columns, progress=advance, **how)
@@ -219,7 +219,7 @@ def _read_anonymity(
 
 
 def _print_changes(anonymiser: Anonymiser) -> None:
-    """Print the number of changed fields of each message."""
+    """Print the number of changed fields by message."""
     table = table_of("message", "field", "changed", left=2)
     for (message, field), count in sorted(anonymiser.changed.items()):
         table.add_row(message, field, str(count))
@@ -239,7 +239,7 @@ def _read_renames(texts: Sequence[str]) -> dict[int, int]:
 
 
 def _check_edits(edits: TlogEdits, output: Path, message: list[str], system: list[int]) -> None:
-    """Refuse edits for formats that hold no frames."""
+    """Refuse edits for formats without frames."""
     if output.suffix == ".tlog":
         return
     if message and (

@@ -1,4 +1,4 @@
-"""`mavgate diff`: two recordings, parameter files or running vehicles, compared."""
+"""`mavgate diff`: compare two recordings, parameter files or running vehicles."""
 
 import re
 from base64 import b64decode

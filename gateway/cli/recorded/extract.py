@@ -1,4 +1,4 @@
-"""`mavgate extract`: parameters, plans, texts, subtitles and geotags out of a recording."""
+"""`mavgate extract`: extract parameters, plans, texts, subtitles and geotags from a recording."""
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -41,7 +41,7 @@ app = typer.Typer()
 ITEMS: Final = (".waypoints", ".plan")
 ITEM_NAMES: Final = {**KINDS, RALLY: "rally points"}
 VIDEO_TIME: Final = re.compile(r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)")
-"""A time of begin in the name of a video, as cameras write it."""
+"""Start time in the file name of a video, as cameras write it."""
 
 
 def _out(name: str, text: str, endings: tuple[str, ...]) -> Any:
@@ -69,15 +69,15 @@ def extract(
         Path | None, _out("--subtitles", "Subtitles for a video", (".srt", ".ass"))
     ] = None,
     fields: Annotated[
-        str, typer.Option("--fields", help="Of the subtitles, separated by commas.")
+        str, typer.Option("--fields", help="Fields of the subtitles, separated by commas.")
     ] = ",".join(SUBTITLE_FIELDS),
     rate_hz: Annotated[
-        float, typer.Option("--rate", min=0.1, max=MAX_RATE_HZ, help="Of the subtitles, Hz.")
+        float, typer.Option("--rate", min=0.1, max=MAX_RATE_HZ, help="Rate of the subtitles, Hz.")
     ] = 5.0,
     offset: Annotated[
         str | None,
         typer.Option(
-            "--offset", help="Where in the recording the video begins: 80, 1:20 or a time in UTC."
+            "--offset", help="Start of the video in the recording: 80, 1:20 or a time in UTC."
         ),
     ] = None,
     video: Annotated[
@@ -132,7 +132,7 @@ def _plans(
     *,
     is_read: bool,
 ) -> Iterator[tuple[Path, Iterable[str]]]:
-    """Yield the wanted files of parameters, mission, fence and rally points; note missing ones."""
+    """Yield the wanted files of parameters, mission, fence and rally points; list missing ones."""
     if not any(paths):
         return
     if not is_read:
@@ -149,7 +149,7 @@ def _plans(
 
 
 def _params(path: Path, plan: RecordedPlan) -> Iterable[str]:
-    """Return the content of a file of parameters; empty if there are none."""
+    """Return the content of a parameter file; empty if there are no parameters."""
     parameters = plan.parameters()
     if not parameters:
         return ()
@@ -173,7 +173,7 @@ def _read_fields(text: str) -> list[str]:
 
 
 def _video_begin(offset: str | None, video: Path | None) -> Moment:
-    """Return when the video begins, after the recording or in UTC; the offset is added."""
+    """Return the start of the video, within the recording or in UTC, with the offset added."""
     try:
         begin = Moment(0.0) if offset is None else parse_moment(offset)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""`mavgate info` and `mavgate recover`: summarise recordings, and repair a damaged one."""
+"""`mavgate info` and `mavgate recover`: summarise recordings, and recover damaged ones."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 SHOWN: Final = 8
-"""Gaps and damaged ranges that are listed one by one."""
+"""Gaps and damaged ranges that are listed individually."""
 
 EARLIEST_US: Final = 366 * 86_400 * US_PER_S
-"""Times before, in µs since 1970, are those since a start, as in other programs' logs."""
+"""Earlier times, in µs since 1970, count from a start, as in other programs' logs."""
 
 Report = Callable[[str], None]
 
@@ -66,13 +66,13 @@ def info(
     columns: ColumnsOption = None,
     json: Annotated[bool, typer.Option("--json", help="For programs: one line per file.")] = False,
 ) -> None:
-    """Show what recordings hold: duration, vehicles, rates, gaps, distance, damage; or list all."""
+    """Show duration, vehicles, rates, gaps, distance and damage of recordings; or list all."""
     if not files:
         _list_all(json=json)
         return
     if (folder := next(filter(Path.is_dir, files), None)) is not None:
         refuse(f"{folder}: is a folder; `mavgate catalogue {folder}` indexes it")
-    # A file needs no settings, which would import every stage.
+    # Files need no settings, which would import all stages.
     files = recorded_files(files, "all")
     with progress_of(files) as advance:
 
@@ -89,7 +89,7 @@ def info(
 
 
 def _list_all(*, json: bool) -> None:
-    """List the recordings, the newest last."""
+    """List the recordings, newest last."""
     folder = recordings_folder()
     found = list_recordings(folder)
     figures = _figures(found) if found else {}
@@ -117,7 +117,7 @@ def recover(
     ] = None,
     force: ForceOption = False,
 ) -> None:
-    """Write the intact part of a damaged recording to a new file, and list what was left out.
+    """Write the intact part of a damaged recording to a new file, and list the damage.
 
     The checksum of every frame is checked. The damaged file is never changed.
     """
@@ -178,7 +178,7 @@ def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[byte
 
 
 def _print_some(lines: Sequence[str], more: str) -> None:
-    """Print the first lines of a list, and how many more there are."""
+    """Print the first lines of a list, and the number of further ones."""
     for line in lines[:SHOWN]:
         console_of().print(line)
     if len(lines) > SHOWN:
@@ -255,15 +255,11 @@ def _when(found: FileInfo) -> str:
     if begin_us is None or 0 <= begin_us < EARLIEST_US:
         return ""
     moment = civil_time(begin_us)
-    return (
-        ", from no day of the calendar"
-        if moment is None
-        else f", from {moment:%Y-%m-%d %H:%M:%S} UTC"
-    )
+    return ", without a valid date" if moment is None else f", from {moment:%Y-%m-%d %H:%M:%S} UTC"
 
 
 def _figures(recordings: list[Recording]) -> dict[str, dict[int, FlightFigures]]:
-    """Bring the catalogue of the recordings up to date, and take their figures from it."""
+    """Update the catalogue of the recordings, and return figures from it."""
     from gateway.batch.catalogue import CatalogueError, figures_of, find_flights, index_folder
     from gateway.batch.executors import ThisProcess
 
@@ -310,16 +306,16 @@ def _show_list(recordings: list[Recording], figures: dict[str, dict[int, FlightF
 
 
 def _length_s(flown: dict[int, FlightFigures]) -> float | None:
-    """Return the length of a recording, given the figures of its vehicles; None if unknown."""
+    """Return the length of a recording from the figures of its vehicles; None if unknown."""
     return max((figures.duration for figures in flown.values()), default=None)
 
 
 def _each(figures: list[FlightFigures], text: Callable[[FlightFigures], str]) -> str:
-    """Write one figure for each vehicle."""
+    """Return one figure of each vehicle as text."""
     return " ".join(map(text, figures)) or UNKNOWN
 
 
 def _path(recording: Recording) -> str:
-    """Return a shell pattern of all its files."""
+    """Return a shell pattern that matches all files of a recording."""
     first = str(recording.files[0])
     return first if len(recording.files) == 1 else f"{recording.files[0].parent / recording.name}_*"

@@ -77,7 +77,7 @@ def play(
     ] = None,
     fuse: Annotated[
         bool,
-        typer.Option("--fuse", help="Of an autopilot's log: mavgate's states, not its own."),
+        typer.Option("--fuse", help="For an autopilot's log: mavgate's states, not its own."),
     ] = False,
     both: BesideOption = False,
     fuse_with: FuseWithOption = "recorded",
@@ -91,13 +91,13 @@ def play(
         ),
     ] = False,
     yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask before commands leave this machine.")
+        bool, typer.Option("--yes", "-y", help="Send commands to other machines without asking.")
     ] = False,
     attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
     endpoint: EndpointOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Play recordings to the ground stations, several at once if you like.
+    """Play one or several recordings to the ground stations.
 
     Messages of the vehicles of a tlog are sent byte for byte, and requests are answered from the
     recording. A table is fused again while it plays, so what was recorded and what other settings
@@ -134,16 +134,16 @@ def play(
 def print_plan(
     names: Sequence[str], flights: Sequence[PlayedFlight], endpoints: Sequence[str]
 ) -> None:
-    """Print which vehicles are sent, and to whom."""
+    """Print the vehicles that are sent, and the endpoints."""
     systems = [system_id for flight in flights for system_id in flight.system_ids.values()]
     listed = ", ".join(map(str, systems))
-    whom = ", ".join(endpoints) or "nobody: no endpoint is set"
+    whom = ", ".join(endpoints) or "no client: no endpoint is set"
     vehicles = f"vehicle{'s' * (len(systems) != 1)} {listed}"
     console_of().print(f"playing {', '.join(names)} as {vehicles} to {whom}", markup=False)
 
 
 def _ask_for_commands(settings: GatewaySettings) -> None:
-    """Ask before recorded commands leave this machine; end the command without a yes."""
+    """Ask before recorded commands leave this machine; end the command unless confirmed."""
     if away := endpoints_beyond(settings.hub):
         typer.confirm(
             "Recorded commands (arming, steering, parameters, missions) would go to "
@@ -217,7 +217,7 @@ async def _serve(daemon_of: Callable[[], PlayerDaemon], *, attached: bool) -> No
 
 
 def steer(daemon: PlayerDaemon, key: str) -> None:
-    """Carry out a key of the terminal; other keys do nothing."""
+    """Execute the command of a key; other keys have no effect."""
     edge = daemon.edge
     match key:
         case "q":
@@ -239,7 +239,7 @@ def steer(daemon: PlayerDaemon, key: str) -> None:
 
 
 def _next_speed(speed: float | None, *, faster: bool) -> float:
-    """Return twice or half the speed, within its range; None is as fast as possible."""
+    """Return twice or half the speed, within its range; None means as fast as possible."""
     if speed is None:
         return AS_FAST_AS_POSSIBLE if faster else GREATEST_SPEED
     return min(max(speed * (2.0 if faster else 0.5), LEAST_SPEED), GREATEST_SPEED)

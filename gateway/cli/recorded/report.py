@@ -59,7 +59,7 @@ def report(
     Without a flight the built-in simulated one is used.
     """
     require("a report", "plot")
-    # These need the extra, and take a second to import.
+    # These require the extra, and take a second to import.
     from gateway.analysis.case import make_case
     from gateway.analysis.reporting.compose import make_report
     from gateway.analysis.reporting.page import count_pictures, write_report
@@ -83,7 +83,7 @@ def report(
         progress.update(task, description="drawing", total=count_pictures(made.sections))
 
         def advance() -> None:
-            # The bar has no thread: the processes that draw are forked from this one.
+            # No thread for the progress bar, since drawing processes are forked from this one.
             progress.advance(task)
             progress.refresh()
 
@@ -125,7 +125,7 @@ def page(
     options = read_options(gateway, columns, choice=fuse_with)
     comparison = None
     if compare:
-        # At the same time on another core.
+        # Runs on another core at the same time.
         tables = files_of([flight], folder_of(gateway), "tables")
         comparison = begin_comparison(tables, options)
     with progress_of(files) as advance:

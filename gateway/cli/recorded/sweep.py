@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 SHOWN: Final = 10
 AT_REST_MPS: Final = 1.0
-"""A GPS receiver at rest reports up to 0.3 m/s."""
+"""Greatest GPS speed of a flight at rest; a receiver at rest reports up to 0.3 m/s."""
 HEADINGS: Final = {
     "north_m": "latitude error, m",
     "east_m": "longitude error, m",
@@ -66,7 +66,7 @@ HEADINGS: Final = {
     "reference_m": "error against the reference, m",
     "attitude_deg": "attitude error, deg",
 }
-"""By the columns of a sweep's scores."""
+"""Headings of the columns with a sweep's scores."""
 
 
 @app.command()
@@ -138,14 +138,14 @@ def sweep(
 
 @dataclass(frozen=True, slots=True)
 class SweepOptions:
-    """Options of the command line."""
+    """Options of the command line for a sweep."""
 
     named: Sequence[tuple[str, str]]
-    """The paper's own weights, with their values as texts."""
+    """The paper's own weights, with their values as text."""
     vary: Sequence[str]
     """Further settings as `NAME=VALUES`."""
     generations: int
-    """How long to search; 0 for a grid."""
+    """Number of generations to search; 0 for a grid."""
     metric: Metric
     hold_out: int
     gps_interval_s: float
@@ -174,8 +174,8 @@ def run_sweep(
     )
     if (fastest := max_speed_mps(flight)) < AT_REST_MPS:
         console_of(stderr=True).print(
-            f"{flight.name}: at rest throughout, at most {fastest:.1f} m/s by GPS: nothing can be "
-            "learned from it about settings of a flight",
+            f"{flight.name}: at rest throughout, at most {fastest:.1f} m/s by GPS: it contains no "
+            "information on settings for flights",
             style="yellow",
         )
     _print_idle(contest, axes)
@@ -191,7 +191,7 @@ def run_sweep(
 
 
 def _check_outputs(options: SweepOptions, path: Path | None = None) -> None:
-    """Raise OSError if an output cannot be written, or is the flight itself."""
+    """Raise OSError if an output cannot be written, or is the input itself."""
     for out in (options.output, options.table):
         if out is not None:
             check_output(out, [path], overwrite=options.overwrite)
@@ -205,7 +205,7 @@ def _write(
     table: "pd.DataFrame",
     path: Path | None = None,
 ) -> None:
-    """Write the settings that were varied, with the best values, and the table if it is wanted."""
+    """Write a settings file with the best of the varied values, and the table if requested."""
     if best.estimation.estimator != settings.estimation.estimator:
         keys = [ESTIMATOR_KEY, *keys]
     merged = render(msgspec.structs.replace(settings, estimation=best.estimation), keys)
@@ -221,7 +221,7 @@ def _cell(value: object) -> str:
 
 
 def _parse_axes(options: SweepOptions) -> list[Axis]:
-    """Read the axes to vary; raises SweepError for invalid ones."""
+    """Parse the axes to vary; raises SweepError for invalid ones."""
     wanted = list(options.named)
     for item in options.vary:
         name, equals, text = item.partition("=")
@@ -234,12 +234,12 @@ def _parse_axes(options: SweepOptions) -> list[Axis]:
 
 
 def _print_idle(contest: Contest, axes: Sequence[Axis]) -> None:
-    """Print in advance which settings change nothing."""
+    """Print in advance the settings that have no effect."""
     idle = sweeping.idle_axes(contest, axes)
     if not idle:
         return
     estimator = contest.fusion.estimation.estimator
-    text = f"{', '.join(idle)}: changes nothing on this flight"
+    text = f"{', '.join(idle)}: has no effect on this flight"
     if not any(axis.key == ESTIMATOR_KEY for axis in axes):
         text += f" with the estimator {estimator}"
     if len(idle) == len(axes):
@@ -295,7 +295,7 @@ def run_season_sweep(
     options: SweepOptions,
     kept: Path | None = None,
 ) -> list[FlightResult]:
-    """Score every point on every flight, show the best point for all, and write it."""
+    """Score every point on every flight, show the point that is best overall, and write it."""
     import pandas as pd
 
     if kept is not None:
@@ -312,7 +312,7 @@ def run_season_sweep(
     results = work.run(task, work.items(), kept)
     swept = [result for result in results if result.error is None]
     if not swept:
-        refuse("no flight could be swept")
+        refuse("the sweep failed on all flights")
     base, choice = _chosen(swept)
     _show_choice(axes, points, choice, column, len(swept))
     best = with_values(fusion, keys, points[choice.winner])
@@ -321,8 +321,8 @@ def run_season_sweep(
             "recording": [result.location for result in swept],
             "aircraft": [result.vehicle for result in swept],
             "began": [result.began for result in swept],
-            "as it came": base,
-            "as others chose": choice.judged,
+            "recorded settings": base,
+            "chosen by others": choice.judged,
         }
     )
     _write(options, settings, best, keys, table)
@@ -330,10 +330,10 @@ def run_season_sweep(
 
 
 def _chosen(swept: Sequence[FlightResult]) -> "tuple[FloatArray, Choice]":
-    """Return the errors with the settings of the flights, and with the best ones."""
+    """Return the errors with the recorded settings, and the choice of the best point."""
     from gateway.batch.statistics import choose, group_of
 
-    # An unknown score is null in JSON.
+    # JSON represents an unknown score as null.
     errors = np.array([result.figures["scores"] for result in swept], float)
     base = np.array([result.figures["base"] for result in swept], float)
     groups = [group_of(result) for result in swept]
@@ -360,7 +360,7 @@ def _show_choice(
     )
     if choice.over_base is not None:
         console.print(
-            "against the settings that the flights came with, each flight judging only what the "
+            "against the recorded settings, each flight scored only with settings that the "
             f"others chose: {choice.over_base.text}",
         )
     if choice.over_second is not None:

@@ -1,1 +1,1 @@
-"""Parts shared by the commands."""
+"""Code that several commands share."""

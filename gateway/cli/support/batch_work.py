@@ -1,4 +1,4 @@
-"""The work of a command on many recordings: finding them, running a task, showing progress."""
+"""Run a command's task on many recordings: find them, run the task, show progress."""
 
 import logging
 from collections.abc import Iterator, Sequence
@@ -47,23 +47,23 @@ IntervalOption = Annotated[
 ]
 
 SHOWN_FAILURES: Final = 12
-"""Failures that are listed one by one."""
+"""Failures that are listed individually."""
 
 
 @dataclass(frozen=True, slots=True)
 class SeasonWork:
-    """Recordings, and the processes or the cluster that work on them."""
+    """Recordings, and the processes or cluster for the work on them."""
 
     names: Sequence[str]
     jobs: int | None = None
     scheduler: str | None = None
 
     def items(self) -> list[BatchItem]:
-        """Find the recordings; what is not there ends the command."""
+        """Find the recordings; a missing one ends the command."""
         if any(map(is_url, self.names)):
             require("a URL", "batch")
             log = logging.getLogger()
-            # Storages log each connection.
+            # Storage libraries log each connection.
             if log.level == logging.INFO:
                 log.setLevel(logging.WARNING)
         names: list[str] = []
@@ -82,7 +82,7 @@ class SeasonWork:
 
     @contextmanager
     def executor(self) -> Iterator[Executor]:
-        """Open the executor; a cluster that cannot be used ends the command."""
+        """Open the executor; an unusable cluster ends the command."""
         if self.scheduler is None:
             yield LocalProcesses(self.jobs)
             return
@@ -93,7 +93,7 @@ class SeasonWork:
     def run(
         self, task: FlightTask, items: Sequence[BatchItem], output: Path | None
     ) -> list[FlightResult]:
-        """Run a task on all, with a progress bar, and list what failed."""
+        """Run a task on all recordings, with a progress bar, and list the failures."""
         folder = None if output is None else ResultFolder(output)
         with (
             self.executor() as executor,
@@ -110,7 +110,7 @@ class SeasonWork:
                 results = run_season(task, items, executor, folder, report)
             except KeyboardInterrupt:
                 if folder is not None:
-                    text = "interrupted; what is done is kept: the same command goes on"
+                    text = "interrupted; finished results are kept: repeat the command to continue"
                     console_of(stderr=True).print(text)
                 raise
         _print_failures(results)
@@ -118,12 +118,12 @@ class SeasonWork:
 
 
 def season_options(columns: Path | None, choice: SettingsChoice) -> ReadOptions:
-    """Take what reads a season's flights out of the settings; nothing that must stay secret."""
+    """Return the settings for reading a season's flights, without secrets."""
     return without_secrets(read_options(read_settings(), columns, choice=choice))
 
 
 def failures(results: Sequence[FlightResult]) -> int:
-    """Count the recordings that there are no figures of."""
+    """Return the number of recordings without figures."""
     return sum(result.error is not None for result in results)
 
 

@@ -1,4 +1,4 @@
-"""The running gateway, player or fleet that a command asks."""
+"""Requests to the running gateway, player or fleet."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ def ask(
     of: str = "run",
     wait_s: float | None = None,
 ) -> Any:
-    """Send a request to the running gateway, or player."""
+    """Send a request to the running gateway, player or fleet, and return the answer."""
     return request(socket_of(of), verb, params, timeout_s=wait_s)
 
 
 def socket_of(of: str) -> Path:
-    """Return the selected gateway's socket; raises ControlError if there is none."""
+    """Return the socket of the selected gateway; raises ControlError if there is none."""
     return SOCKET.get() or find_socket(of)
 
 
 def is_running() -> bool:
-    """Return whether a gateway of this user runs."""
+    """Return whether a gateway of this user is running."""
     return SOCKET.get() is not None or bool(live_sockets("run"))
 
 
 def recordings_folder() -> Path:
-    """Return the folder of recordings: the running gateway's, unless settings are given."""
+    """Return the folder of recordings of the running gateway, or of the given settings."""
     if CONFIG.get() is None and is_running():
         return Path(ask("record.status")["folder"])
     return folder_of(read_settings())

@@ -1,7 +1,7 @@
-"""What the user has named: settings file, control socket, and the file to write.
+"""Global options of the user: settings file, control socket; and the file to write.
 
-The settings import every stage, and with them NumPy: a command that never reads them must not wait
-for that, so they are imported where they are read.
+The settings import all stages, and with them NumPy. Commands that do not read settings must not
+wait for that, so they are imported where they are read.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 USER_CONFIG: Final = Path("~/.config/mavgate/gateway.toml")
 
 CONFIG: Final[ContextVar[Path | None]] = ContextVar("config", default=None)
-"""Settings file that the user has named."""
+"""Settings file given by the user."""
 SOCKET: Final[ContextVar[Path | None]] = ContextVar("socket", default=None)
-"""Control socket that the user has named."""
+"""Control socket given by the user."""
 
 
 class RadioName(StrEnum):
-    """The radios of the boards as they are named on the command line."""
+    """The radios of the boards by their names on the command line."""
 
     NRF24 = "nrf24"
     SX1276 = "sx1276"
@@ -38,15 +38,15 @@ class RadioName(StrEnum):
 
 @cache
 def extend() -> None:
-    """Load the extensions, or end the command; they may add kinds of endpoints to the settings."""
-    # Imported late, because the search for installed packages takes 20 ms.
+    """Load the extensions, which can add kinds of endpoints; an error ends the command."""
+    # Imported late, because searching for installed packages takes 20 ms.
     from gateway.extensions import load_extensions
 
     load_extensions()
 
 
 def read_settings(file: Path | None = None) -> GatewaySettings:
-    """Load the given settings, those that the user has named, the user's own, or the defaults."""
+    """Read settings from a given file, the user's choice, the user's default file, or defaults."""
     from gateway.config import GatewaySettings, load
 
     extend()
@@ -57,12 +57,12 @@ def read_settings(file: Path | None = None) -> GatewaySettings:
 
 
 def settings_file() -> Path:
-    """Return the settings file that the user has named, or the user's own, which may not exist."""
+    """Return the settings file that the user gave, or the default one, which may not exist."""
     return CONFIG.get() or USER_CONFIG.expanduser()
 
 
 def output_file(text: str, endings: Collection[str], *names: str) -> Any:
-    """Return the option of a file to write, by default `--output`, that has one of the endings."""
+    """Return an option, by default `--output`, for a file to write with one of these suffixes."""
 
     def check(path: Path | None) -> Path | None:
         if path is not None:
@@ -73,12 +73,12 @@ def output_file(text: str, endings: Collection[str], *names: str) -> Any:
 
 
 def folder_of(settings: GatewaySettings) -> Path:
-    """Return the folder of recordings in these settings."""
+    """Return the folder of recordings according to the settings."""
     return Path(settings.recording.folder).expanduser()
 
 
 def read_options(settings: GatewaySettings, columns: Path | None = None, **how: Any) -> ReadOptions:
-    """Return how flights are read: by a column map, the limits of the settings, and `how`."""
+    """Return options for reading flights: column map, limits of the settings, and `how`."""
     from gateway.config import load_aircraft
     from gateway.pipeline import PipelineSettings
     from gateway.recordings.reading import read_column_map

@@ -1,4 +1,4 @@
-"""Arguments and options about recordings: by path or by name, and how they are read."""
+"""Arguments and options for recordings: given by path or name, and how to read them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SmoothOption = Annotated[
     bool,
     typer.Option(
         "--smooth",
-        help="Smooth from both ends (Kalman filter, Rauch-Tung-Striebel); "
+        help="Smooth forwards and backwards (Rauch-Tung-Striebel); "
         "an hour of flight takes 120 MB of memory.",
     ),
 ]
@@ -37,16 +37,16 @@ BesideOption = Annotated[
     bool,
     typer.Option(
         "--beside",
-        help="Of an autopilot's log: its own estimates and mavgate's, as two vehicles.",
+        help="For an autopilot's log: its own estimates and mavgate's, as two vehicles.",
     ),
 ]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite the output.")]
 FromOption = Annotated[
-    str | None, typer.Option("--from", help="Begin: 80, 1:20 or 2026-06-11T14:25:30Z.")
+    str | None, typer.Option("--from", help="Start: 80, 1:20 or 2026-06-11T14:25:30Z.")
 ]
 ToOption = Annotated[str | None, typer.Option("--to", help="End, written like --from.")]
 JobsOption = Annotated[
-    int | None, typer.Option("--jobs", help="Processes here; one a core by default.", min=1)
+    int | None, typer.Option("--jobs", help="Local processes; by default one per core.", min=1)
 ]
 ColumnsOption = Annotated[
     Path | None, typer.Option("--columns", help="Column map of another program's CSV (TOML).")
@@ -55,7 +55,7 @@ SensorOption = Annotated[
     list[str] | None,
     typer.Option(
         "--sensor",
-        help="Of a ULog or DataFlash log: gps=2 for the second GPS; so with imu, mag and baro. "
+        help="For a ULog or DataFlash log: gps=2 for the second GPS; likewise imu, mag and baro. "
         "By default the first with data.",
     ),
 ]
@@ -68,7 +68,7 @@ PositionOption = Annotated[
     typer.Option("--position", help="Position as live, or on straight lines between fixes."),
 ]
 Wanted = Literal["tlogs", "tables", "all"]
-"""Which files of a recording a command uses; the others if it has none of these."""
+"""Files of a recording to use; if it has none of these, the others are used."""
 FlightArgument = Annotated[
     Path | None,
     typer.Argument(
@@ -81,7 +81,7 @@ ReferenceOption = Annotated[
     Path | None,
     typer.Option(
         "--reference",
-        help="A mavgate CSV on the flight's clock, with whose states the estimates are compared.",
+        help="A mavgate CSV on the flight's clock, with the states to compare with.",
     ),
 ]
 SystemOption = Annotated[
@@ -90,7 +90,7 @@ SystemOption = Annotated[
 OTHER_DESCRIPTION: Final = "Recorded by another program; its samples count as calibrated."
 DESCRIPTIONS: Final = {
     TABLE: "Recorded by mavgate.",
-    TLOG: "Read out of an autopilot's MAVLink log; its samples count as calibrated.",
+    TLOG: "Read from an autopilot's MAVLink log; its samples count as calibrated.",
 }
 
 
@@ -108,7 +108,7 @@ def read_sensors(texts: Sequence[str] | None) -> tuple[tuple[str, int], ...]:
 
 
 def read_range(begin: str | None, end: str | None) -> tuple[Moment | None, Moment | None]:
-    """Read --from and --to; raises FlightError if one is invalid, or nothing lies between them."""
+    """Read --from and --to; raises FlightError if one is invalid, or the range is empty."""
     try:
         first, last = (None if text is None else parse_moment(text) for text in (begin, end))
     except ValueError as error:
@@ -116,13 +116,13 @@ def read_range(begin: str | None, end: str | None) -> tuple[Moment | None, Momen
     for unit in ("offset_s", "time_us"):
         low, high = getattr(first, unit, None), getattr(last, unit, None)
         if low is not None and high is not None and low >= high:
-            raise FlightError(f"nothing lies between --from {begin} and --to {end}")
+            raise FlightError(f"the range from --from {begin} to --to {end} is empty")
     return first, last
 
 
 @contextmanager
 def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
-    """Show the progress of reading, and that the command computes after that, on a terminal."""
+    """Show the progress of reading, and of the computation after it, on a terminal."""
     total = sum(file.stat().st_size for file in files if file.exists())
     columns = (DownloadColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with progress_bar(*columns, auto_refresh=True) as progress:
@@ -137,13 +137,13 @@ def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
 
 
 def print_remarks(remarks: Iterable[str]) -> None:
-    """Print remarks about a file to stderr."""
+    """Print remarks on a file to stderr."""
     for remark in remarks:
         console_of(stderr=True).print(remark)
 
 
 def recorded_files(names: Iterable[Path], wanted: Wanted) -> list[Path]:
-    """Replace names of recordings by their files, for which alone a gateway is asked."""
+    """Replace names of recordings by their files; only for names a gateway is asked."""
     names = list(names)
     if all(map(_is_path, names)):
         return names
@@ -156,7 +156,7 @@ def files_of(names: Iterable[Path], folder: Path, wanted: Wanted) -> list[Path]:
 
 
 def name_of(wanted: Path, files: Sequence[Path]) -> str:
-    """Return the name of what was chosen: of a file, or of a recording that may be `last`."""
+    """Return the name of a file, or of a recording, which may have been given as `last`."""
     return wanted.name if _is_path(wanted) else recording_name(files[0])
 
 
@@ -181,7 +181,7 @@ def _files_of(name: Path, folder: Path, wanted: Wanted) -> list[Path]:
 
 
 def fusion_of(settings: GatewaySettings) -> FusionSettings:
-    """Return the part of the settings that fuses a flight."""
+    """Return the part of the settings that concerns fusion."""
     from gateway.recordings.fuse import FusionSettings
 
     return FusionSettings(estimation=settings.estimation)
@@ -193,8 +193,8 @@ def load_flight(
     options: ReadOptions,
     reference: Path | None = None,
 ) -> Flight:
-    """Read a recording, or the simulated flight; raises FlightError if a file holds none."""
-    # Imported here: they import all stages, for which commands that fuse nothing must not wait.
+    """Read a recording, or the simulated flight; raises FlightError if a file has no flight."""
+    # Imported here: these import all stages, which commands without fusion need not wait for.
     from gateway.analysis.flight import flight_of_files, judged_by
     from gateway.analysis.simulated import simulated_flight
     from gateway.recordings.reading import is_table, open_rows

@@ -1,4 +1,4 @@
-"""Texts of commands on the terminal: tables, warnings and errors."""
+"""Output of commands on the terminal: tables, warnings and errors."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 UNLIMITED_WIDTH: Final = 1000
-"""Width of output that is not a terminal, where paths and tables must not be cut."""
+"""Width of output that is not to a terminal, so that paths and tables are not cut."""
 NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
-"""Context settings of a command whose arguments may begin with a minus."""
+"""Context settings of commands whose arguments may begin with a minus sign."""
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
 KINDS: Final = {"int": "write a whole number", "float": "write a number"}
 BOUNDS: Final = {"less_than_equal": ("le", "at most"), "greater_than_equal": ("ge", "at least")}
-"""Errors of the library that parses options, by their type."""
+"""Words for the errors of the option parser, by error type."""
 
 
 def console_of(*, stderr: bool = False) -> Console:
-    """Open a console that leaves long lines whole, and obeys nothing that texts hold.
+    """Return a console that does not wrap long lines, and does not interpret texts.
 
-    Names of files and texts of recordings are printed as they are: brackets and colons are no
-    markup, and control characters do not reach the terminal.
+    File names and texts of recordings are printed as they are: brackets and colons are not markup,
+    and control characters do not reach the terminal.
     """
-    # Imported late, because a service prints nothing.
+    # Imported late, because a service prints no tables.
     from rich.console import Console
 
     class PrintableConsole(Console):
@@ -56,17 +56,17 @@ def console_of(*, stderr: bool = False) -> Console:
 
 
 def print_json(value: object) -> None:
-    """Print a value as one line of JSON that no terminal obeys."""
-    # Imported late, because a service prints nothing.
+    """Print a value as one line of JSON, without control characters."""
+    # Imported late, because a service prints no JSON.
     import msgspec
 
     print(printable_json(msgspec.json.encode(value).decode()))
 
 
 def table_of(*columns: str, left: int = 1) -> Table:
-    """Create an empty table; the first `left` columns are text, the others figures.
+    """Create an empty table; the first `left` columns are text, the others numbers.
 
-    No frame and narrow padding: the table of clients fits a terminal of 80 columns.
+    No frame and narrow padding, so that the table of clients fits in 80 columns.
     """
     from rich import box
     from rich.table import Table
@@ -84,9 +84,9 @@ def duration_text(seconds: float) -> str:
 
 
 def progress_bar(*columns: ProgressColumn, auto_refresh: bool = False) -> Progress:
-    """Make a progress bar on stderr, which is hidden where that is no terminal.
+    """Create a progress bar on stderr; it is hidden if that is not a terminal.
 
-    `auto_refresh` starts a thread, which must not be where processes are forked meanwhile.
+    `auto_refresh` starts a thread, which is not allowed if processes are forked during the work.
     """
     from rich.progress import (
         BarColumn,
@@ -113,7 +113,7 @@ def refuse(text: str) -> NoReturn:
 
 
 def in_words(error: typer.BadParameter) -> str:
-    """Describe an argument or option that could not be parsed: its value, and what is allowed."""
+    """Describe an option or argument that could not be parsed: its value, and the allowed ones."""
     errors: list[dict[str, Any]] = getattr(error.__cause__ or error.__context__, "errors", list)()
     if not errors:
         return error.message
@@ -128,7 +128,7 @@ def in_words(error: typer.BadParameter) -> str:
 
 @contextmanager
 def refusing() -> Iterator[None]:
-    """End the command with a clear error where the user or a file is at fault."""
+    """End the command with a clear error if the user or a file is at fault."""
     try:
         yield
     except UserError as error:
@@ -136,7 +136,7 @@ def refusing() -> Iterator[None]:
     except FileExistsError as error:
         refuse(f"{error.filename}: already exists; use --force to overwrite")
     except OSError as error:
-        # Without a name it is the output that fails.
+        # An error without a file name is one of the output.
         if error.filename is None:
             raise
         refuse(f"{error.filename}: {error.strerror or reason_of(error)}")

@@ -77,7 +77,7 @@ def saved(config: Path) -> NodeCalibration:
 def test_steps_are_guided_and_saved_with_residuals(config: Path) -> None:
     output = run(config, "gyro", "accel", "mag")
     assert [f"{step}: done" in output for step in ("gyro", "accel", "mag")] == [True] * 3
-    assert "5 of 6 sides are done. Lay the node on one of these and let it go: chips up" in output
+    assert "5 of 6 sides are done. Lay the node on one of these and release it: chips up" in output
     found = saved(config)
     assert found.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
     assert found.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.02)

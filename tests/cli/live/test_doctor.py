@@ -217,6 +217,6 @@ def test_template_is_written_once_into_a_new_folder(
     assert (template, file.stat().st_mode & 0o777) == (invoke("check-config").output, 0o600)
     file.write_text("# mine")
     again = invoke("check-config", "--write")
-    assert (again.exit_code, f"{file}: is there, and is kept" in again.output) == (2, True)
+    assert (again.exit_code, f"{file}: exists, and is not overwritten" in again.output) == (2, True)
     assert file.read_text() == "# mine"
     assert invoke("check-config", "--all").output.count("\n[") > template.count("\n[")

@@ -132,7 +132,7 @@ def test_foreign_csv_is_converted_by_its_column_map(tmp_path: Path) -> None:
     ("words", "text"),
     [
         ("convert -o x.tlog --from soon", "invalid time"),
-        ("convert -o x.tlog --from 4 --to 2", "nothing lies between --from 4 and --to 2"),
+        ("convert -o x.tlog --from 4 --to 2", "from --from 4 to --to 2 is empty"),
         ("convert -o x.kml", "{0}: nothing to draw, since the flight has no position"),
         ("play --from 1:30", "it ends after 10.0 s, before --from"),
         ("play --to 2010-01-01", "nothing between that begin and end"),

@@ -204,7 +204,7 @@ def test_times_beyond_the_calendar_are_written_and_reported(
     path = table(tmp_path / "table.csv", unix_us_at_zero=zero_us)
     run("convert", path, "-o", tmp_path / f"out{end}")
     printed = run("info", path)
-    assert ("no day of the calendar" in printed) == (zero_us != 0)
+    assert ("without a valid date" in printed) == (zero_us != 0)
 
 
 @pytest.mark.parametrize(
@@ -253,8 +253,8 @@ def test_invalid_column_map_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("endpoint", "code", "words"),
     [
-        ("udp-listen:127.0.0.1:0", 2, "takes any free port"),
-        ("udp-listen:127.0.0.1:14550", 0, "all settings are right"),
+        ("udp-listen:127.0.0.1:0", 2, "uses any free port"),
+        ("udp-listen:127.0.0.1:14550", 0, "all settings are valid"),
     ],
 )
 def test_settings_are_checked(tmp_path: Path, endpoint: str, code: int, words: str) -> None:

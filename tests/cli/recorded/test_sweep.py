@@ -47,7 +47,7 @@ def test_flight_at_rest_is_reported(tmp_path: Path) -> None:
     ]
     path = write_table(tmp_path / "rest.csv", TableHeader(), resting)
     result = invoke("sweep", path, "--alpha", "0.1,0.9", "-o", tmp_path / "best.toml", code=0)
-    assert "at rest throughout, at most 0.2 m/s by GPS: nothing can be learned" in result.output
+    assert "at rest throughout, at most 0.2 m/s by GPS: it contains no information" in result.output
 
 
 def test_search_writes_its_best_settings(recording: Path, tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_setting_without_effect_is_reported(recording: Path, tmp_path: Path) -> 
     idle = ["--vary", "dead_reckoning_s=30.0,60.0"]
     base = ["sweep", str(recording), "-o", str(tmp_path / "best.toml"), "--jobs", "1", "--force"]
     result = invoke(*base, "--vary", "baro_noise_m=0.1,5.0", *idle, code=0)
-    assert "estimation.eskf.dead_reckoning_s: changes nothing" in result.output
+    assert "estimation.eskf.dead_reckoning_s: has no effect" in result.output
     assert "baro_noise_m:" not in result.output
     result = invoke(*base, *idle, code=2)
     assert "vary another setting" in result.output
