@@ -13,11 +13,8 @@ from tools.ablate import FILTER, MECHANISMS, Mechanism
 
 def names_used_in(module: ModuleType) -> set[str]:
     """Return the names that the compiled functions of a module use."""
-    functions = [
-        value
-        for value in vars(module).values()
-        if isinstance(value, FunctionType) and value.__module__ == module.__name__
-    ]
+    own = (each for each in vars(module).values() if isinstance(each, FunctionType))
+    functions = [each for each in own if each.__module__ == module.__name__]
     return {name for function in functions for name in function.__code__.co_names}
 
 

@@ -1,6 +1,7 @@
 """Estimators give the same bits live, offline and in pieces, and survive invalid data."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -80,9 +81,8 @@ def feed(estimator: Estimator, items: Items) -> list[NavState]:
 
 
 def as_log(estimator: KernelEstimator, items: Items) -> SampleLog:
-    imus = [i for i in items if isinstance(i, ImuSample)]
-    baros = [i for i in items if isinstance(i, BaroSample)]
-    fixes = [i for i in items if isinstance(i, GpsFix)]
+    kinds = (ImuSample, BaroSample, GpsFix)
+    imus, baros, fixes = ([i for i in items if isinstance(i, kind)] for kind in kinds)
     return SampleLog(
         imu_time_us=np.array([i.time_us for i in imus]),
         imu=np.array([col.imu_row(i) for i in imus]).reshape(-1, col.IMU_COLUMNS),
@@ -237,26 +237,25 @@ class TestInvalidData:
         assert NavFlags.SENSOR_FAULT not in recovered[-1].flags
         assert recovered[-1].q_nb[0] > 0.99
 
-    def test_gps_glitch_of_300_m_is_rejected_and_reported(self, estimator: KernelEstimator) -> None:
-        items: Items = []
-        for sample in still(0, 12.0):
+    def with_fixes(self, seconds: float, off_m: Callable[[float], float]) -> Items:
+        """Rest with fixes after the first second, which are off to the east at a time in s."""
+        found: Items = []
+        for sample in still(0, seconds):
             t = sample.time_us
             if t % 200_000 == 0 and t > 1_000_000:
-                off = 300.0 if 6_000_000 < t < 10_000_000 else 0.0
-                items.append(fix(t, north_m=off))
-            items.append(sample)
+                found.append(fix(t, east_m=off_m(t * 1e-6)))
+            found.append(sample)
+        return found
+
+    def test_gps_glitch_of_300_m_is_rejected_and_reported(self, estimator: KernelEstimator) -> None:
+        items = self.with_fixes(12.0, lambda time_s: 300.0 * (6.0 < time_s < 10.0))
         states = feed(estimator, items)
         assert max(math.hypot(*off_m(state)) for state in states[200:]) < 5.0
         assert NavFlags.GPS_REJECTED in states[900].flags
         assert NavFlags.GPS_REJECTED not in states[-1].flags
 
     def test_lasting_jump_of_fixes_is_finally_accepted(self, estimator: KernelEstimator) -> None:
-        items: Items = []
-        for sample in still(0, 60.0):
-            t = sample.time_us
-            if t % 200_000 == 0 and t > 1_000_000:
-                items.append(fix(t, east_m=400.0 if t > 6_000_000 else 0.0))
-            items.append(sample)
+        items = self.with_fixes(60.0, lambda time_s: 400.0 * (time_s > 6.0))
         state = feed(estimator, items)[-1]
         assert off_m(state)[1] == pytest.approx(400.0, abs=3.0)
         assert NavFlags.GPS_REJECTED not in state.flags

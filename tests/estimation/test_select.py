@@ -39,12 +39,7 @@ def test_former_sections_are_migrated_with_a_remark_each() -> None:
         },
     }
     present, remarks = migrate_sections(old)
-    assert present == {
-        "estimation": {
-            "estimator": "eskf",
-            "paper": {"accel_cutoff_hz": 5.0},
-            "eskf": {"gps_position_m": 3.0},
-        }
-    }
+    found = {"paper": {"accel_cutoff_hz": 5.0}, "eskf": {"gps_position_m": 3.0}}
+    assert present == {"estimation": {"estimator": "eskf", **found}}
     assert len(remarks) == 4
     assert migrate_sections(present) == (present, [])

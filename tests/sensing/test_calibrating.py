@@ -405,9 +405,8 @@ def test_joined_calibrations_equal_one_after_the_other(seed: int) -> None:
 
 
 def test_correction_of_one_sensor_leaves_the_others_to_the_last_bit() -> None:
-    joined = solver.corrected_by(
-        CALIBRATION, msgspec.structs.replace(solver.IN_BODY_AXES, gyro_bias_radps=ERROR)
-    )
+    one = msgspec.structs.replace(solver.IN_BODY_AXES, gyro_bias_radps=ERROR)
+    joined = solver.corrected_by(CALIBRATION, one)
     changed = {n for n in joined.__struct_fields__ if getattr(joined, n) != getattr(CALIBRATION, n)}
     assert changed == {"gyro_bias_radps"}
 

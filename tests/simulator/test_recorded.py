@@ -1,5 +1,7 @@
 """A recording comes out of the wire as it went in, at its own times."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -51,6 +53,10 @@ def fly(flight: RecordedFlight, settings: SimulatorSettings = QUIET) -> list[Raw
     ]
 
 
+def of_kind(records: list[RawRecord], kind: type) -> list[Any]:
+    return [record for record in records if isinstance(record, kind)]
+
+
 @pytest.fixture(scope="module")
 def flight() -> RecordedFlight:
     return RecordedFlight.from_columns(columns())
@@ -65,7 +71,7 @@ class TestThroughTheWire:
     def test_inertial_samples_agree_within_half_a_count(
         self, flight: RecordedFlight, records: list[RawRecord]
     ) -> None:
-        imu = [r for r in records if isinstance(r, ImuRaw)]
+        imu = of_kind(records, ImuRaw)
         assert len(imu) == ROWS
         accel_scale = imu[0].accel_range_g * 9.80665 / 32768
         lsb_per_dps = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}[imu[0].gyro_range_dps]
@@ -76,7 +82,7 @@ class TestThroughTheWire:
         np.testing.assert_allclose(gyro, flight.gyro_b_radps, atol=half_count)
 
     def test_magnetometer_is_held(self, flight: RecordedFlight, records: list[RawRecord]) -> None:
-        imu = [r for r in records if isinstance(r, ImuRaw)]
+        imu = of_kind(records, ImuRaw)
         new = np.array([bool(r.flags & ImuFlags.MAG_NEW) for r in imu])
         np.testing.assert_array_equal(new, np.isfinite(flight.mag_b_ut[:, 0]))
         scale = 100.0 / imu[0].mag_lsb_per_gauss
@@ -87,13 +93,13 @@ class TestThroughTheWire:
     def test_barometer_gives_its_height_back(
         self, flight: RecordedFlight, records: list[RawRecord]
     ) -> None:
-        pressures = np.array([r.pressure_pa for r in records if isinstance(r, BaroRaw)])
+        pressures = np.array([r.pressure_pa for r in of_kind(records, BaroRaw)])
         heights = (1.0 - (pressures / 101_325.0) ** (1.0 / 5.255876)) * 288.15 / 0.0065
         recorded = flight.baro_alt_m[np.isfinite(flight.baro_alt_m)]
         np.testing.assert_allclose(heights, recorded, atol=0.002)
 
     def test_fixes_equal_recording(self, flight: RecordedFlight, records: list[RawRecord]) -> None:
-        fixes = [r for r in records if isinstance(r, GpsFix)]
+        fixes = of_kind(records, GpsFix)
         lat = [r.lat_dege7 * 1e-7 for r in fixes]
         np.testing.assert_allclose(lat, flight.gps_lat_deg, atol=1e-7)
         np.testing.assert_allclose([r.alt_amsl_m for r in fixes], flight.gps_alt_m, atol=1e-3)
@@ -106,29 +112,27 @@ class TestThroughTheWire:
         self, flight: RecordedFlight, records: list[RawRecord]
     ) -> None:
         for kind, recorded_s in ((ImuRaw, flight.time_s), (GpsFix, flight.gps_time_s)):
-            heard_s = np.array([r.time_us for r in records if isinstance(r, kind)]) * 1e-6
-            late_s = heard_s - recorded_s
+            late_s = np.array([r.time_us for r in of_kind(records, kind)]) * 1e-6 - recorded_s
             assert late_s.min() >= 0.0
             assert late_s.max() < 0.02
             # Once the clocks are learned: one and the same delay of reading, radio and line.
             assert np.ptp(late_s[recorded_s > 5.0]) < 0.0001
 
     def test_status_contains_the_rate(self, records: list[RawRecord]) -> None:
-        status = [r for r in records if isinstance(r, NodeStatus)]
+        status = of_kind(records, NodeStatus)
         rates = {r.node.node_id: (r.sample_rate_hz, r.sensors_present) for r in status}
         assert rates == {0: (50, 0b0111), 1: (5, 0b1000)}
 
 
 class TestRanges:
     @pytest.mark.parametrize(
-        ("peak_mps2", "range_g"), [(15.0, 2), (25.0, 4), (60.0, 8), (150.0, 16), (900.0, 16)]
+        ("peak_mps2", "range_g"), [(15, 2), (25, 4), (60, 8), (150, 16), (900, 16)]
     )
     def test_finest_range_that_holds_a_peak_is_chosen(self, peak_mps2: float, range_g: int) -> None:
-        calm = np.zeros(ROWS)
-        ax = calm.copy()
+        calm, ax = np.zeros((2, ROWS))
         ax[10] = -peak_mps2
         found = fly(RecordedFlight.from_columns(columns(ax=ax, ay=calm, az=calm - 9.8)))
-        imu = [r for r in found if isinstance(r, ImuRaw)]
+        imu = of_kind(found, ImuRaw)
         assert imu[0].accel_range_g == range_g
         clipped = [bool(r.flags & ImuFlags.ACCEL_CLIPPED) for r in imu]
         assert clipped == [k == 10 and peak_mps2 == 900.0 for k in range(ROWS)]
@@ -138,18 +142,17 @@ class TestRanges:
                 not name.startswith("gps")}  # fmt: skip
         found = fly(RecordedFlight.from_columns(bare))
         assert not any(isinstance(r, GpsFix | BaroRaw) for r in found)
-        imu = [r for r in found if isinstance(r, ImuRaw)]
+        imu = of_kind(found, ImuRaw)
         assert imu[0].flags == ImuFlags.MAG_ABSENT | ImuFlags.BARO_ABSENT
-        assert next(r for r in found if isinstance(r, NodeStatus)).sensors_present == 1
+        assert of_kind(found, NodeStatus)[0].sensors_present == 1
 
 
 class TestGpsGaps:
     def test_missing_values_are_reported_as_unknown(self) -> None:
         table = columns(gps_vn=None, gps_alt_m=None)
-        fixes = [r for r in fly(RecordedFlight.from_columns(table)) if isinstance(r, GpsFix)]
-        assert np.isnan(fixes[0].speed_acc_mps)
-        assert np.isnan(fixes[0].v_acc_m)
-        assert fixes[0].h_acc_m == 2.0
+        fix, *_ = of_kind(fly(RecordedFlight.from_columns(table)), GpsFix)
+        assert np.isnan([fix.speed_acc_mps, fix.v_acc_m]).all()
+        assert fix.h_acc_m == 2.0
 
     def test_fixes_from_before_the_start_are_left_out(self) -> None:
         early = columns()["gps_time_s"] - 5.0
@@ -199,26 +202,21 @@ def test_recording_repeats_without_landing(flight: RecordedFlight) -> None:
     link = Link()
     found: list[RawRecord] = []
     rounds: list[tuple[int, int]] = []
-
-    def note(number: int) -> None:
-        rounds.append((number, len(found)))
-
     until_s = 2.5 * flight.duration_s
     frames = replay(QUIET, flight, endless=True).frames()
-    for frame in in_rounds(frames, flight.duration_s, note):
+    for frame in in_rounds(frames, flight.duration_s, lambda n: rounds.append((n, len(found)))):
         if frame.time_s > until_s:
             break
         found.extend(link.feed(frame.data, round(frame.time_s * 1e6)))
     assert [number for number, _ in rounds] == [2, 3]
+    (_, one), (_, two) = rounds
     first, second = (
-        [r.accel_raw for r in some if isinstance(r, ImuRaw)]
-        for some in (found[: rounds[0][1]], found[rounds[0][1] : rounds[1][1]])
+        [r.accel_raw for r in of_kind(some, ImuRaw)] for some in (found[:one], found[one:two])
     )
     assert len(first) == pytest.approx(ROWS, abs=2)
     assert second[5:-5] == first[5:-5] or second[6:-5] == first[5:-6]
-    report = link.report(round(until_s * 1e6), connected=True, port="")
-    assert [node.restarts for node in report.nodes] == [0, 0]
-    assert [node.lost for node in report.nodes] == [0, 0]
+    nodes = link.report(round(until_s * 1e6), connected=True, port="").nodes
+    assert [(node.restarts, node.lost) for node in nodes] == [(0, 0)] * 2
 
 
 def test_recording_without_barometer_and_gps_repeats() -> None:

@@ -64,9 +64,8 @@ class TestConsistency:
 
     def test_degrees_agree_with_metres(self, truth: Truth) -> None:
         for k in range(0, len(truth.time_s), 5000):
-            north_m, east_m = geodesy.displacement_m(
-                -7.7656, 110.3728, float(truth.lat_deg[k]), float(truth.lon_deg[k]), 133.0
-            )
+            here_deg = float(truth.lat_deg[k]), float(truth.lon_deg[k])
+            north_m, east_m = geodesy.displacement_m(-7.7656, 110.3728, *here_deg, 133.0)
             assert north_m == pytest.approx(truth.pos_n_m[k, 0], abs=1e-3)
             assert east_m == pytest.approx(truth.pos_n_m[k, 1], abs=1e-3)
             assert truth.alt_amsl_m[k] == pytest.approx(110.0 - truth.pos_n_m[k, 2])

@@ -118,9 +118,8 @@ def test_imu_in_si_keeps_its_values_through_counts_and_mounting() -> None:
     assert isinstance(raw, ImuRaw)
     sample = SensorChain(NodeCalibration()).imu(raw)
     assert sample.accel_b_mps2 == pytest.approx((0.5, 1.25, -9.8), abs=0.0004)
-    assert sample.gyro_b_radps == pytest.approx(
-        [math.radians(rate) for rate in (10, 20, -300)], abs=math.radians(0.005)
-    )
+    rates = [math.radians(rate) for rate in (10, 20, -300)]
+    assert sample.gyro_b_radps == pytest.approx(rates, abs=math.radians(0.005))
     assert sample.mag_b_ut == pytest.approx((21, 3.5, 44), abs=0.006)
 
 

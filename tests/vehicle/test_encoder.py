@@ -53,11 +53,8 @@ def test_every_message_of_the_dialect_is_framed_as_pymavlink_does(kind: Any) -> 
         assert ours.encode(message).frame == expected
 
 
-NUMERIC = [
-    kind
-    for kind in mavlink.mavlink_map.values()
-    if "char" not in kind.fieldtypes and len(kind.ordered_fieldnames) > 1
-]
+KINDS = mavlink.mavlink_map.values()
+NUMERIC = [k for k in KINDS if "char" not in k.fieldtypes and len(k.ordered_fieldnames) > 1]
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -73,11 +73,8 @@ def invalid_marks(message: str) -> dict[str, str]:
     for file in ("common.xml", "standard.xml", "minimal.xml"):
         for element in ET.parse(folder / file).getroot().iter("message"):
             if element.get("name") == message:
-                return {
-                    str(field.get("name")): str(field.get("invalid"))
-                    for field in element.iter("field")
-                    if field.get("invalid")
-                }
+                fields = [field for field in element.iter("field") if field.get("invalid")]
+                return {str(f.get("name")): str(f.get("invalid")) for f in fields}
     raise AssertionError(f"no {message} in the definitions")
 
 

@@ -99,11 +99,10 @@ def test_fix_replaces_an_incomplete_home(nowhere: GroundStation) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("HOME_LAT", 90.1), ("HOME_LON", -180.1), ("HOME_ALT", 1e6), ("HOME_SOURCE", 3.0)],
+    ("axis", "value"), [("LAT", 90.1), ("LON", -180.1), ("ALT", 1e6), ("SOURCE", 3.0)]
 )
-def test_invalid_coordinates_are_refused(station: GroundStation, name: str, value: float) -> None:
-    before = home(station)
+def test_invalid_coordinates_are_refused(station: GroundStation, axis: str, value: float) -> None:
+    name, before = f"HOME_{axis}", home(station)
     error, echo = station.set_parameter(name, value)
     assert (error.get_type(), echo.param_value) == ("PARAM_ERROR", before[NAMES.index(name)])
     assert home(station) == before

@@ -149,10 +149,8 @@ def test_changed_passphrase_takes_effect_at_once(station: GroundStation) -> None
 
 def test_number_of_streams_is_bounded() -> None:
     verifier = signing.Verifier(KEY, signing.SigningClock(NOW_UNIX_US))
-    accepted = sum(
-        verifier.accepts(ping(sender=(number % 256, 1 + number // 256)), 0)
-        for number in range(2 * signing.MAX_STREAMS)
-    )
+    senders = [(number % 256, 1 + number // 256) for number in range(2 * signing.MAX_STREAMS)]
+    accepted = sum(verifier.accepts(ping(sender=sender), 0) for sender in senders)
     assert accepted == signing.MAX_STREAMS
 
 

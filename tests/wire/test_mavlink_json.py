@@ -60,9 +60,8 @@ def test_every_template_can_be_sent() -> None:
 
 
 def test_heartbeat_has_the_json_of_mavlink2rest() -> None:
-    heartbeat = mavlink.MAVLink_heartbeat_message(
-        mavlink.MAV_TYPE_FIXED_WING, mavlink.MAV_AUTOPILOT_GENERIC, 81, 7, 4, 3
-    )
+    kind, autopilot = mavlink.MAV_TYPE_FIXED_WING, mavlink.MAV_AUTOPILOT_GENERIC
+    heartbeat = mavlink.MAVLink_heartbeat_message(kind, autopilot, 81, 7, 4, 3)
     assert to_json(heartbeat) == {
         "type": "HEARTBEAT",
         "mavtype": {"type": "MAV_TYPE_FIXED_WING"},

@@ -35,9 +35,8 @@ def observe(tracker: ClockTracker, stamps: np.ndarray, arrivals: np.ndarray) -> 
 @pytest.mark.parametrize("seed", range(2))
 def test_offset_and_drift_are_estimated(skew_ppm: float, start_us: int, seed: int) -> None:
     """Once the window is filled, a sample is placed within 0.2 ms: a tenth of a mean queue."""
-    stamps, true_us, arrivals = packets(
-        np.random.default_rng(seed), seconds=60, skew_ppm=skew_ppm, start_us=start_us
-    )
+    rng = np.random.default_rng(seed)
+    stamps, true_us, arrivals = packets(rng, seconds=60, skew_ppm=skew_ppm, start_us=start_us)
     tracker = ClockTracker()
     error_us = observe(tracker, stamps, arrivals) - true_us
     settled = error_us[true_us - true_us[0] > 15e6]

@@ -100,8 +100,7 @@ def test_command_with_extreme_parameters_is_acknowledged_once(
 
 
 @pytest.mark.parametrize(
-    "location",
-    [(90.1, 0.0, 0.0), (0.0, 180.1, 0.0), (math.nan, 8.0, 0.0), (47.0, 8.0, 1e30), (47, 8, -1001)],
+    "location", [(90.1, 0, 0), (0, 180.1, 0), (math.nan, 8, 0), (47, 8, 1e30), (47, 8, -1001)]
 )
 def test_mark_with_invalid_coordinates_or_height_raises_value_error(
     vehicle: Vehicle, location: tuple[float, float, float]
