@@ -123,17 +123,16 @@ def test_implausible_accelerometer_error_is_refused(poses: np.ndarray, reason: s
         solver.solve_accelerometer(poses)
 
 
+EARTH = sphere(np.random.default_rng(1), 300, 45.0)
+
+
 @pytest.mark.parametrize(
     ("field", "reason"),
     [
-        (sphere(np.random.default_rng(1), 300, 45.0) + np.array([0, 0, 201]), "hard iron 201"),
-        (sphere(np.random.default_rng(1), 300, 45.0) * [1.0, 2.1, 1.0], "soft iron"),
-        (sphere(np.random.default_rng(1), 300, 120.0), "the fit gave 120 uT"),
-        (
-            sphere(np.random.default_rng(1), 300, 45.0)
-            * (1.0 + 0.2 * np.random.default_rng(2).normal(size=(300, 1))),
-            "residual",
-        ),
+        (EARTH + np.array([0, 0, 201]), "hard iron 201"),
+        (EARTH * [1.0, 2.1, 1.0], "soft iron"),
+        (EARTH * (120.0 / 45.0), "the fit gave 120 uT"),
+        (EARTH * (1.0 + 0.2 * np.random.default_rng(2).normal(size=(300, 1))), "residual"),
     ],
 )
 def test_field_outside_the_range_of_the_earth_is_refused(field: np.ndarray, reason: str) -> None:

@@ -15,13 +15,12 @@ from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.link import Link
 
 ROWS = 500
-RATE_HZ = 50.0
+TIME_S = 100.0 + np.arange(ROWS) / 50.0
 QUIET = SimulatorSettings(radio_loss=0.0, radio_duplicates=0.0, vehicle_id=4)
 
 
 def columns(**changes: np.ndarray | None) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(7)
-    time_s = 100.0 + np.arange(ROWS) / RATE_HZ
     new_mag = np.arange(ROWS) % 5 == 2
     new_gps = np.arange(ROWS) % 10 == 9
 
@@ -29,12 +28,12 @@ def columns(**changes: np.ndarray | None) -> dict[str, np.ndarray]:
         return np.where(rows, values, np.nan)
 
     table = {
-        "time_s": time_s,
+        "time_s": TIME_S,
         **{name: rng.normal(0.0, 3.0, ROWS) for name in ("ax", "ay", "gx", "gy", "gz")},
         "az": rng.normal(-9.8, 3.0, ROWS),
         **{name: only(new_mag, rng.normal(0.0, 30.0, ROWS)) for name in ("mx", "my", "mz")},
         "baro_alt_m": only(new_mag, rng.normal(200.0, 5.0, ROWS)),
-        "gps_time_s": only(new_gps, time_s - 0.004),
+        "gps_time_s": only(new_gps, TIME_S - 0.004),
         "gps_lat": only(new_gps, rng.normal(47.0, 0.001, ROWS)),
         "gps_lon": only(new_gps, rng.normal(8.0, 0.001, ROWS)),
         "gps_alt_m": only(new_gps, rng.normal(500.0, 3.0, ROWS)),
@@ -160,19 +159,18 @@ class TestGpsGaps:
 
 
 class TestRefusals:
-    def test_missing_columns_are_named_in_the_error(self) -> None:
-        with pytest.raises(ValueError, match="columns missing: ay, gz"):
-            RecordedFlight.from_columns(columns(ay=None, gz=None))
-
-    def test_time_that_goes_back_is_refused(self) -> None:
-        time_s = columns()["time_s"]
-        time_s[20] = time_s[18]
-        with pytest.raises(ValueError, match=r"decreases at 100\.36 s"):
-            RecordedFlight.from_columns(columns(time_s=time_s))
-
-    def test_flight_without_samples_is_refused(self) -> None:
-        with pytest.raises(ValueError, match="0 rows"):
-            RecordedFlight.from_columns(columns(ax=np.full(ROWS, NAN)))
+    @pytest.mark.parametrize(
+        ("changes", "why"),
+        [
+            ({"ay": None, "gz": None}, "columns missing: ay, gz"),
+            ({"time_s": np.where(TIME_S == 100.4, 100.36, TIME_S)}, r"decreases at 100\.36 s"),
+            ({"ax": np.full(ROWS, NAN)}, "0 rows"),
+        ],
+        ids=["columns", "time", "samples"],
+    )
+    def test_unusable_recording_is_refused(self, changes: dict[str, Any], why: str) -> None:
+        with pytest.raises(ValueError, match=why):
+            RecordedFlight.from_columns(columns(**changes))
 
     def test_rows_without_samples_are_skipped(self) -> None:
         ax = columns()["ax"]

@@ -194,9 +194,7 @@ def test_aeroplane_remains_one_in_modes_that_copters_have_too() -> None:
 
 def passthrough(*packets: tuple[int, int]) -> bytes:
     packed = b"".join(struct.pack("<HI", *packet) for packet in packets)
-    if len(packets) == 1:
-        return frame(0x80, b"\xf0" + packed)
-    return frame(0x80, bytes([0xF2, len(packets)]) + packed)
+    return frame(0x80, (b"\xf0" if len(packets) == 1 else bytes([0xF2, len(packets)])) + packed)
 
 
 def test_ardupilot_frames_have_mode_type_arming_batteries_and_text() -> None:

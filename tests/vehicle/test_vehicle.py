@@ -29,6 +29,8 @@ from tests.kit.records import (
 )
 
 ONE_S = 1_000_000
+BYTEWISE = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+C_CAST = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
 
 
 def make(**changes: Any) -> Vehicle:
@@ -111,26 +113,18 @@ def test_position_goes_on_while_dead_reckoned() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "autopilot", "custom_mode", "capability"),
-    [
-        ("generic", 0, 0, mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE),
-        ("ardupilotmega", 3, 0, mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST),
-        ("px4", 12, 1 << 16, mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE),
-    ],
+    ("name", "autopilot", "custom_mode", "encoding"),
+    [("generic", 0, 0, BYTEWISE), ("ardupilotmega", 3, 0, C_CAST), ("px4", 12, 1 << 16, BYTEWISE)],
 )
 def test_autopilot_of_the_settings_is_reported(
-    clock: ManualClock, name: str, autopilot: int, custom_mode: int, capability: int
+    clock: ManualClock, name: str, autopilot: int, custom_mode: int, encoding: int
 ) -> None:
     station = GroundStation(make(autopilot=name), clock)
     beat = of_kind(station.wait(1.0), "HEARTBEAT")[0]
     assert (beat.autopilot, beat.custom_mode) == (autopilot, custom_mode)
     assert bool(beat.base_mode & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED) == (autopilot != 0)
     [_, version] = station.request(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-    encodings = (
-        mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
-        | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
-    )
-    assert version.capabilities & encodings == capability
+    assert version.capabilities & (BYTEWISE | C_CAST) == encoding
     [_, summary] = station.request(mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2)
     assert (summary.autopilot, summary.custom_mode) == (autopilot, custom_mode >> 16)
 

@@ -132,6 +132,19 @@ VALUES = {
         ),
         named("h_acc v_acc vel_acc hdg_acc alt_ellipsoid vel cog", (*(0,) * 5, 65535, 65535)),
     ),
+    # The type of an invalid fix is not reported.
+    **{
+        f"fix-type-{kind.name}-{fix_ok}": (
+            messages.gps_raw_int(replace(FIX, fix_type=kind, fix_ok=fix_ok)),
+            {"fix_type": getattr(mavlink, f"GPS_FIX_TYPE_{reported}")},
+        )
+        for kind, fix_ok, reported in (
+            (GpsFixType.NONE, False, "NO_FIX"), (GpsFixType.DEAD_RECKONING, True, "NO_FIX"),
+            (GpsFixType.FIX_2D, True, "2D_FIX"), (GpsFixType.FIX_3D, True, "3D_FIX"),
+            (GpsFixType.FIX_3D, False, "NO_FIX"), (GpsFixType.TIME_ONLY, True, "NO_FIX"),
+            (GpsFixType.GNSS_AND_DEAD_RECKONING, True, "3D_FIX"),
+        )
+    },
     # The last position is repeated without a fix.
     "gps-raw-without-fix": (
         messages.gps_raw_int(replace(NO_FIX, lat_dege7=0, lon_dege7=0), FIX),
@@ -250,25 +263,6 @@ def test_heading_of_vfr_hud_is_in_whole_degrees() -> None:
 def test_dilutions_are_unknown_without_a_fix_or_its_accuracy(change: dict[str, Any]) -> None:
     found = through_the_wire(messages.gps_raw_int(replace(FIX, **change)))
     assert (found.eph, found.epv) == (65535, 65535)
-
-
-@pytest.mark.parametrize(
-    ("fix_type", "fix_ok", "expected"),
-    [
-        (GpsFixType.NONE, False, mavlink.GPS_FIX_TYPE_NO_FIX),
-        (GpsFixType.DEAD_RECKONING, True, mavlink.GPS_FIX_TYPE_NO_FIX),
-        (GpsFixType.FIX_2D, True, mavlink.GPS_FIX_TYPE_2D_FIX),
-        (GpsFixType.FIX_3D, True, mavlink.GPS_FIX_TYPE_3D_FIX),
-        (GpsFixType.FIX_3D, False, mavlink.GPS_FIX_TYPE_NO_FIX),
-        (GpsFixType.GNSS_AND_DEAD_RECKONING, True, mavlink.GPS_FIX_TYPE_3D_FIX),
-        (GpsFixType.TIME_ONLY, True, mavlink.GPS_FIX_TYPE_NO_FIX),
-    ],
-)
-def test_fix_type_is_reported_for_a_valid_fix_only(
-    fix_type: GpsFixType, fix_ok: bool, expected: int
-) -> None:
-    fix = replace(FIX, fix_type=fix_type, fix_ok=fix_ok)
-    assert through_the_wire(messages.gps_raw_int(fix)).fix_type == expected
 
 
 def test_local_position_is_north_east_down_of_the_origin() -> None:
