@@ -128,7 +128,7 @@ def test_map_changes_style_and_zoom_and_accepts_an_upload(page: Page, tmp_path: 
     (tmp_path / "hostile.pmtiles").write_bytes(b"no tiles at all")
     upload.set_input_files(tmp_path / "hostile.pmtiles")
     expect(page.get_by_text("it is no PMTiles file")).to_be_visible()
-    write_pmtiles(tmp_path / "home field.pmtiles", tile=(4, 12, 8))
+    write_pmtiles(tmp_path / "home field.pmtiles", tiles=[(4, 12, 8)])
     upload.set_input_files(tmp_path / "home field.pmtiles")
     expect(style.locator("option")).to_have_text(["Field", "Other", "home field", "Grid"])
     style.select_option(label="home field")

@@ -1,13 +1,21 @@
-"""HTTP clients of an application, without a socket."""
+"""HTTP clients of an application, without a socket, and hashes of passwords."""
 
 from collections.abc import Callable
 
 import httpx
+import pytest
 from fastapi import FastAPI
 from starlette.types import Receive, Scope, Send
 
+from gateway.panel import logins
 from gateway.panel.access import ROLE
 from gateway.panel.admission import Role
+from gateway.panel.panel_settings import LEAST_COST
+
+with pytest.MonkeyPatch.context() as patch:
+    # A hash contains its cost: checking these takes half of the time.
+    patch.setattr(logins, "COST", LEAST_COST)
+    OPERATOR, VIEWER = logins.hash_password("tower"), logins.hash_password("guest")
 
 
 def client_of(serve: Callable[[FastAPI], object], role: Role = Role.OPERATOR) -> httpx.AsyncClient:
