@@ -23,6 +23,7 @@ from gateway.panel.connections import (
     LimitedServer,
 )
 
+pytestmark = pytest.mark.io
 REQUEST = b"GET /%s HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n"
 
 
@@ -40,6 +41,18 @@ def make() -> Iterator[Callable[[], socket.socket]]:
         sock.close()
 
 
+def log_in(
+    limits: ConnectionLimits,
+    sock: socket.socket,
+    role: Role,
+    address: str = "10.0.0.1",
+    port: int = 1,
+) -> None:
+    """Open a connection, and log in on it; each role has a session of its own."""
+    limits.admit((address, port), sock)
+    limits.authenticate((address, port), Holder(role, str(role), address))
+
+
 def is_shut(sock: socket.socket) -> bool:
     sock.setblocking(False)
     try:
@@ -53,8 +66,7 @@ def test_connection_for_which_there_is_no_place_is_closed(
 ) -> None:
     limits = ConnectionLimits()
     known, first = make(), make()
-    limits.admit(("10.0.0.1", 1), known)
-    limits.authenticate(("10.0.0.1", 1), Holder(Role.VIEWER, "s", "10.0.0.1"))
+    log_in(limits, known, Role.VIEWER)
     limits.admit(("10.0.0.1", 2), first)
     for port in range(CONNECTIONS_OF_ADDRESS):
         limits.admit(("10.0.0.1", 100 + port), make())
@@ -67,13 +79,10 @@ def test_connections_of_one_viewer_leave_places_for_everybody(
     make: Callable[[], socket.socket],
 ) -> None:
     limits = ConnectionLimits()
-    operator = make()
-    limits.admit(("10.0.0.2", 1), operator)
-    limits.authenticate(("10.0.0.2", 1), Holder(Role.OPERATOR, "o", "10.0.0.2"))
-    viewers = [make() for _ in range(300)]
+    operator, viewers = make(), [make() for _ in range(300)]
+    log_in(limits, operator, Role.OPERATOR, "10.0.0.2")
     for port, sock in enumerate(viewers):
-        limits.admit(("10.0.0.1", port), sock)
-        limits.authenticate(("10.0.0.1", port), Holder(Role.VIEWER, "v", "10.0.0.1"))
+        log_in(limits, sock, Role.VIEWER, port=port)
     assert sum(not is_shut(sock) for sock in viewers) == CONNECTIONS_OF_SESSION
     newcomer = make()
     limits.admit(("10.0.0.1", 1000), newcomer)
@@ -85,8 +94,7 @@ def test_closed_connections_are_not_counted(make: Callable[[], socket.socket]) -
     limits = ConnectionLimits()
     for port in range(2 * CONNECTIONS_OF_ROLE):
         sock = make()
-        limits.admit(("10.0.0.1", port), sock)
-        limits.authenticate(("10.0.0.1", port), Holder(Role.VIEWER, "s", "10.0.0.1"))
+        log_in(limits, sock, Role.VIEWER, port=port)
         sock.close()
     assert limits.refused == 0
 
@@ -126,7 +134,14 @@ async def served() -> AsyncIterator[int]:
     await serving
 
 
-@pytest.mark.io
+@asynccontextmanager
+async def connected() -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    async with served() as port:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        yield reader, writer
+        writer.close()
+
+
 async def test_idle_connections_do_not_block_a_user() -> None:
     async with served() as port:
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(300)]
@@ -138,7 +153,6 @@ async def test_idle_connections_do_not_block_a_user() -> None:
             stream.close()
 
 
-@pytest.mark.io
 @pytest.mark.parametrize(
     "sent", [b"", b"GET / HT", REQUEST[:-2] % b"", (REQUEST % b"") + b"GET /sec"]
 )
@@ -146,33 +160,26 @@ async def test_connection_with_an_incomplete_header_is_closed(
     sent: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connections, "HEADER_S", 0.2)
-    async with served() as port:
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    async with connected() as (reader, writer):
         writer.write(sent)
         try:
             data = await reader.read()
         except ConnectionResetError:
             data = b""
         assert data.count(b"HTTP/1.1 200") == sent.count(b"\r\n\r\n")
-        writer.close()
 
 
-@pytest.mark.io
 async def test_connection_with_an_endless_header_is_closed() -> None:
-    async with served() as port:
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    async with connected() as (reader, writer):
         writer.write(b"GET / HTTP/1.1\r\n")
         writer.write((b"x: " + b"y" * 1000 + b"\r\n") * (MAX_HEADER // 500))
         with pytest.raises((ConnectionError, asyncio.IncompleteReadError)):
             await reader.readexactly(1)
-        writer.close()
 
 
-@pytest.mark.io
 @pytest.mark.parametrize("size", [1000, MAX_HEADER, 300_000, 1_000_000])
 async def test_body_that_arrives_with_its_header_is_no_part_of_it(size: int) -> None:
-    async with served() as port:
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    async with connected() as (reader, writer):
         head = f"POST / HTTP/1.1\r\nhost: x\r\ncontent-length: {size}\r\n\r\n".encode()
         # Another request follows in the same piece as the end of the body.
         for _ in range(3):
@@ -180,14 +187,10 @@ async def test_body_that_arrives_with_its_header_is_no_part_of_it(size: int) -> 
             for _ in range(2):
                 answer = await reader.readuntil(b"hello")
                 assert answer.startswith(b"HTTP/1.1 200"), answer
-        writer.close()
 
 
-@pytest.mark.io
 async def test_complete_header_that_is_too_long_is_refused() -> None:
-    async with served() as port:
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    async with connected() as (reader, writer):
         writer.write(b"GET / HTTP/1.1\r\nx: " + b"y" * MAX_HEADER + b"\r\n\r\n")
         with contextlib.suppress(ConnectionError):
             assert b"200" not in await reader.readline()
-        writer.close()

@@ -4,6 +4,7 @@ import base64
 import gzip
 import json
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +28,23 @@ from tests.kit.cli import invoke
 from tests.panel.browsing import FEW_FRAMES, needs_chromium
 from tests.panel.messages import BEGIN_US, HOSTILE_TEXT, flight_frames
 
+pytestmark = pytest.mark.io
 GOLDEN = Path(__file__).parents[1] / "golden" / "take_off.csv.gz"
+OPTIONS = read_options(GatewaySettings())
 
 
-def flight_of(folder: Path, seconds: int) -> PageFlight:
+def flight_of(folder: Path, records: Iterable[tuple[int, bytes]]) -> PageFlight:
     path = folder / "day_01.tlog"
-    path.write_bytes(b"".join(encode_record(*record) for record in flight_frames(seconds)))
-    return read_flight([path], read_options(GatewaySettings()), HOSTILE_TEXT)
+    path.write_bytes(b"".join(encode_record(*record) for record in records))
+    return read_flight([path], OPTIONS, HOSTILE_TEXT)
+
+
+def flight_with(folder: Path, messages: list[tuple[float, Any]]) -> PageFlight:
+    """Return the flight of messages with their times in s."""
+    link = mavlink.MAVLink(None, 3, 1)
+    return flight_of(
+        folder, ((BEGIN_US + round(s * 1e6), bytes(m.pack(link))) for s, m in messages)
+    )
 
 
 def unpacked(page: str, name: str) -> Any:
@@ -42,9 +53,8 @@ def unpacked(page: str, name: str) -> Any:
     return json.loads(gzip.decompress(base64.b64decode(packed[1])))
 
 
-@pytest.mark.io
 def test_page_contains_the_states_and_texts_of_a_flight(tmp_path: Path) -> None:
-    page = render_page(flight_of(tmp_path, 60))
+    page = render_page(flight_of(tmp_path, flight_frames(60)))
     assert HOSTILE_TEXT not in page
     data = unpacked(page, "data")
     (aircraft,) = data["aircraft"]
@@ -57,84 +67,67 @@ def test_page_contains_the_states_and_texts_of_a_flight(tmp_path: Path) -> None:
     assert set(unpacked(page, "modules")) >= {"vue", "./flight_page.js"}
 
 
-def page_of(folder: Path, messages: list[tuple[float, Any]]) -> Any:
-    path, link = folder / "day_01.tlog", mavlink.MAVLink(None, 3, 1)
-    records = [(BEGIN_US + round(s * 1e6), bytes(m.pack(link))) for s, m in messages]
-    path.write_bytes(b"".join(encode_record(*record) for record in records))
-    return unpacked(render_page(read_flight([path], read_options(GatewaySettings()), "x")), "data")
-
-
 def located(lat: int, boot_ms: int = 0) -> Any:
     return mavlink.MAVLink_global_position_int_message(
         boot_ms, lat, lat // 5, 430_000, 0, 0, 0, 0, 0
     )
 
 
-@pytest.mark.io
 def test_page_leaves_out_positions_before_the_fix_and_joins_texts(tmp_path: Path) -> None:
     text = mavlink.MAVLink_statustext_message
     sent = [(k * 0.5, located(470_000_000 if k > 3 else 0)) for k in range(10)]
     sent += [(5.0, text(4, b"a" * 50, 7, 0)), (5.1, text(4, "ende ü".encode(), 7, 1))]
-    data = page_of(tmp_path, sent)
+    data = unpacked(render_page(flight_with(tmp_path, sent)), "data")
     (aircraft,) = data["aircraft"]
     assert len(aircraft["columns"]["lat_deg"]["d"]) == 6
     assert (aircraft["breaks"], aircraft["distance_m"]) == ([], 0.0)
     assert [words for *_, words in data["texts"]] == ["a" * 50 + "ende ü"]
 
 
-@pytest.mark.io
 def test_page_of_gps_fixes_alone_has_a_track_and_its_interruption(tmp_path: Path) -> None:
     fixes = [
         (at, mavlink.MAVLink_gps_raw_int_message(
             0, 3, 470_000_000 + round(at * 100), 85_000_000, 430_000, 1, 1, 0, 0, 9))
         for at in (0.0, 1.0, 2.0, 3600.0, 3601.0)
     ]  # fmt: skip
-    (aircraft,) = page_of(tmp_path, fixes)["aircraft"]
+    (aircraft,) = unpacked(render_page(flight_with(tmp_path, fixes)), "data")["aircraft"]
     assert len(aircraft["columns"]["lat_deg"]["d"]) == 5
     assert aircraft["breaks"] == [3_600_000_000]
     assert aircraft["distance_m"] == pytest.approx(3 * 1.11, rel=0.02)
 
 
-@pytest.mark.io
 @pytest.mark.slow
 def test_page_of_a_quarter_of_an_hour_is_small(tmp_path: Path) -> None:
-    empty = len(render_page(flight_of(tmp_path, 10)).encode())
+    empty = len(render_page(flight_of(tmp_path, flight_frames(10))).encode())
     assert empty <= 3_000_000
-    size = len(render_page(flight_of(tmp_path, 900)).encode())
+    size = len(render_page(flight_of(tmp_path, flight_frames(900))).encode())
     assert size - empty <= 500_000 / 4
 
 
-@pytest.mark.io
 def test_recording_without_a_position_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "day_01.tlog"
-    beat = mavlink.MAVLink_heartbeat_message(1, 0, 128, 0, 4, 3).pack(mavlink.MAVLink(None, 3, 1))
-    path.write_bytes(encode_record(BEGIN_US, bytes(beat)) * 3)
     with pytest.raises(FlightError, match="no position"):
-        read_flight([path], read_options(GatewaySettings()), "day")
+        flight_with(tmp_path, [(0, mavlink.MAVLink_heartbeat_message(1, 0, 128, 0, 4, 3))] * 3)
 
 
-@pytest.mark.io
-def test_page_of_the_last_recording_has_its_name(tmp_path: Path) -> None:
-    flight_of(tmp_path, 30)
-    config = tmp_path / "gateway.toml"
+def test_page_of_the_last_recording_has_its_name_and_overwrites_none(tmp_path: Path) -> None:
+    flight_of(tmp_path, flight_frames(30))
+    config, output = tmp_path / "gateway.toml", tmp_path / "flight.html"
     config.write_text(f'[recording]\nfolder = "{tmp_path}"\n')
-    output = tmp_path / "flight.html"
-    done = invoke("page", "last", "-o", str(output), "--no-compare", "-c", str(config))
-    assert done.exit_code == 0, done.output
+    words = ("page", "last", "-o", output, "--no-compare", "-c", config)
+    assert "MB" in invoke(*words, code=0).output
     page = output.read_text()
     assert "<title>day</title>" in page
     assert unpacked(page, "data")["name"] == "day"
     assert unpacked(page, "data")["aircraft"][0]["title"] == "Plane 3"
+    assert "--force" in invoke(*words, code=2).output
 
 
-@pytest.mark.io
 def test_estimators_are_compared_in_another_process(tmp_path: Path) -> None:
-    tlog = flight_of(tmp_path, 30)
-    options = read_options(GatewaySettings())
-    add_comparison(tlog, begin_comparison([tmp_path / "day_01.tlog"], options))
+    tlog = flight_of(tmp_path, flight_frames(30))
+    add_comparison(tlog, begin_comparison([tmp_path / "day_01.tlog"], OPTIONS))
     assert "The estimators are not compared: " in tlog.remarks[-1]
-    flight = read_flight([GOLDEN], options, "take-off")
-    add_comparison(flight, begin_comparison([GOLDEN], options))
+    flight = read_flight([GOLDEN], OPTIONS, "take-off")
+    add_comparison(flight, begin_comparison([GOLDEN], OPTIONS))
     assert flight.remarks == []
     assert set(flight.compared) == set(ESTIMATORS)
     for curves in flight.compared.values():
@@ -142,29 +135,14 @@ def test_estimators_are_compared_in_another_process(tmp_path: Path) -> None:
         assert -10e6 < curves["time_us"][0] < curves["time_us"][-1] < 90e6
 
 
-@pytest.mark.io
-def test_command_writes_one_file_and_overwrites_none(tmp_path: Path) -> None:
-    flight_of(tmp_path, 30)
-    output = tmp_path / "flight.html"
-    command = ["page", str(tmp_path / "day_01.tlog"), "-o", str(output), "--no-compare"]
-    done = invoke(*command)
-    assert done.exit_code == 0, done.output
-    assert "MB" in done.output
-    again = invoke(*command)
-    assert again.exit_code != 0
-    assert "--force" in again.output
-
-
 @pytest.fixture(scope="module")
 def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of a flight of two minutes."""
-    folder = tmp_path_factory.mktemp("page")
-    path = folder / "flight.html"
-    path.write_text(render_page(flight_of(folder, 120)))
+    path = tmp_path_factory.mktemp("page") / "flight.html"
+    path.write_text(render_page(flight_of(path.parent, flight_frames(120))))
     return path
 
 
-@pytest.mark.io
 @pytest.mark.slow
 @needs_chromium
 @pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1920, "dark")])
@@ -261,7 +239,6 @@ for (const name of ['bufferData', 'bufferSubData']) {
 """Counts the buffers of lines that are interrupted."""
 
 
-@pytest.mark.io
 @pytest.mark.slow
 @needs_chromium
 @pytest.mark.parametrize(("later_s", "is_interrupted"), [(0.0, False), (3600.0, True)])
@@ -270,10 +247,8 @@ def test_path_in_3d_is_interrupted_where_the_recording_is(
 ) -> None:
     sent = [(k * 0.5, located(470_000_000 + 1000 * k)) for k in range(40)]
     sent += [(20 + later_s + k * 0.5, located(470_040_000 + 1000 * k)) for k in range(40)]
-    page_of(tmp_path, sent)
     file = tmp_path / "flight.html"
-    flight = read_flight([tmp_path / "day_01.tlog"], read_options(GatewaySettings()), "x")
-    file.write_text(render_page(flight))
+    file.write_text(render_page(flight_with(tmp_path, sent)))
     page = browser.new_page()
     page.add_init_script(FEW_FRAMES + NOTE_GAPS)
     page.goto(file.as_uri())

@@ -30,6 +30,13 @@ def exported(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder, not made yet, in which the exports are."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    return tmp_path / "temporary"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "begin"), [("gpx", b"<?xml"), ("page", b"<!doctype html>")])
 async def test_export_is_fetched_under_an_unguessable_address(
@@ -67,9 +74,9 @@ async def test_part_of_a_recording_is_cut_anonymised_and_extracted(exported: Pat
 
 @pytest.mark.slow
 async def test_failed_export_reports_the_reason_and_leaves_no_file(
-    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    temporary.mkdir()
     (exported / "broken_01.tlog").write_bytes(b"no recording at all\n" * 10)
     jobs = RecordingJobs()
     with pytest.raises(ExportError, match="broken_01"):
@@ -82,26 +89,26 @@ async def test_failed_export_reports_the_reason_and_leaves_no_file(
     cancelled = asyncio.create_task(jobs.export(Order(exported, NAME, "page")))
     # Its command runs as soon as its folder holds the settings.
     async with asyncio.timeout(60.0):
-        while not list(tmp_path.glob("mavgate-export-*/*/settings.toml")):
+        while not list(temporary.glob("mavgate-export-*/*/settings.toml")):
             await asyncio.sleep(0)
     cancelled.cancel()
     await asyncio.wait([cancelled])
-    assert list(tmp_path.glob("mavgate-export-*/*")) == []
+    assert list(temporary.glob("mavgate-export-*/*")) == []
     jobs.close()
-    assert list(tmp_path.glob("mavgate-export-*")) == []
+    assert list(temporary.glob("mavgate-export-*")) == []
 
 
 async def test_export_that_writes_too_much_is_stopped_and_deleted(
-    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    temporary.mkdir()
     monkeypatch.setattr(recording_jobs, "MAX_EXPORT", 1_000_000)
     endless = 'head -c 1100000 /dev/zero > "$TMPDIR/part"; exec sleep 5'
     monkeypatch.setattr(recording_jobs, "own_command", lambda _: ["sh", "-c", endless])
     jobs = RecordingJobs()
     with pytest.raises(ExportError, match="larger than 1 MB, and stopped: choose a shorter"):
         await jobs.export(Order(exported, NAME, "csv"))
-    assert list(tmp_path.glob("mavgate-export-*/*")) == []
+    assert list(temporary.glob("mavgate-export-*/*")) == []
     jobs.close()
 
 
@@ -130,17 +137,16 @@ def maker(monkeypatch: pytest.MonkeyPatch) -> Maker:
 
 
 async def test_export_is_made_again_after_the_temporary_folder_failed_or_was_removed(
-    exported: Path, maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported: Path, maker: Maker, temporary: Path
 ) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "full"))
     jobs, order = RecordingJobs(), Order(exported, NAME, "csv")
     for _ in range(recording_jobs.EXPORTS_OF_ROLE + 1):
         with pytest.raises(FileNotFoundError):
             await jobs.export(order)
-    (tmp_path / "full").mkdir()
+    temporary.mkdir()
     for kind in ("csv", "gpx"):
         await jobs.export(Order(exported, NAME, kind))
-        shutil.rmtree(*tmp_path.glob("full/mavgate-export-*"))
+        shutil.rmtree(*temporary.glob("mavgate-export-*"))
     assert maker.kinds == ["csv", "gpx"]
     jobs.close()
 
@@ -167,9 +173,9 @@ async def test_exports_of_a_viewer_keep_no_operator_waiting(exported: Path, make
 
 
 async def test_equal_export_is_made_once_and_deleted_after_the_last_fetch(
-    exported: Path, maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported: Path, maker: Maker, temporary: Path
 ) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    temporary.mkdir()
     jobs = RecordingJobs()
     first, second = await asyncio.gather(
         *(jobs.export(Order(exported, NAME, "kml"), VIEWER) for _ in range(2))
@@ -177,19 +183,19 @@ async def test_equal_export_is_made_once_and_deleted_after_the_last_fetch(
     assert (first, maker.kinds) == (second, ["kml"])
     async with client_of(jobs.serve) as client:
         assert [(await client.get(first)).status_code for _ in range(3)] == [200, 200, 404]
-    assert list(tmp_path.glob("mavgate-export-*/*")) == []
+    assert list(temporary.glob("mavgate-export-*/*")) == []
     jobs.close()
 
 
 async def test_bytes_of_exports_are_bounded(
-    exported: Path, maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported: Path, maker: Maker, temporary: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    temporary.mkdir()
     monkeypatch.setattr(recording_jobs, "MAX_EXPORTED", 2500)
     jobs = RecordingJobs()
     for kind in ("csv", "kml", "gpx", "page"):
         await jobs.export(Order(exported, NAME, kind), VIEWER)
-    kept = sorted(file.suffix for file in tmp_path.glob("mavgate-export-*/*/*"))
+    kept = sorted(file.suffix for file in temporary.glob("mavgate-export-*/*/*"))
     assert kept == [".gpx", ".page"]
     jobs.close()
 
