@@ -30,42 +30,35 @@ def test_first_vehicle_keeps_its_id_and_second_gets_the_lowest_free_one() -> Non
     assert IdMap(dict(ids.items())).items() == ids.items()
 
 
-def test_id_of_an_excluded_vehicle_goes_to_a_waiting_one() -> None:
-    ids = IdMap()
-    for n in range(LAST_ID + 2):
-        ids.id_of(f"site-{n}", 1)
-    assert ids.unmapped == {("site-249", 1), ("site-250", 1)}
-    ids.leave_out("site-7", 1)
-    assert ids.id_of("site-7", 1) is None
-    assert ids.id_of("site-250", 1) == 8
-    assert ids.id_of("site-249", 1) is None
-    again = IdMap(dict(ids.items()))
-    assert again.id_of("site-7", 1) is None
-    assert again.left_out == {("site-7", 1)}
-    again.set_by_hand("site-7", 1, 8)
-    assert again.id_of("site-7", 1) == 8
-    assert not again.left_out
-
-
-def test_vehicles_beyond_the_number_of_ids_wait() -> None:
-    ids = IdMap()
-    found = [ids.id_of(f"site-{n}", 1) for n in range(300)]
-    given = [own_id for own_id in found if own_id is not None]
-    assert sorted(given) == list(range(FIRST_ID, LAST_ID + 1))
-    assert len(ids.unmapped) == 300 - len(given)
-    ids.set_by_hand("site-299", 1, 5)
-    assert ids.id_of("site-299", 1) == 5
-    assert ids.vehicle_of(5) == ("site-299", 1)
-    assert ("site-299", 1) not in ids.unmapped
-
-
-def filled(sites: int) -> IdMap:
+def filled(sites: int, systems: int = LAST_ID) -> IdMap:
     """Return a map that as many sites have filled as far as they could."""
     ids = IdMap()
     for number in range(sites):
-        for system_id in range(1, LAST_ID + 1):
+        for system_id in range(1, systems + 1):
             ids.id_of(f"many-{number}", system_id)
     return ids
+
+
+def test_vehicles_beyond_the_number_of_ids_wait_for_a_free_one() -> None:
+    ids = filled(LAST_ID + 2, 1)
+    assert sorted(own_id for _, own_id in ids.items()) == list(range(FIRST_ID, LAST_ID + 1))
+    assert ids.unmapped == {("many-249", 1), ("many-250", 1)}
+    ids.leave_out("many-7", 1)
+    assert ids.id_of("many-7", 1) is None
+    assert ids.id_of("many-250", 1) == 8
+    assert ids.id_of("many-249", 1) is None
+    # One that the operator moves leaves its former id.
+    ids.leave_out("many-9", 1)
+    ids.set_by_hand("many-0", 1, 10)
+    assert ids.id_of("many-249", 1) == 1
+    assert not ids.unmapped
+    again = IdMap(dict(ids.items()))
+    assert again.id_of("many-7", 1) is None
+    assert again.left_out == {("many-7", 1), ("many-9", 1)}
+    again.set_by_hand("many-7", 1, 8)
+    assert again.id_of("many-7", 1) == 8
+    assert again.vehicle_of(8) == ("many-7", 1)
+    assert again.left_out == {("many-9", 1)}
 
 
 @pytest.mark.parametrize("sites", [1, 2, 5])
@@ -156,18 +149,6 @@ def test_id_assigned_by_the_operator_is_swapped() -> None:
     for wrong in (0, 250):
         with pytest.raises(ValueError, match="1 to 249"):
             ids.set_by_hand("a", 1, wrong)
-
-
-def test_id_freed_by_the_operator_goes_to_a_waiting_vehicle() -> None:
-    ids = IdMap()
-    for n in range(LAST_ID):
-        ids.id_of(f"site-{n}", 1)
-    ids.leave_out("site-7", 1)
-    assert ids.id_of("late", 1) == 8
-    assert ids.id_of("later", 1) is None
-    ids.leave_out("site-9", 1)
-    ids.set_by_hand("site-0", 1, 10)
-    assert ids.id_of("later", 1) == 1
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -26,6 +26,12 @@ class Ring:
         time_ms = self.now_us // 1000
         return self.vehicles[name].pack(mavlink.MAVLink_attitude_message(time_ms, 0, 0, 0, 0, 0, 0))
 
+    def passed(self, name: str) -> bytes:
+        """Return the next frame of a site's vehicle, as the stations get it."""
+        given = self.give(name, self.attitude(name))
+        assert given is not None
+        return given
+
     def give(self, name: str, frame: bytes, *, is_own: bool = False) -> bytes | None:
         given = self.sites[name].from_site(frame_of(frame), self.now_us, is_own=is_own)
         return None if given is None else given.data
@@ -35,8 +41,7 @@ def test_looped_frames_end_after_one_round_and_assign_no_id() -> None:
     ring = Ring()
     for _ in range(300):
         for name in "ab":
-            given = ring.give(name, ring.attitude(name))
-            assert given is not None
+            given = ring.passed(name)
             ring.now_us += STEP_US
             assert ring.give("c", given) is None
     assert ring.ids.items() == [(("a", 1), 1), (("b", 1), 2)]
@@ -47,8 +52,7 @@ def test_looped_frames_end_after_one_round_and_assign_no_id() -> None:
 
 def test_frame_returned_through_its_own_site_is_no_loop() -> None:
     ring = Ring(IdMap({("a", 1): 7}))
-    given = ring.give("a", ring.attitude("a"))
-    assert given is not None
+    given = ring.passed("a")
     assert origin_of(given)[0] == 7
     assert ring.give("a", given) is None
     assert ring.ids.known_id("a", 7) is None
@@ -61,7 +65,7 @@ def test_two_equal_vehicles_are_separated_by_the_first_differing_frame() -> None
     assert ring.give("b", ring.vehicles["b"].heartbeat()) is None
     for _ in range(50):
         for name in "ab":
-            assert ring.give(name, ring.attitude(name)) is not None
+            ring.passed(name)
         for name in "ab":
             assert ring.give(name, ring.vehicles[name].heartbeat()) is not None
     assert ring.ids.known_id("b", 1) == 2
@@ -97,9 +101,7 @@ def test_looped_vehicle_with_an_id_is_dropped_after_a_run() -> None:
     ring = Ring(IdMap({("b", 1): 2, ("c", 2): 3}))
     passed = 0
     for _ in range(100):
-        given = ring.give("b", ring.attitude("b"))
-        assert given is not None
-        passed += ring.give("c", given) is not None
+        passed += ring.give("c", ring.passed("b")) is not None
     assert passed == MAX_CHANCE
     assert ring.sites["c"].counters["looped"] == 100 - MAX_CHANCE
     own = Sender(2, 1).pack(mavlink.MAVLink_attitude_message(1, 2, 0, 0, 0, 0, 0))
@@ -123,8 +125,7 @@ def test_returned_command_ends_on_both_ways() -> None:
 
 def test_memory_is_bounded_in_time_and_number() -> None:
     ring = Ring()
-    given = ring.give("b", ring.attitude("b"))
-    assert given is not None
+    given = ring.passed("b")
     ring.now_us += 2 * SPAN_US + 1
     assert ring.give("c", given) is not None
     loops = LoopDetection()

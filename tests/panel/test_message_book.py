@@ -10,14 +10,11 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel import rest_api
 from gateway.panel.rest_api import MessageBook
+from tests.conftest import ManualClock
 from tests.panel.messages import decoded
 
-
-class Wall:
-    now_s = 1_700_000_000.0
-
-    def __call__(self) -> float:
-        return self.now_s
+BEGIN_S = 1_700_000_000
+ATTITUDE = "vehicles/1/components/1/messages/ATTITUDE"
 
 
 def attitude(roll: float, system_id: int = 1, component_id: int = 1) -> Any:
@@ -26,21 +23,13 @@ def attitude(roll: float, system_id: int = 1, component_id: int = 1) -> Any:
 
 
 @pytest.fixture
-def wall() -> Wall:
-    return Wall()
-
-
-@pytest.fixture
-def book(wall: Wall) -> MessageBook:
-    book = MessageBook(wall)
+def book(clock: ManualClock) -> MessageBook:
+    book = MessageBook(lambda: BEGIN_S + clock.now_us / 1e6)
     for count in range(11):
-        wall.now_s = 1_700_000_000.0 + count / 10
+        clock.now_us = count * 100_000
         book.add(attitude(count / 2))
     book.add(attitude(7, 2, 5))
     return book
-
-
-ATTITUDE = "vehicles/1/components/1/messages/ATTITUDE"
 
 
 def test_value_is_found_by_its_path(book: MessageBook) -> None:
@@ -60,7 +49,7 @@ def test_status_has_count_frequency_and_times(book: MessageBook) -> None:
     assert status["counter"] == 11
     assert status["frequency"] == pytest.approx(10)
     first, last = (datetime.fromisoformat(status[f"{end}_update"]) for end in ("first", "last"))
-    assert first.timestamp() == 1_700_000_000.0
+    assert first.timestamp() == BEGIN_S
     assert (last - first).total_seconds() == 1
     once = book.look_up("vehicles/2/components/5/messages/ATTITUDE/status/time")
     assert (once["counter"], once["frequency"]) == (1, 0.0)
@@ -68,7 +57,7 @@ def test_status_has_count_frequency_and_times(book: MessageBook) -> None:
 
 def test_array_element_is_found_by_its_index(book: MessageBook) -> None:
     book.add(decoded(mavlink.MAVLink_param_value_message(b"SPEED", 1.5, 9, 1, 0)))
-    path = "vehicles/1/components/1/messages/PARAM_VALUE/message/param_id"
+    path = ATTITUDE.replace("ATTITUDE", "PARAM_VALUE/message/param_id")
     assert book.look_up(f"{path}/1") == "P"
     for element in ("16", "-1", "01", "+1"):
         with pytest.raises(KeyError):
@@ -78,13 +67,8 @@ def test_array_element_is_found_by_its_index(book: MessageBook) -> None:
 @pytest.mark.parametrize(
     "path",
     [
-        "nowhere",
-        "vehicles/3",
-        f"{ATTITUDE}/message/rol",
-        f"{ATTITUDE}/message/roll/x",
-        "vehicles/x",
-        f"{ATTITUDE}/",
-        f"/{ATTITUDE}",
+        *("nowhere", "vehicles/3", "vehicles/x", f"/{ATTITUDE}"),
+        *(f"{ATTITUDE}/{rest}" for rest in ("", "message/rol", "message/roll/x")),
     ],
 )
 def test_unknown_path_raises_key_error(book: MessageBook, path: str) -> None:
@@ -94,11 +78,11 @@ def test_unknown_path_raises_key_error(book: MessageBook, path: str) -> None:
 
 @pytest.mark.parametrize("bound", ["MAX_KINDS", "MAX_KINDS_OF_SYSTEM"])
 def test_forged_ids_are_dropped_before_entries_that_are_updated(
-    book: MessageBook, wall: Wall, monkeypatch: pytest.MonkeyPatch, bound: str
+    book: MessageBook, clock: ManualClock, monkeypatch: pytest.MonkeyPatch, bound: str
 ) -> None:
     monkeypatch.setattr(rest_api, bound, 3)
     for number in range(3, 10):
-        wall.now_s += 1
+        clock.advance(1)
         book.add(attitude(9))
         of_system = bound == "MAX_KINDS_OF_SYSTEM"
         book.add(attitude(0, 1, number) if of_system else attitude(0, number))

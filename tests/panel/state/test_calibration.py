@@ -20,13 +20,14 @@ from gateway.vehicle.services.calibrator import SIDES as VEHICLE_SIDES
 from tests.kit.vehicle_bench import G_MPS2, VehicleBench
 
 
-def bench_of(step: CalibrationStep) -> VehicleBench:
-    return VehicleBench(CalibrationRun(1, step, 10 * US_PER_S))
+def started(step: CalibrationStep) -> VehicleBench:
+    bench = VehicleBench(CalibrationRun(1, step, 10 * US_PER_S))
+    bench.send(bench.client.start_message())
+    return bench
 
 
 def test_gyro_calibration_reports_bias_before_and_after() -> None:
-    bench = bench_of(CalibrationStep.GYRO)
-    bench.send(bench.client.start_message())
+    bench = started(CalibrationStep.GYRO)
     assert bench.client.state is RunState.RUNNING
     bench.hold(1.5, gyro=(0.01, 0.0, 0.0))
     assert bench.client.progress in range(40, 60)
@@ -40,16 +41,14 @@ def test_gyro_calibration_reports_bias_before_and_after() -> None:
 
 
 def test_motion_fails_gyro_calibration_with_the_reason() -> None:
-    bench = bench_of(CalibrationStep.GYRO)
-    bench.send(bench.client.start_message())
+    bench = started(CalibrationStep.GYRO)
     for n in range(40):
         bench.hold(0.1, gyro=(math.sin(n), 0.0, 0.0))
     assert (bench.client.state, bench.client.trouble) == (RunState.FAILED, "it was moved")
 
 
 def test_each_of_six_sides_is_reported_once_done() -> None:
-    bench = bench_of(CalibrationStep.ACCEL)
-    bench.send(bench.client.start_message())
+    bench = started(CalibrationStep.ACCEL)
     bias = np.array((0.3, -0.2, 0.1))
     for done, (axis, sign) in enumerate((a, s) for a in range(3) for s in (1.0, -1.0)):
         pose = bias + sign * G_MPS2 * np.eye(3)[axis]
@@ -64,8 +63,7 @@ def test_each_of_six_sides_is_reported_once_done() -> None:
 
 
 def test_magnetometer_shows_uncovered_directions() -> None:
-    bench = bench_of(CalibrationStep.MAG)
-    bench.send(bench.client.start_message())
+    bench = started(CalibrationStep.MAG)
     rng = np.random.default_rng(2)
     directions = rng.normal(size=(1500, 3))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -91,8 +89,7 @@ def test_magnetometer_shows_uncovered_directions() -> None:
 
 
 def test_cancelling_and_timeout_end_a_calibration() -> None:
-    bench = bench_of(CalibrationStep.MAG)
-    bench.send(bench.client.start_message())
+    bench = started(CalibrationStep.MAG)
     bench.send(bench.client.cancel_message())
     assert (bench.client.state, bench.client.trouble) == (RunState.FAILED, "cancelled")
     lonely = CalibrationRun(2, CalibrationStep.GYRO, 0)

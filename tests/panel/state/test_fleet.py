@@ -113,25 +113,26 @@ def test_model_follows_the_vehicle_type(vehicle: VehicleState, kind: int, model:
     assert vehicle.model == model
 
 
-def test_chunks_of_a_long_text_are_joined(vehicle: VehicleState) -> None:
-    for chunk, text in enumerate(("a" * 50, "b" * 50, "c")):
-        vehicle.update(decoded(mavlink.MAVLink_statustext_message(4, text.encode(), 9, chunk)), 0)
-    vehicle.update(decoded(mavlink.MAVLink_statustext_message(2, b"next")), 0)
-    texts = [(entry.number, entry.severity, entry.text) for entry in vehicle.texts.all]
-    assert texts == [(1, 4, "a" * 50 + "b" * 50 + "c"), (2, 2, "next")]
-
-
-def test_text_that_fills_its_last_chunk_ends_with_an_empty_one(vehicle: VehicleState) -> None:
-    for chunk, text in enumerate(("a" * 50, "")):
-        vehicle.update(decoded(mavlink.MAVLink_statustext_message(4, text.encode(), 9, chunk)), 0)
-    assert [entry.text for entry in vehicle.texts.all] == ["a" * 50]
-
-
-def test_text_whose_last_chunk_is_lost_is_shown_after_a_while(vehicle: VehicleState) -> None:
-    vehicle.update(decoded(mavlink.MAVLink_statustext_message(4, b"a" * 49 + b" ", 9, 0)), 0)
-    assert list(vehicle.texts.all) == []
-    vehicle.update(heartbeat(), 4 * US_PER_S)
-    assert [entry.text for entry in vehicle.texts.all] == ["a" * 49 + "…"]
+@pytest.mark.parametrize(
+    ("chunks", "later_s", "shown"),
+    [
+        (("a" * 50, "b" * 50, "c"), 0, ["a" * 50 + "b" * 50 + "c"]),
+        (("a" * 50, ""), 0, ["a" * 50]),
+        (("a" * 49 + " ",), 0, []),
+        (("a" * 49 + " ",), 4, ["a" * 49 + "…"]),
+    ],
+    ids=["three", "an empty last one", "last one to come", "last one lost"],
+)
+def test_chunks_of_a_text_are_joined(
+    vehicle: VehicleState, chunks: tuple[str, ...], later_s: int, shown: list[str]
+) -> None:
+    for number, text in enumerate(chunks):
+        vehicle.update(decoded(mavlink.MAVLink_statustext_message(4, text.encode(), 9, number)), 0)
+    vehicle.update(heartbeat(), later_s * US_PER_S)
+    assert [entry.text for entry in vehicle.texts.all] == shown
+    vehicle.update(decoded(mavlink.MAVLink_statustext_message(2, b"next")), later_s * US_PER_S)
+    newest = vehicle.texts.all[-1]
+    assert (newest.number, newest.severity, newest.text) == (len(vehicle.texts.all), 2, "next")
 
 
 def test_position_before_the_first_fix_is_unknown(vehicle: VehicleState) -> None:

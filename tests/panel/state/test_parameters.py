@@ -27,6 +27,24 @@ def loaded(*, may_change: bool = True) -> tuple[ParameterClient, VehicleBench]:
     return client, bench
 
 
+def client_of(*messages: Any) -> ParameterClient:
+    """Return a client that has received some messages."""
+    client = ParameterClient(1)
+    for message in messages:
+        client.handle(message, 0)
+    return client
+
+
+def value_of(
+    name: str, value: float = 1.0, kind: int = 9, *, index: int = 0, count: int = 2
+) -> Any:
+    return mavlink.MAVLink_param_value_message(name.encode(), value, kind, count, index)
+
+
+def beat_of(autopilot: int) -> Any:
+    return mavlink.MAVLink_heartbeat_message(1, autopilot, 0, 0, 4, 3)
+
+
 @pytest.mark.parametrize("lose_every", [0, 3])
 def test_parameter_list_is_completed_despite_losses(lose_every: int) -> None:
     client = ParameterClient(1)
@@ -60,16 +78,11 @@ def test_second_change_before_the_answer_is_not_refused() -> None:
 
 
 def test_retry_sends_the_newest_value_of_an_unanswered_change() -> None:
-    client = ParameterClient(1)
-    client.handle(mavlink.MAVLink_param_value_message(b"P", 1.0, 9, 1, 0), 0)
+    client = client_of(value_of("P"))
     client.change("P", 2.0, 0)
     assert not client.change("P", 3.0, 0)
     [message] = client.poll(US_PER_S)
     assert message.param_value == 3.0
-
-
-def value_of(name: str, *, index: int, count: int = 2) -> Any:
-    return mavlink.MAVLink_param_value_message(name.encode(), 1.0, 9, count, index)
 
 
 def test_unrequested_value_does_not_complete_the_list() -> None:
@@ -88,15 +101,12 @@ def test_unrequested_value_does_not_complete_the_list() -> None:
 
 
 def test_number_of_parameters_is_bounded() -> None:
-    client = ParameterClient(1)
-    for index in range(MAX_PARAMETERS + 3):
-        client.handle(value_of(f"P{index}", index=index, count=65_000), 0)
-    assert len(client.entries) == MAX_PARAMETERS
+    values = (value_of(f"P{n}", index=n, count=65_000) for n in range(MAX_PARAMETERS + 3))
+    assert len(client_of(*values).entries) == MAX_PARAMETERS
 
 
 def test_change_without_an_answer_is_refused_after_retries() -> None:
-    client = ParameterClient(1)
-    client.handle(value_of("P", index=0), 0)
+    client = client_of(value_of("P"))
     sent = client.change("P", 2.0, 0)
     for second in range(1, 30):
         sent += client.poll(second * US_PER_S)
@@ -120,27 +130,23 @@ def test_loading_fails_without_an_answer() -> None:
 
 
 def test_unknown_name_and_invalid_value_are_not_sent() -> None:
-    client = ParameterClient(1)
-    with pytest.raises(ValueError, match="no parameter NIX"):
-        client.change("NIX", 1.0, 0)
-    client.handle(mavlink.MAVLink_param_value_message(b"P", 1.0, 9, 1, 0), 0)
-    with pytest.raises(ValueError, match="not a number"):
-        client.change("P", math.nan, 0)
-    with pytest.raises(ValueError, match="P cannot hold"):
-        client.change("P", 1e39, 0)
+    client = client_of(beat_of(12), value_of("P"), value_of("N", 0.0, 6))
+    for name, value, reason in (
+        ("NIX", 1.0, "no parameter NIX"),
+        ("P", math.nan, "not a number"),
+        ("P", 1e39, "P cannot hold"),
+        ("N", 1e10, "N cannot hold"),
+    ):
+        with pytest.raises(ValueError, match=reason):
+            client.change(name, value, 0)
     assert not client.pending
 
 
-def test_value_beyond_the_parameter_type_is_refused() -> None:
-    client = ParameterClient(1)
-    client.handle(mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3), 0)
-    client.handle(mavlink.MAVLink_param_value_message(b"N", 0.0, 6, 1, 0), 0)
-    with pytest.raises(ValueError, match="N cannot hold"):
-        client.change("N", 1e10, 0)
+def test_change_beyond_a_type_that_is_reported_later_is_refused() -> None:
+    client = client_of(beat_of(12), value_of("N", 0.0, 6))
     assert client.change("N", 300.0, 0)
-    # Changed again, and then the vehicle reports another type.
     client.change("N", 301.0, 0)
-    client.handle(mavlink.MAVLink_param_value_message(b"N", 0.0, 1, 1, 0), 0)
+    client.handle(value_of("N", 0.0, 1), 0)
     assert client.poll(2 * US_PER_S) == []
     assert client.refused == {"N": "N cannot hold 301"}
 
@@ -148,9 +154,7 @@ def test_value_beyond_the_parameter_type_is_refused() -> None:
 def test_integers_are_encoded_by_the_convention_of_the_autopilot() -> None:
     """PX4 packs their bytes into the float, ArduPilot writes the number."""
     for autopilot, on_the_wire in ((12, 7.0e-45), (3, 5.0)):
-        client = ParameterClient(1)
-        client.handle(mavlink.MAVLink_heartbeat_message(1, autopilot, 0, 0, 4, 3), 0)
-        client.handle(mavlink.MAVLink_param_value_message(b"N", on_the_wire, 6, 1, 0), 0)
+        client = client_of(beat_of(autopilot), value_of("N", on_the_wire, 6))
         assert client.entries["N"].value == 5.0
         [message] = client.change("N", 5.0, 0)
         assert message.param_value == pytest.approx(on_the_wire, rel=0.01)
