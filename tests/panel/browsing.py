@@ -1,9 +1,11 @@
 """A gateway with its panel as processes, and a real Chromium to look at it."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, Playwright
+from playwright.sync_api import Browser, FloatRect, Locator, Page, Playwright
 
 from tests.kit import process
 
@@ -104,10 +106,45 @@ def open_page(browser: Browser, link: str, view: str = "flight", script: str = "
     return page
 
 
-def show(page: Page, view: str) -> None:
-    """Show a view by its key."""
+@contextmanager
+def opened(browser: Browser, link: str) -> Iterator[Page]:
+    """Open the page; none of its scripts may fail until it is closed."""
+    page = open_page(browser, link)
+    troubles: list[str] = []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    yield page
+    page.close()
+    assert troubles == []
+
+
+def show(page: Page, view: str) -> Locator:
+    """Show a view by its key; return its element."""
     button = page.locator(f".rail button[data-view='{view}']")
     if not button.is_visible():
         page.get_by_role("button", name="More", exact=True).click()
     button.click()
-    page.locator(f"section[data-view='{view}']").wait_for(state="visible")
+    section = page.locator(f"section[data-view='{view}']")
+    section.wait_for(state="visible")
+    return section
+
+
+def choose(page: Page, label: str, option: str) -> None:
+    """Choose an option of a field."""
+    page.get_by_label(label, exact=True).click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def box_of(element: Locator) -> FloatRect:
+    """Return where a visible element is on the page."""
+    box = element.bounding_box()
+    assert box is not None
+    return box
+
+
+def download(page: Page, button: Locator, folder: Path) -> Path:
+    """Click a button; return the file that is downloaded, under the name that the page gives it."""
+    with page.expect_download(timeout=START_LIMIT_MS) as waiting:
+        button.click()
+    path = folder / waiting.value.suggested_filename
+    waiting.value.save_as(path)
+    return path

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from nicegui import core
 
 from gateway.panel.access import HOLDER
 from gateway.panel.admission import Holder, Places, Role
@@ -19,17 +20,15 @@ def holder(role: Role | None, session: str = "", address: str = "a") -> Holder:
     return Holder(role, session, address)
 
 
+VIEWERS = [holder(VIEWER, str(n), str(n)) for n in range(5)]
+
+
 @pytest.mark.parametrize(
     ("before", "newcomer", "evicted"),
     [
-        pytest.param([holder(VIEWER, "v")] * 2, holder(VIEWER, "v"), [0], id="own session"),
-        pytest.param(
-            [holder(VIEWER, "v"), *(holder(VIEWER, str(n)) for n in range(2))],
-            holder(VIEWER, "x"),
-            [0],
-            id="own address",
-        ),
-        pytest.param(
+        ([holder(VIEWER, "v")] * 2, holder(VIEWER, "v"), [0]),
+        ([holder(VIEWER, "v"), holder(VIEWER, "0"), holder(VIEWER, "1")], holder(VIEWER, "x"), [0]),
+        (
             [
                 holder(VIEWER, "1", "b"),
                 *(holder(VIEWER, str(n), "a") for n in range(2, 5)),
@@ -37,35 +36,24 @@ def holder(role: Role | None, session: str = "", address: str = "a") -> Holder:
             ],
             holder(VIEWER, "x", "d"),
             [1],
-            id="address with most",
         ),
-        pytest.param(
-            [holder(OPERATOR, "o"), *(holder(VIEWER, str(n), str(n)) for n in range(5))],
-            holder(VIEWER, "x", "x"),
-            [1],
-            id="role",
-        ),
-        pytest.param(
-            [holder(VIEWER, str(n), str(n)) for n in range(5)],
-            holder(OPERATOR, "o", "0"),
-            [],
-            id="another role",
-        ),
-        pytest.param([holder(None)] * 3, holder(None), [0], id="no session"),
+        ([holder(OPERATOR, "o"), *VIEWERS], holder(VIEWER, "x", "x"), [1]),
+        (VIEWERS, holder(OPERATOR, "o", "0"), []),
+        ([holder(None)] * 3, holder(None), [0]),
     ],
+    ids=["own session", "own address", "address with most", "role", "another role", "no session"],
 )
 def test_newcomer_takes_a_place_of_its_own_kind_only(
     before: list[Holder], newcomer: Holder, evicted: list[int]
 ) -> None:
     gone: list[int] = []
     places: Places[int] = Places(2, 3, 5, gone.append)
-    for number, each in enumerate(before):
-        assert places.admit(number, each)
-    assert places.admit(99, newcomer)
-    assert gone == evicted
     waiting: Places[int] = Places(2, 3, 5)
     for number, each in enumerate(before):
+        assert places.admit(number, each)
         waiting.admit(number, each)
+    assert places.admit(99, newcomer)
+    assert gone == evicted
     assert waiting.admit(99, newcomer) == (not evicted)
 
 
@@ -182,8 +170,6 @@ def test_page_takes_messages_of_its_own_session_and_ends_with_it() -> None:
 
 
 async def test_every_message_to_a_page_is_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    from nicegui import core
-
     pages = OpenPages()
     page: Any = Page(1)
     pages.add(page, holder(VIEWER, "mine"))

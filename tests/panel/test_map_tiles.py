@@ -12,6 +12,7 @@ from contextlib import suppress
 from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pmtiles.tile import Compression, TileType, zxy_to_tileid
@@ -167,7 +168,8 @@ def write_pmtiles(
         for tile in tiles:
             writer.write_tile(zxy_to_tileid(*tile), picture(sum(tile) % 256))
         ends = ("min_lon_e7", "min_lat_e7", "max_lon_e7", "max_lat_e7")
-        header = dict.fromkeys((*ends, "center_zoom", "center_lon_e7", "center_lat_e7"), 0)
+        zeros = (*ends, "center_zoom", "center_lon_e7", "center_lat_e7")
+        header: dict[str, Any] = dict.fromkeys(zeros, 0)
         header |= {"tile_type": kind, "tile_compression": Compression.NONE}
         writer.finalize(header, {"attribution": attribution})
 

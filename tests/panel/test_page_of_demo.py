@@ -9,7 +9,7 @@ from zipfile import ZipFile
 
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Locator, Page, expect
 
 from gateway.live.control_socket import request
 from gateway.recordings.antenna import AntennaStation, pointing_of
@@ -17,51 +17,50 @@ from gateway.recordings.newest import NewestState
 from gateway.recordings.positions import Position
 from gateway.recordings.tlog import encode_record
 from tests.kit.process import wait_for
-from tests.panel.browsing import START_LIMIT_MS, WAIT_MS, Process, needs_chromium, open_page, show
+from tests.panel.browsing import (
+    START_LIMIT_MS,
+    WAIT_MS,
+    Process,
+    box_of,
+    choose,
+    download,
+    needs_chromium,
+    open_page,
+    opened,
+    show,
+)
 from tests.panel.messages import flight_frames
 from tests.panel.test_map_tiles import write_pmtiles
 
-pytestmark = [
-    pytest.mark.io,
-    pytest.mark.slow,
-    needs_chromium,
-]
+pytestmark = [pytest.mark.io, pytest.mark.slow, needs_chromium]
 expect.set_options(timeout=WAIT_MS)
 
 
 @pytest.fixture(scope="module")
 def page(browser: Browser, demo: Process) -> Iterator[Page]:
     """The one page that all tests of the demo look at."""
-    opened = open_page(browser, demo.link())
-    troubles: list[str] = []
-    opened.on("pageerror", lambda error: troubles.append(str(error)))
-    yield opened
-    opened.close()
-    assert troubles == []
+    with opened(browser, demo.link()) as page:
+        yield page
 
 
 def test_several_aircraft_are_distinguished_and_selected(page: Page) -> None:
-    show(page, "map")
+    view = show(page, "map")
     page.wait_for_function("Object.keys(mavgate.vehicles).length === 2")
-    expect(page.locator("section[data-view='map'] .craft")).to_have_count(2)
+    expect(view.locator(".craft")).to_have_count(2)
     for number in (2, 1):
-        page.get_by_label("Aircraft", exact=True).click()
-        page.get_by_role("option", name=f"Plane {number}", exact=True).click()
+        choose(page, "Aircraft", f"Plane {number}")
         page.wait_for_function(f"mavgate.state.system_id === {number}")
 
 
 def test_scene_shows_the_aircraft_from_two_viewpoints(page: Page) -> None:
-    show(page, "flight")
-    scene = page.locator(".scene")
+    scene = show(page, "flight").locator(".scene")
     expect(scene).to_have_attribute("data-model", "plane")
     choices = scene.locator("select")
     assert [choices.nth(i).input_value() for i in range(2)] == ["chase", "ground"]
     page.wait_for_function("document.querySelector('.scene').dataset.frames > 5")
     # Over each half's own region the world is drawn: sky, ground and aircraft, not one colour.
     # Not the element's own photograph, which waits until nothing moves.
-    box = scene.bounding_box()
-    assert box is not None
-    clip = {"x": box["x"], "y": box["y"], "width": box["width"], "height": box["height"]}
+    clip = box_of(scene)
 
     def halves() -> list[Image.Image]:
         """The two halves as soon as the browser has put what was drawn on the page."""
@@ -94,16 +93,15 @@ async () => {
 
 
 def test_3d_model_is_not_reloaded_while_the_theme_stays(page: Page) -> None:
-    show(page, "flight")
-    expect(page.locator(".scene")).to_have_attribute("data-model", "plane")
+    scene = show(page, "flight").locator(".scene")
+    expect(scene).to_have_attribute("data-model", "plane")
     assert page.evaluate(TOUCH_THE_BODY) == ["plane"]
     page.emulate_media(color_scheme="dark")
     assert page.evaluate(TOUCH_THE_BODY) == ["plane"]
 
 
 def test_map_changes_style_and_zoom_and_accepts_an_upload(page: Page, tmp_path: Path) -> None:
-    show(page, "map")
-    view = page.locator("section[data-view='map']")
+    view = show(page, "map")
     expect(view.locator(".leaflet-tile-loaded").first).to_be_visible()
     style = view.get_by_label("Map style")
     assert style.locator("option").all_inner_texts() == ["Field", "Other", "Grid"]
@@ -149,9 +147,8 @@ LISTEN_TO_WORDS = """
 
 
 def test_position_is_copied_as_latitude_and_longitude(page: Page) -> None:
-    show(page, "map")
+    view = show(page, "map")
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
-    view = page.locator("section[data-view='map']")
     position = view.locator("[data-role='position']")
     expect(position).to_have_text(re.compile(r"-7\.7\d{5}, 110\.3\d{5}"))
     copy = view.get_by_text("Copy", exact=True)
@@ -163,8 +160,7 @@ def test_position_is_copied_as_latitude_and_longitude(page: Page) -> None:
 
 
 def test_marked_position_is_sent_and_shown_with_its_distance(page: Page, demo: Process) -> None:
-    show(page, "map")
-    view = page.locator("section[data-view='map']")
+    view = show(page, "map")
     expect(view.locator(".pin.home")).to_be_visible()
     expect(view.locator("[data-role='sight']")).to_have_text(re.compile(r"from home \d{1,3}°"))
     canvas = view.locator(".map-canvas")
@@ -172,9 +168,7 @@ def test_marked_position_is_sent_and_shown_with_its_distance(page: Page, demo: P
     ask = view.locator(".map-ask")
     # Next to the point, not over all of the map, and named as in the header.
     expect(ask).to_contain_text("Plane 1")
-    box, around = ask.bounding_box(), canvas.bounding_box()
-    assert box is not None
-    assert around is not None
+    box, around = box_of(ask), box_of(canvas)
     assert 0 < box["x"] - (around["x"] + 300) < 30
     assert box["width"] < around["width"] / 2
     ask.get_by_text("Mark this position").click()
@@ -203,8 +197,7 @@ def test_simulated_receiver_is_shown_as_simulation(page: Page) -> None:
 def test_recording_is_saved_downloaded_uploaded_played_and_deleted(
     page: Page, tmp_path: Path
 ) -> None:
-    show(page, "recordings")
-    view = page.locator("section[data-view='recordings']")
+    view = show(page, "recordings")
     state = view.locator("[data-role='recorder']")
     expect(state).to_have_text("idle")
     start, stop = view.get_by_label("Start recording"), view.get_by_label("Stop recording")
@@ -226,16 +219,12 @@ def test_recording_is_saved_downloaded_uploaded_played_and_deleted(
     row = view.locator("tr[data-key='morning flight']")
     # One file after another gets the new name.
     expect(row).to_contain_text("2 tables, 1 tlog")
-    with page.expect_download() as waiting:
-        row.get_by_label("Download").click()
-    archive = tmp_path / "flight.zip"
-    waiting.value.save_as(archive)
-    with ZipFile(archive) as packed:
+    with ZipFile(download(page, row.get_by_label("Download"), tmp_path)) as packed:
         names = packed.namelist()
         tlog = next(name for name in names if name.endswith(".tlog"))
         (tmp_path / "evening_01.tlog").write_bytes(packed.read(tlog))
     assert {"morning flight_01_v1.csv", "morning flight_01_v2.csv"} <= set(names)
-    _cut_and_extract(page, row)
+    _cut_and_extract(page, row, tmp_path)
     view.get_by_label("Upload a recording").set_input_files(tmp_path / "evening_01.tlog")
     brought = view.locator("tr[data-key='evening']")
     expect(brought).to_be_visible()
@@ -250,28 +239,24 @@ def test_recording_is_saved_downloaded_uploaded_played_and_deleted(
         expect(page.locator(".asks")).to_have_count(0)
 
 
-def _cut_and_extract(page: Page, row: object) -> None:
-    cut = row.get_by_label("Cut or extract")  # type: ignore[attr-defined]
+def _cut_and_extract(page: Page, row: Locator, folder: Path) -> None:
+    cut, dialog = row.get_by_label("Cut or extract"), page.locator(".asks")
     cut.click()
-    dialog = page.locator(".asks")
     dialog.get_by_label("From").fill("soon")
     dialog.get_by_role("button", name="Cut to a tlog").click()
     expect(page.get_by_text("invalid time 'soon'")).to_be_visible()
-    cut.click()
-    dialog.get_by_label("To").fill("1.5")
-    with page.expect_download(timeout=60_000) as waiting:
-        dialog.get_by_role("button", name="Anonymised tlog").click()
-    assert waiting.value.suggested_filename == "anonymised.tlog"
-    cut.click()
-    dialog.get_by_label("Vehicle").fill("1")
-    with page.expect_download(timeout=60_000) as waiting:
-        dialog.get_by_role("button", name="Parameters").click()
-    assert waiting.value.suggested_filename == "morning flight.param"
+    for label, value, button, name in (
+        ("To", "1.5", "Anonymised tlog", "anonymised.tlog"),
+        ("Vehicle", "1", "Parameters", "morning flight.param"),
+    ):
+        cut.click()
+        dialog.get_by_label(label).fill(value)
+        assert download(page, dialog.get_by_role("button", name=button), folder).name == name
 
 
-def _move_in_time(page: Page, row: object) -> None:
+def _move_in_time(page: Page, row: Locator) -> None:
     view = page.locator(".player")
-    row.get_by_label("Open").click()  # type: ignore[attr-defined]
+    row.get_by_label("Open").click()
     slider = view.get_by_role("slider")
     expect(slider).to_be_visible()
     page.wait_for_function("document.querySelector('.player .time-slider').dataset.points > 5")
@@ -279,8 +264,7 @@ def _move_in_time(page: Page, row: object) -> None:
     expect(slider).to_have_attribute("data-curves", "2")
     flown = "Object.values(mavgate.vehicles).filter((v) => v.origin === 'recorded')"
     page.wait_for_function(f"{flown}.length === 2 && {flown}.every((v) => v.system_id > 200)")
-    page.get_by_label("Aircraft", exact=True).click()
-    page.get_by_role("option", name="Plane 2, recorded").click()
+    choose(page, "Aircraft", "Plane 2, recorded")
     page.wait_for_function("mavgate.state.origin === 'recorded'")
     expect(page.locator(".chips").get_by_text("playback", exact=True)).to_be_visible()
     expect(page.locator(".chips").get_by_text("link", exact=True)).to_have_count(0)
@@ -301,18 +285,14 @@ def _move_in_time(page: Page, row: object) -> None:
     expect(view.get_by_label("Play or pause")).to_have_text("play_arrow")
     length_s = float(slider.get_attribute("aria-valuemax") or 0)
     assert length_s > 2
-    box = slider.bounding_box()
-    assert box is not None
-    slider.click(position={"x": box["width"] * 0.5, "y": 20})
-    middle = range(int(length_s / 2) - 1, int(length_s / 2) + 2)
-    half = re.compile(f"^({'|'.join(map(str, middle))})$")
+    slider.click(position={"x": box_of(slider)["width"] * 0.5, "y": 20})
+    half = re.compile("|".join(f"^{int(length_s / 2) + off}$" for off in (-1, 0, 1)))
     expect(slider).to_have_attribute("aria-valuenow", half)
     for icon in ("pause", "play_arrow"):
         page.keyboard.press("Space")
         expect(view.get_by_label("Play or pause")).to_have_text(icon)
+    choose(page, "Speed", "0.5×")
     speed = view.get_by_label("Speed")
-    speed.click()
-    page.get_by_role("option", name="0.5×").click()
     expect(speed).to_have_value("0.5×")
     view.get_by_text("fused again next to it").click()
     # The table is fused by another process.
@@ -337,10 +317,9 @@ def test_path_has_no_gap_after_another_view_was_shown(page: Page) -> None:
     show(page, "map")
     page.wait_for_function(
         """() => {
-            const map = document.querySelector('[data-view=map] .map').mavgate_map;
-            const lines = Object.values(map._layers).filter((layer) => layer.getLatLngs);
-            const track = mavgate.track(mavgate.selected).points;
-            return lines.some((line) => line.getLatLngs().flat().length >= track.length - 2);
+            const map = document.querySelector('[data-view=map] .map').mavgate_map, lengths = [];
+            map.eachLayer((layer) => lengths.push(layer.getLatLngs?.().flat().length ?? 0));
+            return Math.max(...lengths) >= mavgate.track(mavgate.selected).points.length - 2;
         }"""
     )
     longest = page.evaluate(
@@ -353,8 +332,7 @@ def test_path_has_no_gap_after_another_view_was_shown(page: Page) -> None:
 
 
 def test_flight_view_seeks_back_and_returns_to_the_present(page: Page) -> None:
-    show(page, "flight")
-    view = page.locator("section[data-view='flight']")
+    view = show(page, "flight")
     slider = view.get_by_role("slider", name="Moment of the flight")
     page.wait_for_function("(mavgate.histories[mavgate.selected]?.time_us.length ?? 0) > 20")
     slider.press("ArrowLeft")
@@ -383,11 +361,10 @@ def test_flight_view_seeks_back_and_returns_to_the_present(page: Page) -> None:
 def test_recording_is_not_visible_on_another_page(
     browser: Browser, page: Page, demo: Process
 ) -> None:
-    (demo.log.parent / "recordings").mkdir(exist_ok=True)
     folder = demo.log.parent / "recordings"
+    folder.mkdir(exist_ok=True)
     (folder / "mine_01.tlog").write_bytes(b"".join(encode_record(*f) for f in flight_frames(60)))
-    show(page, "recordings")
-    view = page.locator("section[data-view='recordings']")
+    view = show(page, "recordings")
     view.locator("tr[data-key='mine']").get_by_label("Open").click()
     expect(page.locator(".playback-bar")).to_be_visible(timeout=START_LIMIT_MS)
     other = open_page(browser, demo.link())
@@ -461,12 +438,12 @@ NEXT_FRAME: Final = "() => new Promise((done) => requestAnimationFrame(() => set
 
 def show_filled(page: Page, view: str) -> None:
     """Show a view, and wait until it is filled and drawn."""
-    show(page, view)
+    section = show(page, view)
     if view == "tuning":
         # The rows are alike, and drawing and checking all of them takes seconds.
         page.get_by_label("Search", exact=True).fill("gyroscope")
         expect(page.locator(".parameter").nth(20)).to_have_count(0)
-    page.locator(f"section[data-view='{view}']").locator(VIEWS[view]).first.wait_for()
+    section.locator(VIEWS[view]).first.wait_for()
     page.evaluate(NEXT_FRAME)
 
 

@@ -14,6 +14,7 @@ from tests.panel.browsing import (
     CONFIG_WITHOUT_MAP,
     WAIT_MS,
     Process,
+    choose,
     needs_chromium,
     open_page,
     show,
@@ -141,15 +142,17 @@ def test_altitude_and_climb_are_drawn(page: Page, vehicle: ScriptedVehicle) -> N
 def test_airspeed_is_drawn_unless_it_repeats_the_ground_speed(
     page: Page, vehicle: ScriptedVehicle
 ) -> None:
-    vehicle.airspeed_mps, vehicle.groundspeed_mps = 21.5, 19.3
-    until_drawn(page, "AS  m/s", "21.5", "GS 19.3")
-    vehicle.airspeed_mps = 0.0
-    until_drawn(page, "GS  m/s", "19.3")
-    expect(display_of(page)).to_have_attribute("aria-label", re.compile(r"speed 19.3 m/s"))
-    vehicle.airspeed_mps = 18.2
-    until_drawn(page, "AS  m/s", "18.2", "GS 19.3")
-    vehicle.airspeed_mps = vehicle.groundspeed_mps
-    until_drawn(page, "GS  m/s", "19.3")
+    vehicle.groundspeed_mps = 19.3
+    for airspeed_mps, drawn in (
+        (21.5, ("AS  m/s", "21.5", "GS 19.3")),
+        (0.0, ("GS  m/s", "19.3")),
+        (18.2, ("AS  m/s", "18.2", "GS 19.3")),
+        (19.3, ("GS  m/s", "19.3")),
+    ):
+        vehicle.airspeed_mps = airspeed_mps
+        until_drawn(page, *drawn)
+        spoken = re.compile(f"speed {drawn[1]} m/s")
+        expect(display_of(page)).to_have_attribute("aria-label", spoken)
 
 
 def test_angles_are_spoken_and_sent_exactly(page: Page, vehicle: ScriptedVehicle) -> None:
@@ -170,11 +173,9 @@ def test_model_in_3d_is_that_of_the_vehicle_type(page: Page, vehicle: ScriptedVe
 
 
 def test_hostile_names_and_texts_do_not_run_as_scripts(page: Page, troubles: list[str]) -> None:
-    page.get_by_label("Aircraft", exact=True).click()
-    page.get_by_role("option", name="Plane 2").click()
+    choose(page, "Aircraft", "Plane 2")
     for view in VIEWS:
-        show(page, view)
-        page.locator(f"section[data-view='{view}'] > *").first.wait_for()
+        show(page, view).locator("> *").first.wait_for()
         # Two messages of each kind have come and were drawn.
         page.evaluate("window.begun_us = mavgate.now_us")
         page.wait_for_function("mavgate.now_us > window.begun_us + 4e5")
@@ -202,8 +203,7 @@ def test_hostile_names_and_texts_do_not_run_as_scripts(page: Page, troubles: lis
 def test_parameter_keeps_focus_and_typed_text_when_the_list_grows(
     page: Page, vehicle: ScriptedVehicle
 ) -> None:
-    page.get_by_label("Aircraft", exact=True).click()
-    page.get_by_role("option", name="Plane 2").click()
+    choose(page, "Aircraft", "Plane 2")
     show(page, "tuning")
     field = page.get_by_label("{{q=1}}", exact=True)
     field.fill("7.5")

@@ -18,7 +18,6 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from gateway.estimation.select import ESTIMATORS
 from gateway.live.control_socket import request
-from gateway.panel.logins import hash_password
 from tests.kit.process import wait_for
 from tests.panel.bench_receiver import RATE_HZ, BenchReceiver
 from tests.panel.browsing import (
@@ -28,26 +27,20 @@ from tests.panel.browsing import (
     START_LIMIT_MS,
     WAIT_MS,
     Process,
+    choose,
+    download,
     needs_chromium,
-    open_page,
+    opened,
     show,
 )
+from tests.panel.web_client import OPERATOR, VIEWER
 
-pytestmark = [
-    pytest.mark.io,
-    pytest.mark.slow,
-    needs_chromium,
-]
+pytestmark = [pytest.mark.io, pytest.mark.slow, needs_chromium]
 expect.set_options(timeout=WAIT_MS)
 RATE_OF_THE_SENSOR = "/v1/mavlink/vehicles/1/components/1/messages/HIGHRES_IMU/message/zgyro"
 FIELD_OF_THE_SENSOR = RATE_OF_THE_SENSOR.replace("zgyro", "xmag")
 OFFLINE = (
-    (
-        '{{name = "Street", url = "http://127.0.0.1:9/{{{{z}}}}/{{{{x}}}}/{{{{y}}}}", '
-        'attribution = "Someone"}}'
-    )
-    .replace("{{{{", "{{")
-    .replace("}}}}", "}}")
+    '{{name = "Street", url = "http://127.0.0.1:9/{{z}}/{{x}}/{{y}}", attribution = "Someone"}}'
 )
 """A style whose tiles cannot be fetched."""
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -57,8 +50,8 @@ DESK = CONFIG.partition("map_styles")[0].replace(
 LOCKED = CONFIG.replace(
     "[panel]",
     f"""[panel]
-password = "{hash_password("tower")}"
-viewer_password = "{hash_password("look")}"
+password = "{OPERATOR}"
+viewer_password = "{VIEWER}"
 certificate = "{{folder}}/panel.pem"
 certificate_key = "{{folder}}/panel.key"
 """,
@@ -73,21 +66,13 @@ class Desk:
     gateway: Process
     receiver: BenchReceiver
     page: Page
-    begun_us: float
-    """On the page's clock."""
 
     def view(self, key: str) -> Locator:
-        show(self.page, key)
-        return self.page.locator(f"section[data-view='{key}']")
+        return show(self.page, key)
 
     @property
     def status(self) -> dict[str, Any]:
         return request(self.folder / "mavgate" / "run.sock", "status", timeout_s=WAIT_MS / 1000)
-
-    @property
-    def home(self) -> tuple[float, float]:
-        """As the gateway has it."""
-        return self.home_and_mark["home"]
 
     @property
     def home_and_mark(self) -> dict[str, tuple[float, float]]:
@@ -118,15 +103,11 @@ def desk(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator
     folder, receiver = tmp_path_factory.mktemp("desk"), BenchReceiver()
     receiver.start()
     gateway = start_gateway(folder, receiver, f"enabled = true\nmap_styles = [{OFFLINE}]\n")
-    page = open_page(browser, gateway.link())
-    troubles: list[str] = []
-    page.on("pageerror", lambda error: troubles.append(str(error)))
-    made = Desk(folder, gateway, receiver, page, page.evaluate("mavgate.state.time_us"))
-    yield made
-    page.close()
+    with opened(browser, gateway.link()) as page:
+        made = Desk(folder, gateway, receiver, page)
+        yield made
     made.gateway.end()
     receiver.end()
-    assert troubles == []
 
 
 def test_receiver_on_a_serial_port_is_shown_as_serial(desk: Desk) -> None:
@@ -254,13 +235,10 @@ def test_field_is_plotted_paused_and_exported(desk: Desk, tmp_path: Path) -> Non
     view.get_by_role("button", name="Pause").click()
     expect(chart).to_have_attribute("data-paused", "true")
     points = chart.get_attribute("data-points")
-    saved = []
-    for label in ("Save as CSV", "Save as PNG"):
-        with desk.page.expect_download() as waiting:
-            card.get_by_label(label).click()
-        saved.append(tmp_path / waiting.value.suggested_filename)
-        waiting.value.save_as(saved[-1])
-    table, picture = saved
+    table, picture = (
+        download(desk.page, card.get_by_label(f"Save as {kind}"), tmp_path)
+        for kind in ("CSV", "PNG")
+    )
     head, *rows = csv.reader(table.read_text().splitlines())
     assert any("ATTITUDE.roll" in name for name in head)
     assert len(rows) > 10
@@ -273,13 +251,13 @@ def test_field_is_plotted_paused_and_exported(desk: Desk, tmp_path: Path) -> Non
 def test_home_is_set_by_click_after_confirmation(desk: Desk) -> None:
     view = desk.view("map")
     expect(view.locator(".pin.home")).to_be_visible()
-    before = desk.home
+    before = desk.home_and_mark["home"]
     view.locator(".map-canvas").click(position={"x": 300, "y": 250})
     place = view.locator(".map-ask .title").inner_text()
     view.locator(".map-ask").get_by_role("button", name="Set home here …").click()
     asks = desk.page.locator(".asks")
     expect(asks).to_contain_text(f"to {place}?")
-    assert desk.home == before
+    assert desk.home_and_mark["home"] == before
     # As over a link that answers only after the question has left the page.
     desk.gateway.process.send_signal(signal.SIGSTOP)
     asks.get_by_role("button", name="Set home").click()
@@ -290,7 +268,7 @@ def test_home_is_set_by_click_after_confirmation(desk: Desk) -> None:
     expect(answer).to_be_visible()
     lat_deg, lon_deg = (float(part) for part in place.split(","))
     desk.page.wait_for_function(f"Math.abs(mavgate.state.home.lat_deg - {lat_deg}) < 1e-6")
-    assert desk.home == pytest.approx((lat_deg, lon_deg), abs=1e-6)
+    assert desk.home_and_mark["home"] == pytest.approx((lat_deg, lon_deg), abs=1e-6)
 
 
 def test_map_without_tiles_reports_it_and_shows_coasts_and_towns(desk: Desk) -> None:
@@ -341,8 +319,7 @@ def test_serial_port_is_disconnected_and_connected_again(desk: Desk) -> None:
     expect(state).to_contain_text("disconnected")
     expect(banner).to_be_visible()
     assert not desk.status["report"]["connected"]
-    view.get_by_label("Serial port").click()
-    desk.page.get_by_role("option", name=desk.receiver.port).click()
+    choose(desk.page, "Serial port", desk.receiver.port)
     view.get_by_role("button", name="Connect", exact=True).click()
     expect(state).to_contain_text(f"{desk.receiver.port} is open")
     expect(banner).to_have_count(0)
@@ -399,8 +376,7 @@ def luminance(colour: str) -> float:
 
 def test_selected_units_are_shown(desk: Desk) -> None:
     page, view = desk.page, desk.view("map")
-    page.get_by_label("Units").click()
-    page.get_by_role("option", name="aviation").click()
+    choose(page, "Units", "aviation")
     page.wait_for_function("mavgate.show('speed', 100)[1] === 'kt'")
     expect(view.locator(".key.circle")).to_contain_text("ft")
 
@@ -432,23 +408,21 @@ def write_certificate(certificate: Path, key: Path) -> None:
 def test_viewer_over_tls_cannot_change_anything(desk: Desk, viewers_page: Page) -> None:
     page, before = viewers_page, desk.home_and_mark
     assert page.url.startswith("https://")
-    page.get_by_label("Password").fill("wrong")
-    page.get_by_text("Open the panel").click()
-    expect(page.get_by_role("alert")).to_contain_text("not the password")
-    page.get_by_label("Password").fill("look")
-    page.get_by_text("Open the panel").click()
-    expect(page.locator(".head").get_by_text("viewer")).to_be_visible()
+    for password, seen in (
+        ("wrong", page.get_by_role("alert").get_by_text("not the password")),
+        ("guest", page.locator(".head").get_by_text("viewer")),
+    ):
+        page.get_by_label("Password").fill(password)
+        page.get_by_text("Open the panel").click()
+        expect(seen).to_be_visible()
     page.wait_for_function("mavgate.state && mavgate.state.lat_deg !== null")
-    show(page, "recordings")
-    recorder = page.locator("section[data-view='recordings'] [data-role='recorder']")
-    expect(recorder).to_have_text("idle")
+    expect(show(page, "recordings").locator("[data-role='recorder']")).to_have_text("idle")
     expect(page.get_by_label("Start recording")).to_have_count(0)
-    show(page, "map")
+    view = show(page, "map")
     expect(page.get_by_label("Upload a PMTiles file")).to_have_count(0)
-    page.locator("section[data-view='map'] .map-canvas").click(position={"x": 300, "y": 300})
+    view.locator(".map-canvas").click(position={"x": 300, "y": 300})
     expect(page.get_by_text("Mark this position")).to_have_count(0)
-    show(page, "link")
-    expect(page.locator("section[data-view='link'] [data-role='receiver']")).to_be_visible()
+    expect(show(page, "link").locator("[data-role='receiver']")).to_be_visible()
     expect(page.get_by_label("Serial port")).to_have_count(0)
     # A request that a page hides can be sent all the same.
     for path in ("/recordings/forged", "/maps/forged"):

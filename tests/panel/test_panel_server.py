@@ -4,6 +4,7 @@ import logging
 import os
 import socket
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -31,7 +32,7 @@ def test_panel_of_a_gateway_takes_another_port_if_its_own_is_in_use(
 
 def test_standalone_panel_reports_the_port_in_use(taken: PanelSettings) -> None:
     with pytest.raises(PanelError, match=f"{taken.port}: Address already in use; --port"):
-        panel_server._bound(taken, or_any=False)
+        panel_server.run_panel(taken, Path(), None, None, print, attached=False)
 
 
 def test_log_lines_of_an_attached_panel_have_no_time(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,22 +74,23 @@ async def test_invalid_upload_leaves_no_file(
     assert "unknown file format" in answer.text
 
 
-async def test_upload_under_an_existing_name_is_refused(
-    client: httpx.AsyncClient, folder: Path
+@pytest.mark.parametrize(
+    ("role", "name", "status"),
+    [
+        (Role.OPERATOR, "day", HTTPStatus.BAD_REQUEST),
+        (Role.VIEWER, "other", HTTPStatus.FORBIDDEN),
+    ],
+    ids=["existing name", "viewer"],
+)
+async def test_refused_upload_changes_no_file_and_the_recording_is_served(
+    folder: Path, role: Role, name: str, status: HTTPStatus
 ) -> None:
     (folder / "day_01.tlog").write_bytes(b"first")
-    answer = await client.put("/recordings/day", content=short_tlog())
-    assert answer.status_code == HTTPStatus.BAD_REQUEST
-    assert (folder / "day_01.tlog").read_bytes() == b"first"
-
-
-async def test_viewer_may_download_but_not_upload(folder: Path) -> None:
-    (folder / "day_01.tlog").write_bytes(short_tlog())
-    async with client_of(partial(serve, folder), Role.VIEWER) as viewer:
-        assert (await viewer.get("/recordings/day")).status_code == HTTPStatus.OK
-        answer = await viewer.put("/recordings/other", content=short_tlog())
-    assert answer.status_code == HTTPStatus.FORBIDDEN
-    assert [file.name for file in folder.iterdir()] == ["day_01.tlog"]
+    async with client_of(partial(serve, folder), role) as client:
+        answer = await client.put(f"/recordings/{name}", content=short_tlog())
+        assert answer.status_code == status
+        assert (await client.get("/recordings/day")).status_code == HTTPStatus.OK
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == {"day_01.tlog": b"first"}
 
 
 async def test_mode_of_uploads_follows_the_umask(client: httpx.AsyncClient, folder: Path) -> None:

@@ -21,7 +21,6 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
-from gateway.hub.settings import HubSettings
 from gateway.hub.systems import NO_FILTER
 from gateway.panel.access import COOKIE, AccessControl
 from gateway.panel.logins import Logins
@@ -29,9 +28,8 @@ from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.rest_api import MAX_WAITING_BYTES, RestApi, Subscriber, names_matching
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.uplink import ControlClient, Uplink
-from gateway.records import Incoming
 from gateway.wire.mavlink_json import template
-from tests.kit.mavlink import Sender, outgoing
+from tests.kit.hub import Rig
 from tests.kit.process import START_LIMIT_S as LIMIT_S
 from tests.kit.process import until
 from tests.panel.web_client import OPERATOR, VIEWER
@@ -46,14 +44,13 @@ ATTITUDE = "/v1/mavlink/vehicles/1/components/1/messages/ATTITUDE"
 class World:
     """A vehicle behind a hub, and the panel's server that hears it."""
 
+    rig: Rig
     hub: Hub
-    heard: list[Incoming]
     url: str
     client: httpx.AsyncClient
-    vehicle: Sender
 
     def send(self, message: Any) -> None:
-        self.hub.send(outgoing(self.vehicle.pack(message)))
+        self.rig.publish(self.hub, self.rig.vehicle.pack(message))
 
     def attitude(self, roll: float) -> None:
         self.send(mavlink.MAVLink_attitude_message(5, roll, 0.25, 0, 0, 0, 0))
@@ -72,7 +69,7 @@ class World:
     def messages(self) -> list[Any]:
         """Return the messages that the vehicle has received."""
         link = mavlink.MAVLink(None)
-        return [link.decode(bytearray(incoming.frame)) for incoming in self.heard]
+        return [link.decode(bytearray(incoming.frame)) for incoming in self.rig.incoming]
 
     def commands(self) -> list[Any]:
         return [message for message in self.messages() if message.get_type() == "COMMAND_LONG"]
@@ -84,12 +81,10 @@ class World:
 
 @asynccontextmanager
 async def open_world(folder: Path, settings: PanelSettings) -> AsyncIterator[World]:
-    heard: list[Incoming] = []
-    clock = GatewayClock()
-    hub = Hub(HubSettings(endpoints=("udp-listen:127.0.0.1:0",)), heard.append, clock)
-    hub.start()
-    fleet, control = FleetState(), ControlClient(folder / "none")
-    uplink = Uplink(f"udp:127.0.0.1:{hub.listening_ports()[0]}", fleet, control, clock)
+    rig = Rig()
+    hub = rig.hub("udp-listen:127.0.0.1:0")
+    gateway, control = f"udp:127.0.0.1:{hub.listening_ports()[0]}", ControlClient(folder / "none")
+    uplink = Uplink(gateway, FleetState(), control, GatewayClock())
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url="/docs.json")
     for router in RestApi(uplink).routers():
         app.include_router(router)
@@ -100,14 +95,14 @@ async def open_world(folder: Path, settings: PanelSettings) -> AsyncIterator[Wor
     uplink.start()
     url = f"127.0.0.1:{sock.getsockname()[1]}"
     async with httpx.AsyncClient(base_url=f"http://{url}", timeout=LIMIT_S) as client:
-        world = World(hub, heard, url, client, Sender())
+        world = World(rig, hub, url, client)
         world.send(mavlink.MAVLink_heartbeat_message(1, 0, 81, 0, 4, 3))
         await until(hub.clients, 0.01)
         yield world
     server.should_exit = True
     await serving
     uplink.close()
-    hub.close()
+    rig.close()
 
 
 @pytest.fixture
