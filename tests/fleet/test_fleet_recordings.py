@@ -62,10 +62,11 @@ async def opened(world: World, folder: Path) -> None:
     await world.until(world.systems)
 
 
-async def result_of(world: World, work: "asyncio.Task[Any]") -> Any:
-    """Let all go on while somebody works in a thread."""
-    await world.until(work.done)
-    return work.result()
+async def result_of(world: World, work: Callable[..., Any], *arguments: object) -> Any:
+    """Do some work in a thread while all go on."""
+    task = asyncio.create_task(asyncio.to_thread(work, *arguments))
+    await world.until(task.done)
+    return task.result()
 
 
 class TestOverTheSession:
@@ -75,8 +76,7 @@ class TestOverTheSession:
         await opened(world, folder)
 
         async def run(*words: str) -> Any:
-            task = asyncio.create_task(asyncio.to_thread(invoke, *words))
-            return await result_of(world, task)
+            return await result_of(world, invoke, *words)
 
         listed = await run("fleet", "recordings", "--json")
         assert {each["name"] for each in json.loads(listed.output)["field-a"]} == {"flight", "link"}
@@ -118,7 +118,7 @@ class TestOverTheSession:
         back = threading.Event()
         to = tmp_path / "fetched"
         fetch = RecordingFetch("field-a", to, recorded, wait=wait)
-        task = asyncio.create_task(asyncio.to_thread(fetch.fetch, NAME, SIZE, lambda _: None))
+        fetching = asyncio.create_task(result_of(world, fetch.fetch, NAME, SIZE, lambda _: None))
         await world.until(lambda: len(asked) == 4)
         world.sites.pop("field-a").close()
         await world.until(lambda: not world.fleet.status()["sites"][0]["is_here"])
@@ -126,7 +126,7 @@ class TestOverTheSession:
         await world.until(retried.is_set)
         assert [path.name for path in to.iterdir()] == [f".{NAME}.part"], "nothing looks whole"
         world.open_site("field-a", "&trusted=yes", recordings=folder)
-        assert await result_of(world, task) is True
+        assert await fetching is True
         assert (to / NAME).read_bytes() == CONTENT
         offsets = [offset for verb, offset in asked if verb == "fleet.piece"]
         assert offsets == sorted(offsets)
@@ -147,8 +147,7 @@ class TestOverTheSession:
 
         async def fetch() -> Any:
             one = RecordingFetch("field-a", tmp_path / "fetched", recorded)
-            work = asyncio.to_thread(one.fetch, NAME, SIZE, lambda _: None)
-            return await result_of(world, asyncio.create_task(work))
+            return await result_of(world, one.fetch, NAME, SIZE, lambda _: None)
 
         with pytest.raises(ControlError):
             await fetch()
@@ -165,8 +164,8 @@ class TestOverTheSession:
     ) -> None:
         world.open_site("field-a", recordings=folder)
         await world.until(world.systems)
-        work = asyncio.to_thread(over(world), "fleet.recordings", {"site": "field-a"}, 20.0)
-        assert await result_of(world, asyncio.create_task(work)) == {}
+        asked = ("fleet.recordings", {"site": "field-a"}, 20.0)
+        assert await result_of(world, over(world), *asked) == {}
 
 
 async def listed(answers: dict[str, bytes]) -> Any:
@@ -204,29 +203,24 @@ async def test_recording_with_an_unusual_name_is_left_out(name: str) -> None:
     assert len(found) == (2 if name == "last" else 1)
 
 
-class TestAnswers:
-    @pytest.mark.parametrize(
-        "file", ["../secret_01.tlog", "notes.txt", "link_01.tlog", "/etc/passwd", "a\0_01.tlog"]
-    )
-    def test_file_outside_the_folder_is_refused(self, folder: Path, file: str) -> None:
-        asked = json.dumps({"file": file, "size": 10}).encode()
-        with pytest.raises(RefusedQueryError):
-            RecordingAnswers(folder)(asked)
+def query(**fields: object) -> bytes:
+    return json.dumps({"file": NAME, "size": 10, **fields}).encode()
 
+
+class TestAnswers:
     @pytest.mark.parametrize(
         "asked",
         [
-            b"garbage",
-            b'{"file": 1}',
-            b'{"file": "\xff\xfe"}',
-            b'{"file": "flight_01.tlog", "size": 0}',
-            b'{"file": "flight_01.tlog", "size": 1e99}',
-            b'{"file": "flight_01.tlog", "size": 1, "offset": -1}',
-            b'{"file": "flight_01.tlog", "size": 1, "offset": 9223372036854775807}',
-            json.dumps({"file": NAME, "size": MAX_PIECE + 1}).encode(),
+            *(query(file=name) for name in ("../secret_01.tlog", "notes.txt", "link_01.tlog")),
+            *(query(file=name) for name in ("/etc/passwd", "a\0_01.tlog")),
+            *(b"garbage", b'{"file": 1}', b'{"file": "\xff\xfe"}'),
+            *(query(size=size) for size in (0, 1e99, MAX_PIECE + 1)),
+            *(query(offset=offset) for offset in (-1, (1 << 63) - 1)),
         ],
     )
-    def test_malformed_query_is_refused(self, folder: Path, asked: bytes) -> None:
+    def test_malformed_query_and_file_outside_the_folder_are_refused(
+        self, folder: Path, asked: bytes
+    ) -> None:
         with pytest.raises(RefusedQueryError):
             RecordingAnswers(folder)(asked)
 
@@ -237,9 +231,8 @@ class TestAnswers:
         os.mkfifo(folder / "pipe_01.tlog")
         (folder / "folder_01.tlog").mkdir()
         for name in ("pipe_01.tlog", "folder_01.tlog"):
-            asked = json.dumps({"file": name, "size": 10, "digest": digest}).encode()
             with pytest.raises(RefusedQueryError, match="not a regular file"):
-                RecordingAnswers(folder)(asked)
+                RecordingAnswers(folder)(query(file=name, digest=digest))
         listed = json.loads(RecordingAnswers(folder)(b""))
         sizes = {file["name"]: file["size"] for each in listed for file in each["files"]}
         assert sizes[NAME] == SIZE
@@ -260,30 +253,25 @@ class TestAnswers:
         assert "old00" not in names
 
     def test_query_above_its_limit_is_refused_unread(self) -> None:
-        query, session = MagicMock(), MagicMock()
-        query.payload.__len__.return_value = site_queries.MAX_QUERY + 1
-        session.declare_queryable.return_value.__iter__.return_value = iter([query])
+        asked, session = MagicMock(), MagicMock()
+        asked.payload.__len__.return_value = site_queries.MAX_QUERY + 1
+        session.declare_queryable.return_value.__iter__.return_value = iter([asked])
         site_queries.QueryAnswers(session, "key", lambda _: b"").undeclare()
-        query.reply_err.assert_called_once_with(b"a query has at most 4096 bytes")
-        query.payload.to_bytes.assert_not_called()
+        asked.reply_err.assert_called_once_with(b"a query has at most 4096 bytes")
+        asked.payload.to_bytes.assert_not_called()
 
     def test_piece_and_digest_equal_the_file(self, folder: Path) -> None:
         answer = RecordingAnswers(folder)
-
-        def ask(**fields: object) -> bytes:
-            return answer(json.dumps({"file": NAME, **fields}).encode())
-
-        assert ask(offset=SIZE - 3, size=10) == CONTENT[-3:]
-        assert ask(offset=SIZE, size=10) == b""
+        assert answer(query(offset=SIZE - 3)) == CONTENT[-3:]
+        assert answer(query(offset=SIZE)) == b""
         whole = hashlib.sha256(CONTENT[:1000]).hexdigest().encode()
-        assert ask(size=1000, digest=True) == whole
+        assert answer(query(size=1000, digest=True)) == whole
 
     def test_digest_stops_when_its_query_has_timed_out(self, folder: Path) -> None:
         times_s = iter([0.0, site_queries.DIGEST_TIMEOUT_S + 0.1])
         answer = RecordingAnswers(folder, lambda: next(times_s))
-        asked = json.dumps({"file": NAME, "size": SIZE, "digest": True}).encode()
         with pytest.raises(RefusedQueryError, match="no digest within 300 s"):
-            answer(asked)
+            answer(query(size=SIZE, digest=True))
 
 
 class Site:

@@ -49,6 +49,18 @@ def to_site(there: FrameTranslation, frame: bytes) -> tuple[int, bytes] | None:
     return None if found is None else (found[0], found[1].data)
 
 
+def shown(there: FrameTranslation, frame: bytes) -> Any:
+    """Return the message of the site as the stations here get it."""
+    return read_back(from_site(there, frame) or b"")
+
+
+def sent(there: FrameTranslation, frame: bytes, key: bytes | None = None) -> Any:
+    """Return the message of a station here as the vehicle 1 of the site gets it."""
+    system_id, changed = to_site(there, frame) or (0, b"")
+    assert system_id == 1
+    return read_back(changed, key)
+
+
 def attitude() -> Any:
     return mavlink.MAVLink_attitude_message(5, 0.5, 0, 0, 0, 0, 0.25)
 
@@ -60,15 +72,14 @@ def command(target: int) -> Any:
 @pytest.mark.parametrize("v1", [False, True])
 def test_sender_of_a_frame_from_the_site_is_translated(v1: bool) -> None:
     there = translation()
-    got = read_back(from_site(there, packed(attitude(), 1, v1=v1)) or b"")
+    got = shown(there, packed(attitude(), 1, v1=v1))
     assert (got.get_srcSystem(), got.roll, got.yawspeed) == (2, 0.5, 0.25)
 
 
 @pytest.mark.parametrize("v1", [False, True])
 def test_target_of_a_frame_to_the_site_is_translated(v1: bool) -> None:
-    system_id, frame = to_site(translation(), packed(command(2), 255, v1=v1)) or (0, b"")
-    got = read_back(frame)
-    assert (system_id, got.target_system, got.get_srcSystem()) == (1, 1, 255)
+    got = sent(translation(), packed(command(2), 255, v1=v1))
+    assert (got.target_system, got.get_srcSystem()) == (1, 255)
     assert (got.command, got.param7) == (400, 7)
 
 
@@ -93,10 +104,9 @@ def follow(leader: int, kind: Any) -> Any:
 )
 def test_system_named_in_a_command_is_translated(kind: Any, v1: bool) -> None:
     both = translation()
-    _, frame = to_site(both, packed(follow(2, kind), 255, v1=v1)) or (0, b"")
-    there = read_back(frame)
+    there = sent(both, packed(follow(2, kind), 255, v1=v1))
     assert (there.target_system, there.param1, there.param2, there.param4) == (1, 1, 2, 4)
-    back = read_back(from_site(both, packed(follow(1, kind), 1, v1=v1)) or b"")
+    back = shown(both, packed(follow(1, kind), 1, v1=v1))
     assert (back.get_srcSystem(), back.param1, back.param2) == (2, 2, 2)
 
 
@@ -105,15 +115,14 @@ def test_parameter_that_names_no_vehicle_is_unchanged(value: float) -> None:
     message = mavlink.MAVLink_command_long_message(
         2, 1, mavlink.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE, 0, 2, 2, value, 2, 0, 0, 0
     )
-    _, frame = to_site(translation(), packed(message, 255)) or (0, b"")
-    got = read_back(frame)
+    got = sent(translation(), packed(message, 255))
     assert (got.param1, got.param2, got.param4) == (1, 2, 2)
     assert got.param3 == pytest.approx(value, nan_ok=True)
 
 
 def test_controlling_systems_of_a_gimbal_are_translated() -> None:
     message = mavlink.MAVLink_gimbal_manager_status_message(5, 0, 1, 1, 1, 255, 190)
-    got = read_back(from_site(translation(), packed(message, 1)) or b"")
+    got = shown(translation(), packed(message, 1))
     assert (got.primary_control_sysid, got.secondary_control_sysid) == (2, 255)
     assert (got.primary_control_compid, got.get_srcSystem()) == (1, 2)
 
@@ -130,7 +139,7 @@ def test_controlling_systems_of_a_gimbal_are_translated() -> None:
 def test_target_of_a_frame_from_the_site_is_translated_within_the_site_only(
     message: Any, sender: tuple[int, int], target: int
 ) -> None:
-    got = read_back(from_site(translation(), packed(message, sender[0])) or b"")
+    got = shown(translation(), packed(message, sender[0]))
     assert (got.get_srcSystem(), got.target_system) == (sender[1], target)
 
 
@@ -154,9 +163,7 @@ class TestSigned:
         assert got[-13:-6] == frame[-13:-6]
 
     def test_target_of_a_frame_to_the_site_is_translated(self) -> None:
-        found = to_site(translation(KEY), packed(command(2), 255, key=KEY))
-        assert found is not None
-        assert read_back(found[1], KEY).target_system == 1
+        assert sent(translation(KEY), packed(command(2), 255, key=KEY), KEY).target_system == 1
 
     @pytest.mark.parametrize("offset", [-1, -10, 15])
     def test_forged_frame_is_dropped_and_counted(self, offset: int) -> None:
@@ -196,9 +203,7 @@ def test_command_for_an_id_passed_to_another_site_is_not_sent_to_the_former() ->
     assert to_site(there, packed(command(30), 255)) is not None
     ids.set_by_hand("a", 1, 30)
     assert to_site(there, packed(command(30), 255)) is None
-    found = to_site(FrameTranslation("a", ids), packed(command(30), 255))
-    assert found is not None
-    assert found[0] == 1
+    assert sent(FrameTranslation("a", ids), packed(command(30), 255)).target_system == 1
 
 
 @pytest.mark.parametrize("own_id", [LEFT_OUT, 7])
