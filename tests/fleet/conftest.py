@@ -41,6 +41,12 @@ class World:
     def open_site(self, name: str, options: str = "", **settings: Any) -> Any:
         return self.add_site(name, f"zenoh:{self.locator}?site={name}{options}", **settings)
 
+    async def open(self, *names: str) -> None:
+        """Open sites, and wait until the station has received the aircraft of each."""
+        for name in names:
+            self.open_site(name)
+        await self.until(lambda: len(self.systems()) == len(names))
+
     def add_site(
         self,
         name: str,

@@ -33,9 +33,8 @@ def _polls_often(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def test_two_aircraft_1_get_two_ids_and_a_command_reaches_the_right_one(world: World) -> None:
-    for name in ("field-a", "field-b", "office"):
-        world.open_site(name)
-    await world.until(lambda: len(world.systems()) == 2)
+    world.open_site("office")
+    await world.open("field-a", "field-b")
     ids = world.ids()
     assert set(ids) == {("field-a", 1), ("field-b", 1)}
     assert set(ids.values()) == world.systems() == {1, 2}
@@ -58,8 +57,7 @@ async def test_id_of_an_abandoned_vehicle_is_passed_on(
     world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(fleet_server, "ABANDONED_US", 0)
-    world.open_site("field-a")
-    await world.until(world.systems)
+    await world.open("field-a")
     (own_id,) = world.systems()
     assert world.ids() == {("field-a", 1): own_id}
     assert (
@@ -94,9 +92,7 @@ async def test_abandoned_site_is_removed_when_sites_are_full(
 
 
 async def test_frames_of_one_site_never_reach_another(world: World) -> None:
-    for name in ("field-a", "field-b"):
-        world.open_site(name)
-    await world.until(lambda: len(world.systems()) == 2)
+    await world.open("field-a", "field-b")
     before = {name: hub.clients()[0].received for name, hub in world.sites.items()}
     await world.until(lambda: len(world.got) > 200)
     assert world.vehicles["field-a"].heartbeat() == world.vehicles["field-b"].heartbeat()
@@ -110,9 +106,7 @@ async def test_frames_of_one_site_never_reach_another(world: World) -> None:
 
 
 async def test_disconnected_site_is_reported_once(world: World) -> None:
-    world.open_site("field-a")
-    world.open_site("field-b")
-    await world.until(lambda: len(world.systems()) == 2)
+    await world.open("field-a", "field-b")
     world.sites.pop("field-b").close()
     await world.until(lambda: any(m.get_type() == "STATUSTEXT" for m in world.got))
     for _ in range(20):
@@ -175,8 +169,7 @@ ASSIGNED = {"site": "field-a", "system_id": 1, "own_id": 77}
 
 
 async def test_assigned_id_is_used_shown_and_saved(world: World, settings: FleetSettings) -> None:
-    world.open_site("field-a")
-    await world.until(world.systems)
+    await world.open("field-a")
     assert await world.ask("fleet.id", **ASSIGNED) == ["field-a/1 = 77"]
     await world.until(lambda: 77 in world.systems())
     [site] = (await world.ask("fleet.status"))["sites"]
@@ -247,9 +240,7 @@ def test_fleet_ends_on_sigterm_while_its_router_does_not_answer(tmp_path: Path) 
 @pytest.mark.parametrize("hub_settings", [HubSettings(endpoints=(), ping_interval_s=0.05)])
 async def test_status_shows_round_trip_and_rate(world: World) -> None:
     names = ("field-a", "field-b")
-    for name in names:
-        world.open_site(name)
-    await world.until(lambda: len(world.systems()) == 2)
+    await world.open(*names)
     await world.until(lambda: all(world.shown()[name]["round_trip_s"] for name in names))
     site = world.shown()["field-a"]
     assert 0 < site["round_trip_s"] < 5
@@ -266,8 +257,7 @@ async def test_metrics_contain_sites_and_vehicles(rig: Rig, settings: FleetSetti
     port = free_port()
     hub = HubSettings(endpoints=(), metrics_port=port)
     async with opened_world(rig, settings, hub) as world:
-        world.open_site("field-a")
-        await world.until(world.systems)
+        await world.open("field-a")
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
         text = (await reader.read()).decode()
@@ -320,9 +310,7 @@ async def test_one_session_under_many_names_takes_no_more_ids_than_one_site(
 
 
 async def test_excluded_vehicle_is_not_shown(world: World, settings: FleetSettings) -> None:
-    world.open_site("field-a")
-    world.open_site("field-b")
-    await world.until(lambda: len(world.systems()) == 2)
+    await world.open("field-a", "field-b")
     await run("fleet", "id", "field-a/1", "0")
 
     def one_is_left() -> bool:
