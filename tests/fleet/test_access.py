@@ -104,9 +104,7 @@ async def test_documented_site_is_shown_and_commanded_through_the_documented_fle
     assert caplog.get_records("setup") == [], "no warning at its start"
 
 
-async def test_certificate_of_one_site_gives_no_access_to_another(
-    world: World, documented: Documented
-) -> None:
+async def test_certificate_of_a_site_opens_no_other(world: World, documented: Documented) -> None:
     world.add_site("field-1", documented.site_url)
     options = f"&config={documented.site_file('field-2')}"
     # The certificate of field-2, the name of field-1.

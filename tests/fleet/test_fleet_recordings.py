@@ -97,7 +97,7 @@ class TestOverTheSession:
         none = await run("fleet", "recordings", "get", "field-b", "flight")
         assert (none.exit_code, "does not answer" in none.output) == (2, True)
 
-    async def test_fetch_continues_after_the_site_has_reconnected(
+    async def test_fetch_continues_with_the_site(
         self, world: World, folder: Path, tmp_path: Path
     ) -> None:
         await opened(world, folder)
@@ -132,7 +132,7 @@ class TestOverTheSession:
         assert offsets == sorted(offsets)
         assert offsets.count(0) == 1, "none from the start"
 
-    async def test_stopped_fetch_continues_at_its_offset(
+    async def test_stopped_fetch_continues(
         self, world: World, folder: Path, tmp_path: Path
     ) -> None:
         await opened(world, folder)
@@ -159,9 +159,7 @@ class TestOverTheSession:
         assert min(offset for offset in asked if offset >= 0) == have
         assert (tmp_path / "fetched" / NAME).read_bytes() == CONTENT
 
-    async def test_site_without_trusted_yes_offers_no_recordings(
-        self, world: World, folder: Path
-    ) -> None:
+    async def test_untrusting_site_offers_no_recordings(self, world: World, folder: Path) -> None:
         world.open_site("field-a", recordings=folder)
         await world.until(world.systems)
         asked = ("fleet.recordings", {"site": "field-a"}, 20.0)
@@ -218,16 +216,12 @@ class TestAnswers:
             *(query(offset=offset) for offset in (-1, (1 << 63) - 1)),
         ],
     )
-    def test_malformed_query_and_file_outside_the_folder_are_refused(
-        self, folder: Path, asked: bytes
-    ) -> None:
+    def test_malformed_query_and_foreign_file_are_refused(self, folder: Path, asked: bytes) -> None:
         with pytest.raises(RefusedQueryError):
             RecordingAnswers(folder)(asked)
 
     @pytest.mark.parametrize("digest", [False, True])
-    def test_file_that_is_not_regular_is_refused_without_waiting(
-        self, folder: Path, digest: bool
-    ) -> None:
+    def test_irregular_file_is_refused_without_waiting(self, folder: Path, digest: bool) -> None:
         os.mkfifo(folder / "pipe_01.tlog")
         (folder / "folder_01.tlog").mkdir()
         for name in ("pipe_01.tlog", "folder_01.tlog"):
@@ -238,7 +232,7 @@ class TestAnswers:
         assert sizes[NAME] == SIZE
         assert not sizes.keys() & {"pipe_01.tlog", "folder_01.tlog", "link_01.tlog"}
 
-    def test_list_leaves_out_the_oldest_recordings_beyond_its_limit(
+    def test_list_beyond_its_limit_lacks_the_oldest_recordings(
         self, folder: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         for number in range(20):
@@ -324,9 +318,7 @@ class TestFetch:
         with pytest.raises(FetchError, match="shorter"):
             self.fetch(tmp_path, Site(CONTENT[:100]))
 
-    def test_site_that_never_answers_is_an_error(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_silent_site_is_an_error(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(recording_fetch, "SITE_TIMEOUT_S", -1.0)
         with pytest.raises(FetchError, match="continues from here"):
             self.fetch(tmp_path, lambda *_: {"data": None})

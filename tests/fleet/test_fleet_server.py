@@ -119,9 +119,7 @@ async def test_disconnected_site_is_reported_once(world: World) -> None:
 
 
 @pytest.mark.parametrize("ids", [{"field-a/1": 7}])
-async def test_frames_fed_back_through_a_site_end_after_one_round(
-    rig: Rig, settings: FleetSettings
-) -> None:
+async def test_frames_fed_back_by_a_site_go_round_once(rig: Rig, settings: FleetSettings) -> None:
     port = free_port()
     hub = HubSettings(endpoints=(f"udp:127.0.0.1:{port}",))
     async with opened_world(rig, settings, hub) as world:
@@ -135,9 +133,7 @@ async def test_frames_fed_back_through_a_site_end_after_one_round(
         assert "looped frames dropped" in await run("fleet", "status")
 
 
-async def test_rejected_frames_of_a_site_with_passphrase_are_counted(
-    world: World,
-) -> None:
+async def test_rejected_frames_of_a_site_with_passphrase_are_counted(world: World) -> None:
     hub = world.open_site("field-s")
     world.open_site("field-a")
     vehicle = world.rig.sender(1, signed=True)
@@ -268,7 +264,7 @@ async def test_metrics_contain_sites_and_vehicles(rig: Rig, settings: FleetSetti
     assert "mavgate_hub_forwarded_total" in text
 
 
-async def test_two_sites_of_one_name_are_reported(
+async def test_sites_of_one_name_are_reported(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
     def sessions() -> int:
@@ -285,9 +281,7 @@ async def test_two_sites_of_one_name_are_reported(
     assert world.shown()["field-a"]["is_here"], "the other one is there still"
 
 
-async def test_one_session_under_many_names_takes_no_more_ids_than_one_site(
-    world: World, forger: Any
-) -> None:
+async def test_session_under_many_names_takes_ids_of_one_site(world: World, forger: Any) -> None:
     tokens = [announce(forger, f"field-{n}") for n in range(6)]
 
     def forge(least: int) -> bool:

@@ -211,9 +211,7 @@ async def test_keep_waits_for_the_disk(kept: IdsFile, monkeypatch: pytest.Monkey
     assert on_disk(kept) == {"field-a/1": 77}
 
 
-async def test_failed_write_is_reported_and_retried(
-    kept: IdsFile, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_failed_write_is_reported(kept: IdsFile, caplog: pytest.LogCaptureFixture) -> None:
     kept.ids.set_by_hand("field-a", 1, 77)
     kept.file.mkdir(parents=True)
     assert [await kept.keep() for _ in range(2)] == ["Invalid argument"] * 2

@@ -70,7 +70,7 @@ async def locked() -> AsyncIterator[httpx.AsyncClient]:
         *(("origin", each, HTTPStatus.FORBIDDEN) for each in ("null", "http://127.0.0.1:8080")),
     ],
 )
-async def test_foreign_host_and_foreign_origin_are_refused(
+async def test_foreign_host_and_origin_are_refused(
     name: str, value: str, status: HTTPStatus
 ) -> None:
     async with client_of(guarded(PanelSettings(hosts=("ground.local",)))) as client:
@@ -112,7 +112,7 @@ PASSED_ON = BaseHTTPMiddleware(says_nothing, lambda request, call_next: call_nex
     ],
     ids=["client left", "no answer", "interrupted upload"],
 )
-async def test_disconnect_before_the_answer_is_no_error(
+async def test_early_disconnect_is_no_error(
     app: ASGIApp, method: str, received: str, is_error: bool
 ) -> None:
     async def receive() -> Message:
@@ -142,9 +142,7 @@ ALLOWED = PanelSettings(origins=(FOREIGN,))
         ("/v1/mavlink", "null", False),
     ],
 )
-async def test_page_of_a_listed_origin_may_use_the_api_only(
-    path: str, origin: str, is_allowed: bool
-) -> None:
+async def test_listed_origin_may_use_the_api_only(path: str, origin: str, is_allowed: bool) -> None:
     headers = {"origin": origin, "sec-fetch-site": "cross-site", "sec-fetch-mode": "cors"}
     async with client_of(guarded(ALLOWED)) as client:
         answer = await client.post(path, headers=headers)
@@ -246,9 +244,7 @@ async def test_request_without_a_session_is_refused(locked: httpx.AsyncClient) -
 
 
 @pytest.mark.parametrize(("password", "role"), [("tower", "operator"), ("guest", "viewer")])
-async def test_password_decides_the_role(
-    locked: httpx.AsyncClient, password: str, role: str
-) -> None:
+async def test_password_sets_the_role(locked: httpx.AsyncClient, password: str, role: str) -> None:
     answer = await locked.post("/login", data={"password": password})
     assert answer.status_code == HTTPStatus.SEE_OTHER
     assert "HttpOnly" in answer.headers["set-cookie"]
@@ -308,7 +304,7 @@ async def test_login_body_is_limited(locked: httpx.AsyncClient) -> None:
 
 @pytest.mark.parametrize("path", ["/", "/login", "/logout", "/path/1", "/web/panel.css", "/x"])
 @pytest.mark.parametrize("host", ["192.168.1.7:14590", "evil.example"])
-async def test_every_response_has_the_security_headers(
+async def test_responses_have_security_headers(
     locked: httpx.AsyncClient, path: str, host: str
 ) -> None:
     answer = await locked.get(path, headers={"host": host})
@@ -351,9 +347,7 @@ def test_hash_matches_only_its_password() -> None:
         ({"certificate_key": "panel.key"}, "certificate"),
     ],
 )
-def test_listening_beyond_loopback_needs_password_and_certificate(
-    settings: dict[str, object], missing: str
-) -> None:
+def test_network_needs_password_and_certificate(settings: dict[str, object], missing: str) -> None:
     with pytest.raises(ValueError, match=missing):
         PanelSettings(**settings)
 
@@ -367,9 +361,7 @@ def test_listening_beyond_loopback_needs_password_and_certificate(
         ("here.pem", "", r"here.pem and \S*here.pem must be a certificate and its key"),
     ],
 )
-def test_unusable_certificate_is_named(
-    tmp_path: Path, certificate: str, key: str, message: str
-) -> None:
+def test_bad_certificate_is_named(tmp_path: Path, certificate: str, key: str, message: str) -> None:
     (tmp_path / "here.pem").write_text("junk")
     files = {"certificate": tmp_path / certificate} | (
         {"certificate_key": tmp_path / key} if key else {}
@@ -426,9 +418,7 @@ async def answer_to(guard: AccessControl, path: str, send: Send, *, port: int = 
         *((path, False) for path in ("/", "/web/panel.css")),
     ],
 )
-async def test_large_answers_to_one_client_are_sent_one_after_another(
-    path: str, is_large: bool
-) -> None:
+async def test_large_answers_to_a_client_are_sent_one_by_one(path: str, is_large: bool) -> None:
     running: list[str] = []
     peak: list[int] = []
 
@@ -448,9 +438,7 @@ async def test_large_answers_to_one_client_are_sent_one_after_another(
     assert max(peak) == 3, "others are not waited for"
 
 
-async def test_client_that_takes_no_piece_of_an_answer_is_disconnected(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_client_that_takes_no_answer_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(access, "WRITE_S", 0.01)
     stuck: list[object] = []
     sizes: list[int] = []

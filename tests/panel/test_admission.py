@@ -43,7 +43,7 @@ VIEWERS = [holder(VIEWER, str(n), str(n)) for n in range(5)]
     ],
     ids=["own session", "own address", "address with most", "role", "another role", "no session"],
 )
-def test_newcomer_takes_a_place_of_its_own_kind_only(
+def test_newcomer_takes_a_place_of_its_kind(
     before: list[Holder], newcomer: Holder, evicted: list[int]
 ) -> None:
     gone: list[int] = []
@@ -67,7 +67,7 @@ def test_many_logins_of_viewers_log_no_operator_out() -> None:
     assert len(ended) == len(set(ended)) == 200 - SESSIONS_OF_ROLE
 
 
-async def test_wrong_passwords_of_many_networks_delay_a_login_by_one_of_each(
+async def test_wrong_passwords_of_many_networks_delay_a_login_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     checked: list[str] = []

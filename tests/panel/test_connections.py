@@ -61,9 +61,7 @@ def is_shut(sock: socket.socket) -> bool:
         return False
 
 
-def test_connection_for_which_there_is_no_place_is_closed(
-    make: Callable[[], socket.socket],
-) -> None:
+def test_connection_without_a_place_is_closed(make: Callable[[], socket.socket]) -> None:
     limits = ConnectionLimits()
     known, first = make(), make()
     log_in(limits, known, Role.VIEWER)
@@ -75,9 +73,7 @@ def test_connection_for_which_there_is_no_place_is_closed(
     assert limits.refused == 1
 
 
-def test_connections_of_one_viewer_leave_places_for_everybody(
-    make: Callable[[], socket.socket],
-) -> None:
+def test_connections_of_a_viewer_leave_places_for_all(make: Callable[[], socket.socket]) -> None:
     limits = ConnectionLimits()
     operator, viewers = make(), [make() for _ in range(300)]
     log_in(limits, operator, Role.OPERATOR, "10.0.0.2")
@@ -156,9 +152,7 @@ async def test_idle_connections_do_not_block_a_user() -> None:
 @pytest.mark.parametrize(
     "sent", [b"", b"GET / HT", REQUEST[:-2] % b"", (REQUEST % b"") + b"GET /sec"]
 )
-async def test_connection_with_an_incomplete_header_is_closed(
-    sent: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_incomplete_header_is_closed(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "HEADER_S", 0.2)
     async with connected() as (reader, writer):
         writer.write(sent)

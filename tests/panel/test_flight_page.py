@@ -146,9 +146,7 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @needs_chromium
 @pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1920, "dark")])
-def test_page_opens_offline_and_moves(
-    browser: Browser, page_file: Path, width: int, scheme: Any
-) -> None:
+def test_page_works_offline(browser: Browser, page_file: Path, width: int, scheme: Any) -> None:
     context = browser.new_context(
         viewport={"width": width, "height": 600}, color_scheme=scheme, offline=True
     )

@@ -69,7 +69,7 @@ async def test_extracted_area_is_a_map_style(world: Path, tmp_path: Path) -> Non
     assert await MapTiles(settings).tile(0, 5, 0, 0) is None
 
 
-def test_area_of_too_many_tiles_is_refused(
+def test_too_large_area_is_refused(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(map_area, "MAX_TILES", 20)

@@ -100,7 +100,7 @@ def tiles_in(folder: Path, *urls: str) -> MapTiles:
     return MapTiles(PanelSettings(tiles_folder=str(folder), map_styles=styles))
 
 
-async def test_fetched_tile_is_cached_and_shown_outdated_while_the_server_has_none(
+async def test_tile_is_cached_and_used_while_the_server_has_none(
     tmp_path: Path, owner: Owner
 ) -> None:
     owner.answers["/3/1/2.png"] = [picture()]
@@ -114,9 +114,7 @@ async def test_fetched_tile_is_cached_and_shown_outdated_while_the_server_has_no
     assert owner.asked == ["/3/1/2.png"] * 2
 
 
-async def test_tile_that_is_no_picture_or_endless_is_not_cached(
-    tmp_path: Path, owner: Owner
-) -> None:
+async def test_tile_that_is_no_picture_or_endless_is_dropped(tmp_path: Path, owner: Owner) -> None:
     sent = 0
 
     def endless() -> Iterator[bytes]:
@@ -139,7 +137,7 @@ async def test_unreachable_server_gives_no_tile(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("tile", [(0, 0, 1), (0, -1, 0), (3, 8, 0), (25, 0, 0), (-1, 0, 0)])
-async def test_tiles_beyond_the_world_are_not_requested(
+async def test_outer_tiles_are_not_asked(
     tmp_path: Path, owner: Owner, tile: tuple[int, int, int]
 ) -> None:
     tiles = tiles_in(tmp_path, owner.url)

@@ -93,7 +93,7 @@ def test_forged_ids_are_dropped_before_entries_that_are_updated(
     assert book.dropped >= 5
 
 
-async def test_tree_is_encoded_in_pieces_as_it_is_in_one(
+async def test_pieces_of_a_tree_are_as_one(
     book: MessageBook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for number in range(20):

@@ -194,9 +194,7 @@ def test_simulated_receiver_is_shown_as_simulation(page: Page) -> None:
     expect(page.locator(".chips").get_by_text("simulation")).to_be_visible()
 
 
-def test_recording_is_saved_downloaded_uploaded_played_and_deleted(
-    page: Page, tmp_path: Path
-) -> None:
+def test_recording_is_saved_loaded_cut_played_and_deleted(page: Page, tmp_path: Path) -> None:
     view = show(page, "recordings")
     state = view.locator("[data-role='recorder']")
     expect(state).to_have_text("idle")
@@ -358,9 +356,7 @@ def test_flight_view_seeks_back_and_returns_to_the_present(page: Page) -> None:
     page.wait_for_function(f"mavgate.state.time_us > {past_us} + 6e6")
 
 
-def test_recording_is_not_visible_on_another_page(
-    browser: Browser, page: Page, demo: Process
-) -> None:
+def test_recording_is_hidden_on_another_page(browser: Browser, page: Page, demo: Process) -> None:
     folder = demo.log.parent / "recordings"
     folder.mkdir(exist_ok=True)
     (folder / "mine_01.tlog").write_bytes(b"".join(encode_record(*f) for f in flight_frames(60)))

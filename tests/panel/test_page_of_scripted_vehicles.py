@@ -139,7 +139,7 @@ def test_altitude_and_climb_are_drawn(page: Page, vehicle: ScriptedVehicle) -> N
     )
 
 
-def test_airspeed_is_drawn_unless_it_repeats_the_ground_speed(
+def test_airspeed_is_drawn_unless_it_is_the_ground_speed(
     page: Page, vehicle: ScriptedVehicle
 ) -> None:
     vehicle.groundspeed_mps = 19.3
@@ -200,7 +200,7 @@ def test_hostile_names_and_texts_do_not_run_as_scripts(page: Page, troubles: lis
     assert troubles == []
 
 
-def test_parameter_keeps_focus_and_typed_text_when_the_list_grows(
+def test_parameter_keeps_focus_and_text_as_the_list_grows(
     page: Page, vehicle: ScriptedVehicle
 ) -> None:
     choose(page, "Aircraft", "Plane 2")

@@ -350,9 +350,7 @@ def test_number_keys_select_a_view_with_a_button_focused(desk: Desk) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_of_filled_buttons_has_enough_contrast(
-    desk: Desk, scheme: Literal["light", "dark"]
-) -> None:
+def test_text_of_buttons_has_enough_contrast(desk: Desk, scheme: Literal["light", "dark"]) -> None:
     desk.page.emulate_media(color_scheme=scheme)
     expect(desk.page.locator("body")).to_have_class(re.compile(f"body--{scheme}"))
     filled = desk.view("plots").locator(".q-btn.bg-primary, .q-btn[aria-pressed=true]")

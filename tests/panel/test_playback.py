@@ -108,9 +108,7 @@ async def test_answer_after_closing_is_ignored(playback: Playback, player: Playe
     assert playback.status is None
 
 
-async def test_opening_waits_for_a_player_that_refuses_at_first(
-    player: Player, tmp_path: Path
-) -> None:
+async def test_opening_waits_for_a_late_player(player: Player, tmp_path: Path) -> None:
     """A socket is in its folder before its process listens to it."""
     player.refusals = 3
     playback = await opened(tmp_path, FleetState(), "page")
@@ -119,9 +117,7 @@ async def test_opening_waits_for_a_player_that_refuses_at_first(
     assert (playback.status, player.returncode) == (None, -15)
 
 
-async def test_recording_is_visible_only_on_the_page_that_opened_it(
-    player: Player, tmp_path: Path
-) -> None:
+async def test_recording_is_visible_only_on_its_page(player: Player, tmp_path: Path) -> None:
     fleet = FleetState()
     playback = await opened(tmp_path, fleet, "mine")
     [first] = playback.aircraft

@@ -50,7 +50,7 @@ async def test_direction_is_returned(fleet: FleetState, station: str) -> None:
         ("x", 0, 422),
     ],
 )
-async def test_direction_that_is_not_known_is_refused(
+async def test_unknown_direction_is_refused(
     fleet: FleetState, path: str, age_s: int, status: int
 ) -> None:
     answer = await get(fleet, f"/v1/pointing/{path}", (1 + age_s) * US_PER_S)

@@ -63,9 +63,7 @@ async def test_post_with_the_token_becomes_one_line_of_the_source(gateway: Gatew
 @pytest.mark.parametrize(
     ("path", "status"), [("/push/wrong", 404), ("/push/", 404), ("/push/right/x", 404), ("/", 303)]
 )
-async def test_post_without_the_token_is_refused_and_counted(
-    gateway: Gateway, path: str, status: int
-) -> None:
+async def test_wrong_token_is_refused_and_counted(gateway: Gateway, path: str, status: int) -> None:
     assert (await gateway.phone.post(path, content=b"x" * 9)).status_code == status
     assert gateway.lines == []
     assert gateway.source.report().faults == ((("token", 1),) if path == "/push/wrong" else ())

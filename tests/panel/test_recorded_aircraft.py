@@ -41,9 +41,7 @@ def test_heights_of_each_aircraft_in_a_tlog_are_read(tmp_path: Path) -> None:
     assert second.profile.alt_amsl_m == (300.0,) * 5
 
 
-def test_heights_of_a_table_are_those_of_its_states(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
+def test_heights_of_a_table_are_of_its_states(tmp_path: Path, rng: np.random.Generator) -> None:
     header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 10))[0])
     header = replace(header, vehicle_id=7)
     table = tmp_path / "a_01_v1.csv"

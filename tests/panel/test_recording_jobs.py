@@ -39,9 +39,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "begin"), [("gpx", b"<?xml"), ("page", b"<!doctype html>")])
-async def test_export_is_fetched_under_an_unguessable_address(
-    exported: Path, kind: str, begin: bytes
-) -> None:
+async def test_export_has_an_unguessable_address(exported: Path, kind: str, begin: bytes) -> None:
     jobs = RecordingJobs()
     async with client_of(jobs.serve) as client:
         url = await jobs.export(Order(exported, NAME, kind))
@@ -172,7 +170,7 @@ async def test_exports_of_a_viewer_keep_no_operator_waiting(exported: Path, make
     jobs.close()
 
 
-async def test_equal_export_is_made_once_and_deleted_after_the_last_fetch(
+async def test_equal_export_is_made_once_and_deleted(
     exported: Path, maker: Maker, temporary: Path
 ) -> None:
     temporary.mkdir()

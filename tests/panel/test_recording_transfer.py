@@ -38,9 +38,7 @@ async def client(folder: Path) -> AsyncIterator[httpx.AsyncClient]:
         yield opened
 
 
-async def test_uploaded_recording_can_be_downloaded(
-    client: httpx.AsyncClient, folder: Path
-) -> None:
+async def test_uploaded_recording_is_downloaded(client: httpx.AsyncClient, folder: Path) -> None:
     answer = await client.put("/recordings/day one", content=short_tlog())
     assert answer.status_code == HTTPStatus.CREATED
     assert (folder / "day one_01.tlog").read_bytes() == short_tlog()
@@ -53,9 +51,7 @@ async def test_uploaded_recording_can_be_downloaded(
 @pytest.mark.parametrize(
     "name", ["../secret", "..%2Fsecret", "%2e%2e/secret", "/etc/passwd", "%2Fetc%2Fpasswd", ".."]
 )
-async def test_name_outside_the_folder_is_refused(
-    client: httpx.AsyncClient, folder: Path, name: str
-) -> None:
+async def test_outside_name_is_refused(client: httpx.AsyncClient, folder: Path, name: str) -> None:
     before = sorted(folder.parent.rglob("*"))
     assert (await client.get(f"/recordings/{name}")).status_code >= HTTPStatus.BAD_REQUEST
     answer = await client.put(f"/recordings/{name}", content=short_tlog())
@@ -66,7 +62,7 @@ async def test_name_outside_the_folder_is_refused(
 @pytest.mark.parametrize(
     "content", [b"", b"a text\n", b"a,b,c\n1,2,3\n", bytes(range(256)) * 40, short_tlog()[:12]]
 )
-async def test_invalid_upload_leaves_no_file(
+async def test_bad_upload_is_deleted(
     client: httpx.AsyncClient, folder: Path, content: bytes
 ) -> None:
     answer = await client.put("/recordings/upload", content=content)

@@ -240,9 +240,7 @@ class TestWriting:
         assert "x" not in answer.headers
 
     @pytest.mark.parametrize("prefix", ["", "/v1", "/mavlink2rest", "/mavlink2rest/v1"])
-    async def test_every_prefix_serves_reading_and_a_command_without_target(
-        self, world: World, prefix: str
-    ) -> None:
+    async def test_prefix_serves_reading_and_commands(self, world: World, prefix: str) -> None:
         await world.until_attitude(0.5)
         path = ATTITUDE.removeprefix("/v1")
         answer = await world.client.get(f"{prefix}{path}/message/roll")
@@ -363,9 +361,7 @@ class TestFollowing:
 
 
 class TestGuards:
-    async def test_only_operators_may_send_and_logout_ends_a_websocket(
-        self, tmp_path: Path
-    ) -> None:
+    async def test_only_operators_may_send_until_they_log_out(self, tmp_path: Path) -> None:
         settings = PanelSettings(password=OPERATOR, viewer_password=VIEWER)
         async with open_world(tmp_path, settings) as world:
             client = world.client

@@ -115,9 +115,7 @@ def test_typed_value_is_not_overwritten_by_its_own_answer() -> None:
     assert row.field.value == 0.5
 
 
-def test_picture_has_a_longer_timeout_than_other_answers(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_picture_has_a_longer_timeout_than_other_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     limits_s: list[float] = []
     answers = {"range": [1.0, 2.0], "picture": "data:"}
 

@@ -176,9 +176,7 @@ def test_metadata_describes_every_parameter(lose_every: int) -> None:
     assert not files.busy
 
 
-def test_metadata_that_describes_no_parameter_is_parsed_once(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_metadata_without_parameters_is_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """It would be parsed again with each message, which takes long for a large one."""
     parsed: list[bytes] = []
 
