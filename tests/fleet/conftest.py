@@ -7,8 +7,8 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.fleet.server import FleetServer
@@ -143,9 +143,7 @@ async def opened_world(
     """Run a fleet with one ground station; sites reach it at its router, or at another address."""
     station = rig.station(free_port())
     listener = "udp-listen:{}:{}".format(*station.target or ())
-    fleet = FleetServer(
-        settings, msgspec.structs.replace(hub, endpoints=(*hub.endpoints, listener))
-    )
+    fleet = FleetServer(settings, replace(hub, endpoints=(*hub.endpoints, listener)))
     await fleet.start()
     async with asyncio.timeout(START_LIMIT_S):
         while not fleet.status()["is_linked"]:

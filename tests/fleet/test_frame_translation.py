@@ -271,8 +271,7 @@ def test_recorded_frame_is_rejected_at_any_later_time(site: WindowVerifier, age_
 
 
 @pytest.mark.parametrize(
-    ("age_ticks", "rejection"),
-    [(MINUTE_TICKS, ""), (MINUTE_TICKS + 1, "replayed"), (-(10**9), "")],
+    ("age_ticks", "rejection"), [(MINUTE_TICKS, ""), (MINUTE_TICKS + 1, "replayed"), (-(10**9), "")]
 )
 def test_older_beginning_of_a_stream_is_rejected(
     site: WindowVerifier, age_ticks: int, rejection: str

@@ -24,9 +24,8 @@ async def test_router_outage_loses_old_frames_and_recovers(world: World, router:
     local.send(local.sender.heartbeat())
     await world.until(lambda: bool(world.systems()))
     router.kill()
-    await world.until(
-        lambda: not world.fleet.status()["is_linked"] and site.clients()[0].state == "connecting"
-    )
+    await world.until(lambda: not world.fleet.status()["is_linked"])
+    await world.until(lambda: site.clients()[0].state == "connecting")
     # What was on its way when the link broke comes before anything else does.
     await world.until(lambda: site.clients()[0].dropped > 20)
     before = len(world.got)

@@ -72,9 +72,8 @@ async def test_insecure_fleet_warns_at_every_start(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     # No other machine can reach it, but it is not written as an address of loopback.
-    settings = FleetSettings(
-        listen=f"tcp/127.1:{free_port()}", insecure=True, ids_file=str(tmp_path / "ids.json")
-    )
+    listen, file = f"tcp/127.1:{free_port()}", str(tmp_path / "ids.json")
+    settings = FleetSettings(listen=listen, insecure=True, ids_file=file)
     for _ in range(2):
         fleet = FleetServer(settings, HubSettings(endpoints=()))
         caplog.clear()

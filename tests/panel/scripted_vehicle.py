@@ -39,9 +39,7 @@ class ScriptedVehicle(threading.Thread):
             while not self._ended.wait(1 / RATE_HZ):
                 frames = [message.pack(own) for message in self._messages()]
                 if turn % HOSTILE_EVERY == 0:
-                    frames += [
-                        message.pack(hostile) for message in hostile_messages(self.hostile_names)
-                    ]
+                    frames += [m.pack(hostile) for m in hostile_messages(self.hostile_names)]
                 turn += 1
                 for frame in frames:
                     with contextlib.suppress(ConnectionRefusedError):

@@ -277,9 +277,8 @@ async def test_parallel_logins_of_an_address_are_limited_and_hashed_one_at_a_tim
         return False
 
     monkeypatch.setattr(logins, "matches", slow)
-    answers = await asyncio.gather(
-        *(locked.post("/login", data={"password": f"guess {n}"}) for n in range(100))
-    )
+    posts = [locked.post("/login", data={"password": f"guess {n}"}) for n in range(100)]
+    answers = await asyncio.gather(*posts)
     assert Counter(answer.status_code for answer in answers) == {
         HTTPStatus.UNAUTHORIZED: MAX_ATTEMPTS,
         HTTPStatus.TOO_MANY_REQUESTS: 100 - MAX_ATTEMPTS,
@@ -363,9 +362,8 @@ def test_network_needs_password_and_certificate(settings: dict[str, object], mis
 )
 def test_bad_certificate_is_named(tmp_path: Path, certificate: str, key: str, message: str) -> None:
     (tmp_path / "here.pem").write_text("junk")
-    files = {"certificate": tmp_path / certificate} | (
-        {"certificate_key": tmp_path / key} if key else {}
-    )
+    files = {"certificate": tmp_path / certificate}
+    files |= {"certificate_key": tmp_path / key} if key else {}
     with pytest.raises(PanelError, match=message):
         tls_files(PanelSettings(**{name: str(file) for name, file in files.items()}))
 

@@ -42,9 +42,7 @@ def flight_of(folder: Path, records: Iterable[tuple[int, bytes]]) -> PageFlight:
 def flight_with(folder: Path, messages: list[tuple[float, Any]]) -> PageFlight:
     """Return the flight of messages with their times in s."""
     link = mavlink.MAVLink(None, 3, 1)
-    return flight_of(
-        folder, ((BEGIN_US + round(s * 1e6), bytes(m.pack(link))) for s, m in messages)
-    )
+    return flight_of(folder, ((BEGIN_US + round(s * 1e6), m.pack(link)) for s, m in messages))
 
 
 def unpacked(page: str, name: str) -> Any:
@@ -68,9 +66,7 @@ def test_page_contains_the_states_and_texts_of_a_flight(tmp_path: Path) -> None:
 
 
 def located(lat: int, boot_ms: int = 0) -> Any:
-    return mavlink.MAVLink_global_position_int_message(
-        boot_ms, lat, lat // 5, 430_000, 0, 0, 0, 0, 0
-    )
+    return mavlink.MAVLink_global_position_int_message(boot_ms, lat, lat // 5, 430_000, *[0] * 5)
 
 
 def test_page_leaves_out_positions_before_the_fix_and_joins_texts(tmp_path: Path) -> None:

@@ -266,9 +266,8 @@ def _move_in_time(page: Page, row: Locator) -> None:
     page.wait_for_function("mavgate.state.origin === 'recorded'")
     expect(page.locator(".chips").get_by_text("playback", exact=True)).to_be_visible()
     expect(page.locator(".chips").get_by_text("link", exact=True)).to_have_count(0)
-    expect(page.locator(".playback-bar")).to_contain_text(
-        re.compile(r"PLAYBACK \d+:\d\d of \d+:\d\d")
-    )
+    playing = re.compile(r"PLAYBACK \d+:\d\d of \d+:\d\d")
+    expect(page.locator(".playback-bar")).to_contain_text(playing)
     # Nothing of the live recorder and of the live flight is offered meanwhile.
     expect(page.locator(".recorder >> visible=true")).to_have_count(0)
     for key in ("map", "flight"):
@@ -276,9 +275,7 @@ def _move_in_time(page: Page, row: Locator) -> None:
         expect(slider).to_be_visible()
     expect(page.get_by_role("button", name=re.compile("Back to live"))).to_be_visible()
     expect(page.get_by_title("Show the present")).to_be_hidden()
-    expect(page.locator("section[data-view='map'] [data-role=path]")).to_have_text(
-        ["fused", "recorded"]
-    )
+    expect(page.locator("[data-view='map'] [data-role=path]")).to_have_text(["fused", "recorded"])
     view.get_by_label("Play or pause").click()
     expect(view.get_by_label("Play or pause")).to_have_text("play_arrow")
     length_s = float(slider.get_attribute("aria-valuemax") or 0)

@@ -182,9 +182,7 @@ def test_hostile_names_and_texts_do_not_run_as_scripts(page: Page, troubles: lis
         assert page.evaluate("typeof q") == "undefined"
     show(page, "tuning")
     names = page.locator(".parameter .name")
-    page.wait_for_function(
-        f"document.querySelectorAll('.parameter').length === {len(HOSTILE_NAMES)}"
-    )
+    expect(names).to_have_count(len(HOSTILE_NAMES))
     shown = set(names.all_inner_texts())
     assert {'B :a="q=1"', "<img/onerror=q>", "{{q=1}}"} <= shown
     rows = page.locator(".parameter").evaluate_all("rows => rows.map(row => row.dataset.name)")

@@ -366,9 +366,7 @@ def test_text_of_buttons_has_enough_contrast(desk: Desk, scheme: Literal["light"
 def luminance(colour: str) -> float:
     """Return the relative luminance of `rgb(r, g, b)`, as WCAG 2.2 defines it."""
     parts = [int(part) / 255 for part in re.findall(r"\d+", colour)]
-    red, green, blue = (
-        part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
-    )
+    red, green, blue = (p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts)
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
@@ -398,9 +396,7 @@ def write_certificate(certificate: Path, key: Path) -> None:
     """Make a certificate that vouches for itself."""
     command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"]
     command += ["-nodes", "-days", "1", "-subj", "/CN=127.0.0.1"]
-    subprocess.run(
-        [*command, "-out", str(certificate), "-keyout", str(key)], check=True, capture_output=True
-    )
+    subprocess.run([*command, "-out", certificate, "-keyout", key], check=True, capture_output=True)
 
 
 def test_viewer_over_tls_cannot_change_anything(desk: Desk, viewers_page: Page) -> None:

@@ -39,9 +39,8 @@ class Gateway:
         app = FastAPI()
         app.include_router(push_router(ControlClient(self.control.path)))
         guard = AccessControl(app, settings, Logins(settings.password, ""))
-        self.phone = httpx.AsyncClient(
-            transport=httpx.ASGITransport(app=guard), base_url="http://192.168.1.7:14590"
-        )
+        transport = httpx.ASGITransport(app=guard)
+        self.phone = httpx.AsyncClient(transport=transport, base_url="http://192.168.1.7:14590")
 
 
 @pytest.fixture

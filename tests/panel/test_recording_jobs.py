@@ -175,9 +175,8 @@ async def test_equal_export_is_made_once_and_deleted(
 ) -> None:
     temporary.mkdir()
     jobs = RecordingJobs()
-    first, second = await asyncio.gather(
-        *(jobs.export(Order(exported, NAME, "kml"), VIEWER) for _ in range(2))
-    )
+    order = Order(exported, NAME, "kml")
+    first, second = await asyncio.gather(*(jobs.export(order, VIEWER) for _ in range(2)))
     assert (first, maker.kinds) == (second, ["kml"])
     async with client_of(jobs.serve) as client:
         assert [(await client.get(first)).status_code for _ in range(3)] == [200, 200, 404]

@@ -72,10 +72,7 @@ async def test_bad_upload_is_deleted(
 
 @pytest.mark.parametrize(
     ("role", "name", "status"),
-    [
-        (Role.OPERATOR, "day", HTTPStatus.BAD_REQUEST),
-        (Role.VIEWER, "other", HTTPStatus.FORBIDDEN),
-    ],
+    [(Role.OPERATOR, "day", HTTPStatus.BAD_REQUEST), (Role.VIEWER, "other", HTTPStatus.FORBIDDEN)],
     ids=["existing name", "viewer"],
 )
 async def test_refused_upload_changes_no_file_and_the_recording_is_served(

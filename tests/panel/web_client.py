@@ -27,6 +27,5 @@ def client_of(serve: Callable[[FastAPI], object], role: Role = Role.OPERATOR) ->
         scope[ROLE] = role
         await app(scope, receive, send)
 
-    return httpx.AsyncClient(
-        transport=httpx.ASGITransport(app=with_role), base_url="http://127.0.0.1"
-    )
+    transport = httpx.ASGITransport(app=with_role)
+    return httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1")

@@ -87,9 +87,7 @@ def test_messages_begin_and_end_alerts(name: str) -> None:
         vehicle.update(decoded(message), round(time_s * US_PER_S))
     found = alerts_of(vehicle, round(at_s * US_PER_S))
     assert [(alert.title, alert.detail) for alert in found] == expected
-    assert all(
-        alert.level is AlertLevel.CRITICAL for alert in found if "Sensors" not in alert.title
-    )
+    assert all(each.level is AlertLevel.CRITICAL for each in found if "Sensors" not in each.title)
 
 
 def status(silent_s: float = 0.0, **changed: Any) -> dict[str, Any]:

@@ -40,9 +40,8 @@ def test_array_elements_and_instances_are_separate_fields() -> None:
 def test_number_of_messages_of_an_aircraft_is_bounded() -> None:
     history = FieldHistory()
     for instance in range(MAX_KINDS + 9):
-        history.add(
-            1, mavlink.MAVLink_battery_status_message(instance, *[0] * 3, [0] * 10, *[0] * 4), 0
-        )
+        fields = (instance, *[0] * 3, [0] * 10, *[0] * 4)
+        history.add(1, mavlink.MAVLink_battery_status_message(*fields), 0)
     assert len(history.fields(1)) == MAX_KINDS
 
 

@@ -29,9 +29,8 @@ def test_newest_attitude_of_either_message_is_used(vehicle: VehicleState) -> Non
     q_nb = from_euler(0.3, -0.1, 1.5)
     vehicle.update(decoded(mavlink.MAVLink_attitude_quaternion_message(0, *q_nb, 0.1, 0, 0)), 0)
     assert vehicle.instant(0).q_nb == pytest.approx(q_nb, abs=1e-6)
-    vehicle.update(
-        decoded(mavlink.MAVLink_attitude_message(0, -0.4, 0.2, 0.1, 0, 0, 0)), 2 * US_PER_S
-    )
+    later = mavlink.MAVLink_attitude_message(0, -0.4, 0.2, 0.1, 0, 0, 0)
+    vehicle.update(decoded(later), 2 * US_PER_S)
     now = vehicle.instant(2 * US_PER_S)
     assert now.q_nb == pytest.approx(from_euler(-0.4, 0.2, 0.1), abs=1e-6)
 
