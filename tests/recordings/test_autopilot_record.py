@@ -238,8 +238,7 @@ def test_diff_shows_the_defaults_that_a_log_states(tmp_path: Path) -> None:
 
 
 def test_diff_shows_the_defaults_that_a_ulog_states(tmp_path: Path) -> None:
-    key = b"int32_t MAV_SYS_ID"
-    default = flown.ulog_message(b"Q", bytes([1, len(key)]) + key + struct.pack("<i", 1))
+    default = flown.ulog_message(b"Q", b"\x01" + flown.ulog_parameter("MAV_SYS_ID", 1))
     path, other = flown.write(tmp_path / "a.ulg", px4_log() + default), tmp_path / "other.param"
     other.write_text("MAV_SYS_ID,9\n")
     found = json.loads(run("diff", path, other, "--json"))

@@ -41,12 +41,8 @@ def records() -> tuple[Record, ...]:
             found.append(record)
             continue
         s = chain.imu(record)
-        mag = s.mag_b_ut
-        found.append(
-            ImuCalibrated(
-                s.time_us, record.node, s.accel_b_mps2, s.gyro_b_radps, mag, 20.0, s.flags
-            )
-        )
+        values = (s.accel_b_mps2, s.gyro_b_radps, s.mag_b_ut, 20.0, s.flags)
+        found.append(ImuCalibrated(s.time_us, record.node, *values))
     return tuple(found)
 
 
@@ -106,17 +102,20 @@ FORMATS = {
     "vehicle_global_position": "uint64_t timestamp;double lat;double lon;float alt;float eph;",
     "vehicle_local_position": "uint64_t timestamp;float vx;float vy;float vz;",
 }
-STRUCTS = {"uint64_t": "Q", "uint32_t": "I", "int32_t": "i", "uint8_t": "B", "bool": "?"} | {
-    "float": "f",
+STRUCTS = {
+    "uint64_t": "Q", "uint32_t": "I", "int32_t": "i", "uint8_t": "B", "bool": "?", "float": "f",
     "double": "d",
-}
-
-
+}  # fmt: skip
 SYNC = bytes.fromhex("2f731320250cbb12")
 
 
 def ulog_message(kind: bytes, payload: bytes) -> bytes:
     return struct.pack("<Hc", len(payload), kind) + payload
+
+
+def ulog_parameter(name: str, value: int) -> bytes:
+    key = f"int32_t {name}".encode()
+    return bytes([len(key)]) + key + struct.pack("<i", value)
 
 
 class Ulog:
@@ -135,10 +134,7 @@ class Ulog:
                 form += (count.rstrip("]") or "1") + STRUCTS[kind]
             self.structs[name] = struct.Struct(form)
         for name, value in parameters.items():
-            key = f"int32_t {name}".encode()
-            self.parts.append(
-                ulog_message(b"P", bytes([len(key)]) + key + struct.pack("<i", value))
-            )
+            self.parts.append(ulog_message(b"P", ulog_parameter(name, value)))
         for name, number in self.ids.items():
             self.parts.append(ulog_message(b"A", struct.pack("<BH", 0, number) + name.encode()))
 
@@ -174,10 +170,8 @@ def make_ulog(*, old: bool = False, seconds: float = DURATION_S) -> bytes:
                     position = (r.lat_dege7, r.lon_dege7, *mm)
                 vel = (float(np.hypot(*r.vel_n_mps[:2])), *r.vel_n_mps)
                 acc = (r.speed_acc_mps, np.radians(r.course_acc_deg), r.h_acc_m, r.v_acc_m)
-                end = (0, int(r.fix_type), r.fix_ok, r.satellites)
-                log.add(
-                    "vehicle_gps_position", t, r.utc_us or 0, *position, *acc, 0.8, 1.1, *vel, *end
-                )
+                values = (*position, *acc, 0.8, 1.1, *vel, 0, int(r.fix_type), r.fix_ok)
+                log.add("vehicle_gps_position", t, r.utc_us or 0, *values, r.satellites)
             case Estimated():
                 log.add("vehicle_local_position", t, *r.vel_n_mps)
                 log.add("vehicle_global_position", t, r.lat_deg, r.lon_deg, r.alt_m, 1.0)
@@ -211,11 +205,7 @@ Row = tuple[str, Sequence[float | bytes]]
 
 
 def dataflash_rows(seconds: float = DURATION_S) -> list[Row]:
-    rows: list[Row] = [
-        ("FMT", (number, dataflash_size(form), name.encode(), form.encode(), columns.encode()))
-        for name, (number, form, columns) in DATAFLASH.items()
-    ]
-    rows.append(("PARM", (BOOT_US, b"SYSID_THISMAV", 9.0, 1.0)))
+    rows: list[Row] = [("PARM", (BOOT_US, b"SYSID_THISMAV", 9.0, 1.0))]
     for r in timed(records(), estimated(), seconds=seconds):
         t = BOOT_US + r.time_us
         match r:
@@ -240,9 +230,8 @@ def dataflash_rows(seconds: float = DURATION_S) -> list[Row]:
                 position = (r.lat_dege7 / 1e7, r.lon_dege7 / 1e7, r.alt_amsl_m)
                 motion = (float(np.hypot(north, east)), course, down, 0.0)
                 status = 3 if r.fix_ok else 1
-                rows.append(
-                    ("GPS", (t, 0, status, ms, week, r.satellites, 0.8, *position, *motion, 1))
-                )
+                time = (status, ms, week, r.satellites, 0.8)
+                rows.append(("GPS", (t, 0, *time, *position, *motion, 1)))
                 acc = (r.h_acc_m, r.v_acc_m, r.speed_acc_mps)
                 rows.append(("GPA", (t, 0, 1.1, *acc, 0.0, 1, 0, 200)))
             case Estimated():
@@ -257,8 +246,15 @@ def dataflash_size(form: str) -> int:
     return 3 + struct.calcsize("<" + "".join(CODES[letter] for letter in form))
 
 
+def dataflash_heads(formats: dict[str, Format]) -> list[Row]:
+    return [
+        ("FMT", (number, dataflash_size(form), name.encode(), form.encode(), columns.encode()))
+        for name, (number, form, columns) in formats.items()
+    ]
+
+
 def make_dataflash(seconds: float = DURATION_S) -> bytes:
-    return b"".join(packed(name, values) for name, values in dataflash_rows(seconds))
+    return dataflash_of(DATAFLASH, dataflash_rows(seconds))
 
 
 def packed(
@@ -278,17 +274,14 @@ def packed(
 def dataflash_of(formats: dict[str, Format], rows: Sequence[Row]) -> bytes:
     """Write messages of any formats; each row is a name and its values in the format's units."""
     known = {"FMT": DATAFLASH["FMT"]} | formats
-    heads = [
-        ("FMT", (number, dataflash_size(form), name.encode(), form.encode(), columns.encode()))
-        for name, (number, form, columns) in known.items()
-    ]
+    heads = dataflash_heads(known)
     return b"".join(packed(name, values, known) for name, values in [*heads, *rows])
 
 
 def make_dataflash_text(seconds: float = DURATION_S) -> bytes:
     """As `.log` files have it: a line a message, its values in the units of the columns."""
     lines = []
-    for name, values in dataflash_rows(seconds):
+    for name, values in [*dataflash_heads(DATAFLASH), *dataflash_rows(seconds)]:
         texts = (v.decode() if isinstance(v, bytes) else repr(float(v)) if isinstance(v, float)
                  or v != int(v) else str(int(v)) for v in values)  # fmt: skip
         lines.append(", ".join([name, *texts]))

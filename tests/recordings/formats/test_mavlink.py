@@ -2,7 +2,7 @@
 
 import math
 import random
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -17,6 +17,7 @@ from tests.kit.recordings import START_US, make_tlog, records_sent, senders_of
 
 G = 9.80665
 Message = Any
+Kind = TypeVar("Kind", bound=Imported)
 
 
 def highres(time_us: int, updated: int = 0b111111111) -> Message:
@@ -63,13 +64,16 @@ def read(messages: list[tuple[int, Message]], component_id: int = 1) -> list[Imp
     return [record for record in held if record is not None]
 
 
+def of_kind(kind: type[Kind], messages: list[tuple[int, Message]]) -> list[Kind]:
+    return [record for record in read(messages) if isinstance(record, kind)]
+
+
 def fixes_of(messages: list[tuple[int, Message]]) -> list[GpsFix]:
-    return [r for r in read([(0, raw(0)), *messages]) if isinstance(r, GpsFix)]
+    return of_kind(GpsFix, [(0, raw(0)), *messages])
 
 
 def test_highres_imu_is_read_in_si_units() -> None:
-    (imu,) = read([(0, highres(5_000_000))])
-    assert isinstance(imu, ImuCalibrated)
+    (imu,) = of_kind(ImuCalibrated, [(0, highres(5_000_000))])
     assert imu.time_us == 0
     assert imu.accel_b_mps2 == pytest.approx((0.1, 0.2, -9.8))
     assert imu.gyro_b_radps == pytest.approx((0.01, 0.02, 0.03))
@@ -79,16 +83,14 @@ def test_highres_imu_is_read_in_si_units() -> None:
 
 
 def test_magnetometer_without_a_new_sample_is_left_out() -> None:
-    (imu,) = read([(0, highres(0, updated=0b111111))])
-    assert isinstance(imu, ImuCalibrated)
+    (imu,) = of_kind(ImuCalibrated, [(0, highres(0, updated=0b111111))])
     assert imu.mag_b_ut is None
 
 
 def test_raw_and_scaled_imu_are_read_in_thousandths() -> None:
     scaled = mavlink.MAVLink_scaled_imu_message(20, 10, 20, -1000, 10, 20, 30, 200, 50, -400)
     for message in (raw(20_000), scaled):
-        (imu,) = read([(0, message)])
-        assert isinstance(imu, ImuCalibrated)
+        (imu,) = of_kind(ImuCalibrated, [(0, message)])
         assert imu.accel_b_mps2 == pytest.approx((0.01 * G, 0.02 * G, -G))
         assert imu.gyro_b_radps == pytest.approx((0.01, 0.02, 0.03))
         assert imu.mag_b_ut == pytest.approx((20.0, 5.0, -40.0))
@@ -102,8 +104,7 @@ def test_imu_message_of_highest_resolution_is_used() -> None:
 
 def test_pressure_is_converted_to_pascal() -> None:
     pressure = mavlink.MAVLink_scaled_pressure_message(15, 950.25, 0, 2150)
-    baro = read([(0, raw(10_000)), (5_000, pressure)])[1]
-    assert isinstance(baro, BaroRaw)
+    (baro,) = of_kind(BaroRaw, [(0, raw(10_000)), (5_000, pressure)])
     assert (baro.time_us, baro.pressure_pa, baro.temperature_degc) == (5_000, 95_025.0, 21.5)
 
 
@@ -163,7 +164,7 @@ def test_fix_without_a_time_follows_the_imu_despite_clock_drift() -> None:
         messages.append((at_us * 99 // 100, raw(2_000_000 + at_us)))
         if at_us % 200_000 == 0:
             messages.append((at_us * 99 // 100 + 4_000, gps(0)))
-    fixes = [r.time_us for r in read(messages) if isinstance(r, GpsFix)]
+    fixes = [fix.time_us for fix in of_kind(GpsFix, messages)]
     assert fixes == [*range(4_000, 4_000_000, 200_000)]
 
 
