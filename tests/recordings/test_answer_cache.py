@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -30,6 +31,7 @@ from tests.kit.ground_station import (
     item,
     kinds,
     load_parameters,
+    of_kind,
     request_item,
     upload,
 )
@@ -158,6 +160,8 @@ def test_second_station_gets_parameters_and_missions_without_the_link(link: Cach
     link.first.request(VERSION)
     link.up.clear()
     assert load_parameters(link.second) == values
+    numbers = [message.get_seq() for message in of_kind(link.second.inbox, "PARAM_VALUE")]
+    assert {(after - before) % 256 for before, after in pairwise(numbers)} == {1}
     for kind, sent in items.items():
         assert [content(each) for each in download(link.second, kind)] == [*map(content, sent)]
     assert kinds(link.second.request(VERSION)) == ["COMMAND_ACK", "AUTOPILOT_VERSION"]
