@@ -51,6 +51,11 @@ def records_sent(sent: Sent, step_us: int = STEP_US) -> list[TlogRecord]:
     return records_of((packed(message, *origin) for origin, message in sent), step_us)
 
 
+def with_jump(records: list[TlogRecord], at: int, by_us: int) -> list[TlogRecord]:
+    """Set the clock by some time before the record with a number."""
+    return records[:at] + [TlogRecord(r.time_us + by_us, r.frame) for r in records[at:]]
+
+
 def make_tlog(records: Iterable[TlogRecord]) -> bytes:
     return b"".join(encode_record(record.time_us, record.frame) for record in records)
 

@@ -7,7 +7,7 @@ import pytest
 from gateway.recordings.play import Player, PlayState
 from gateway.recordings.tlog import TlogRecord
 from gateway.wire.mavlink_splitter import origin_of
-from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, make_track
+from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, make_track, with_jump
 
 MANY = 10_000
 RECORDS = make_records(100)
@@ -160,25 +160,18 @@ def test_resume_after_the_end_restarts() -> None:
     assert player.poll(10**9, MANY) == FRAMES[:1]
 
 
-def with_gap(gap_us: int) -> list[TlogRecord]:
-    return [
-        TlogRecord(record.time_us + (gap_us if i >= 50 else 0), record.frame)
-        for i, record in enumerate(RECORDS)
-    ]
-
-
 def test_gaps_are_kept_or_shortened_to_a_maximum() -> None:
     gap_us = 60_000_000
-    kept = play_to_end(make_player(with_gap(gap_us)))
+    kept = play_to_end(make_player(with_jump(RECORDS, 50, gap_us)))
     assert kept[-1][0] == SPAN_US + gap_us
-    cut = play_to_end(make_player(with_gap(gap_us), max_gap_us=1_000_000))
+    cut = play_to_end(make_player(with_jump(RECORDS, 50, gap_us), max_gap_us=1_000_000))
     assert cut[-1][0] == SPAN_US - STEP_US + 1_000_000
     assert [frame for _, frame in cut] == FRAMES
 
 
 @pytest.mark.parametrize("jump_us", [50 * 365 * 86_400_000_000, -3_600_000_000])
 def test_jump_of_the_recorded_clock_is_skipped(jump_us: int) -> None:
-    found = play_to_end(make_player(with_gap(jump_us)))
+    found = play_to_end(make_player(with_jump(RECORDS, 50, jump_us)))
     assert [frame for _, frame in found] == FRAMES
     assert found[-1][0] <= SPAN_US
 

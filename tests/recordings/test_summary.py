@@ -9,7 +9,7 @@ from gateway.recordings.summary import FileInfo, Rate, TableSummary, TlogSummary
 from gateway.recordings.table import TableHeader, TableNote, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from tests.kit.mavlink import packed
-from tests.kit.recordings import SECOND_US, START_US, make_tlog, senders_of
+from tests.kit.recordings import SECOND_US, START_US, make_tlog, senders_of, with_jump
 from tests.recordings.samples import make_baro, make_fused
 
 M_PER_DEG_LAT = 111_132.0
@@ -103,11 +103,7 @@ def test_incomplete_last_line_is_no_damage(
 @pytest.mark.parametrize("years", [56, -30])
 def test_jump_of_the_clock_by_years_does_not_add_to_the_duration(years: int, chunk: int) -> None:
     leap_us = years * 31_556_952 * SECOND_US
-    records = [
-        TlogRecord(record.time_us + (leap_us if number >= 40 else 0), record.frame)
-        for number, record in enumerate(make_flight(101, 1))
-    ]
-    info = sum_up(make_tlog(records), chunk)
+    info = sum_up(make_tlog(with_jump(make_flight(101, 1), 40, leap_us)), chunk)
     assert info.duration_s == 99.0
     assert info.vehicles[0].rates[0].rate_hz == pytest.approx(1.0, abs=0.03)
     assert [gap.duration_s for gap in info.gaps] == ([leap_us / 1e6 + 1.0] if years > 0 else [])

@@ -34,6 +34,7 @@ from tests.kit.recordings import (
     records_of,
     records_sent,
     senders_of,
+    with_jump,
     write_tlog,
 )
 
@@ -155,8 +156,7 @@ def test_sparse_file_keeps_the_records_around_its_hole(tmp_path: Path) -> None:
 
 
 def test_times_run_on_where_the_clock_was_set_back(tmp_path: Path) -> None:
-    back_us = 3600 * SECOND_US
-    stepped = [TlogRecord(r.time_us - back_us * (i >= 100), r.frame) for i, r in enumerate(MIXED)]
+    stepped = with_jump(MIXED, 100, -3600 * SECOND_US)
     kept, text = convert(tmp_path, stepped, "--system", 1)
     assert "jumped back by 3600 s" in text
     times = [record.time_us for record in kept]
@@ -300,7 +300,7 @@ def test_vehicles_of_two_links_are_merged_although_nothing_is_equal(tmp_path: Pa
 
 def test_third_file_is_aligned_by_copies_of_any_other() -> None:
     first, second, whole = two_receivers(5 * SECOND_US)
-    third = [TlogRecord(r.time_us + 2 * SECOND_US, r.frame) for r in second]
+    third = with_jump(second, 0, 2 * SECOND_US)
     alignment = Alignment()
     for records in (first[:50], whole, third):
         alignment.add(batched(records))
