@@ -207,9 +207,7 @@ def test_settings_of_earlier_versions_are_migrated() -> None:
     assert estimation.eskf.gps_position_m == 3.0
 
 
-def test_interpolated_positions_lie_on_the_line_between_the_fixes(
-    rng: np.random.Generator,
-) -> None:
+def test_interpolated_positions_lie_on_the_line_between_the_fixes(rng: np.random.Generator) -> None:
     first, second = make_fix(1_000_000, rng), make_fix(2_000_000, rng)
     first = msgspec.structs.replace(first, lon_dege7=1_799_999_000, alt_amsl_m=10.0)
     second = msgspec.structs.replace(second, lon_dege7=-1_799_999_000, alt_amsl_m=20.0)

@@ -128,10 +128,7 @@ def test_input_is_never_the_output(tmp_path: Path) -> None:
     ids=["zeros at the end", "cut at the end", "garbage before", "garbage within"],
 )
 def test_intact_records_of_a_damaged_file_are_kept_and_the_rest_counted(
-    tmp_path: Path,
-    spoil: Callable[[bytes], bytes],
-    lost: int | None,
-    left_out: int,
+    tmp_path: Path, spoil: Callable[[bytes], bytes], lost: int | None, left_out: int
 ) -> None:
     path = tmp_path / "a.tlog"
     path.write_bytes(spoil(make_tlog(MIXED)))
