@@ -1,12 +1,12 @@
 """A flight for the analysis: its arrays, its sources, its fused tracks."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from gateway.aircraft import AircraftSettings
 from gateway.analysis.case import ESTIMATORS, make_case
 from gateway.analysis.flight import (
     Flight,
@@ -23,16 +23,17 @@ from gateway.analysis.metrics import position_error_m, rms
 from gateway.analysis.reporting.compose import make_report
 from gateway.analysis.simulated import ideal_calibration
 from gateway.analysis.sweep import with_value
-from gateway.estimation.select import make_estimator
 from gateway.geometry.geodesy import displacement_m
+from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.fuse import FusionSettings, with_estimator
 from gateway.recordings.table import block_of
-from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuFlags, ImuRaw, NodeId
+from gateway.records import ImuCalibrated, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.analysis.flights import DURATION_S, short_case, short_flight, true_track, with_imu
+from tests.recordings.flights import record
 from tools.simulated_flight import SimulatedFlight, fly
 
 
@@ -101,29 +102,14 @@ def recorded(*, raw: bool, calibration: NodeCalibration | None = None) -> Flight
     )
 
 
-def rows(*, raw: bool) -> Iterator[TableRow]:
+def rows(*, raw: bool) -> list[TableRow]:
     """Rows as the recorder writes them, with states."""
-    fusion = short_case().fusion
-    chain = SensorChain(ideal_calibration(SIMULATED.errors))
-    estimator = make_estimator(fusion.estimation)
-    for record in SIMULATED.records():
-        match record:
-            case ImuRaw():
-                sample = chain.imu(record)
-                state = estimator.update_imu(sample)
-                calibrated = ImuCalibrated(
-                    sample.time_us, record.node, sample.accel_b_mps2, sample.gyro_b_radps,
-                    sample.mag_b_ut, sample.temperature_degc, sample.flags,
-                )  # fmt: skip
-                yield TableRow(
-                    record.time_us, raw=record if raw else None, imu=calibrated, state=state
-                )
-            case BaroRaw():
-                estimator.update_baro(chain.baro(record))
-                yield TableRow(record.time_us, baro=record)
-            case GpsFix():
-                estimator.update_gps(record)
-                yield TableRow(record.time_us, gps=record)
+    estimation = short_case().fusion.estimation
+    calibration = ideal_calibration(SIMULATED.errors)
+    settings = AircraftSettings(estimation=estimation, calibration=calibration)
+    lines, _ = record(Pipeline(PipelineSettings(settings)), [*SIMULATED.records()])
+    found = [line for line in lines if isinstance(line, TableRow)]
+    return found if raw else [replace(row, raw=None) for row in found]
 
 
 @pytest.mark.parametrize("raw", [True, False])

@@ -1,17 +1,18 @@
 """Flights fused live and recorded, for the tests of recordings."""
 
 import math
+from collections.abc import Mapping
 from functools import cache
 
 import msgspec
 import numpy as np
 
-from gateway.aircraft import AircraftSettings
+from gateway.aircraft import AircraftSettings, SettingsChanged
 from gateway.config import GatewaySettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
-from gateway.recordings.recorded_table import ReadOptions, header_for
+from gateway.recordings.columns import RowBuilder, TableRow
+from gateway.recordings.recorded_table import Line, ReadOptions, header_for
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
 from gateway.records import (
     BaroRaw,
@@ -25,12 +26,16 @@ from gateway.records import (
     RawRecord,
 )
 from gateway.sensing.calibration import NodeCalibration
+from gateway.vehicle.service import SettingsChange
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.kit.records import fix_at
 
 OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 """Files are read and fused with the default settings."""
 IMU_US = 16_000
+Changes = Mapping[int, SettingsChange]
+"""By the number of the record after which they are made."""
+NO_CHANGES: Changes = {}
 CALIBRATION = NodeCalibration(
     accel_bias_mps2=(0.1, -0.2, 1 / 3), gyro_bias_radps=(0.01, 0.02, -0.03)
 )
@@ -81,17 +86,34 @@ def make_fix(time_us: int, rng: np.random.Generator) -> GpsFix:
     )
 
 
-def fly(settings: AircraftSettings, records: list[RawRecord]) -> tuple[bytes, list[NavState]]:
-    """Fuse live, and record as the recorder does."""
-    pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
-    lines, states = [encode_head(header_for(settings, 1))], []
-    for record in records:
-        for action in pipeline.feed_record(record, record.time_us).records:
-            if isinstance(action, FusedSample | BaroRaw | GpsFix):
-                lines += map(row_to_line, rows.add(action))
+def record(
+    pipeline: Pipeline, records: list[RawRecord], changes: Changes = NO_CHANGES
+) -> tuple[list[Line], list[NavState]]:
+    """Fuse live; return the lines that the recorder writes, and the states."""
+    rows = RowBuilder()
+    lines: list[Line] = []
+    states: list[NavState] = []
+    for number, raw in enumerate(records):
+        out = pipeline.feed_record(raw, raw.time_us)
+        if number in changes:
+            pipeline.aircraft[1].perform([changes[number]], raw.time_us, out)
+        for action in out.records:
+            if isinstance(action, SettingsChanged):
+                lines += [*rows.flush(), header_for(pipeline.aircraft[1].settings, 1)]
+            elif isinstance(action, FusedSample | BaroRaw | GpsFix):
+                lines += rows.add(action)
             if isinstance(action, FusedSample):
                 states.append(action.state)
-    return "".join(lines).encode(), states
+    return lines, states
+
+
+def fly(
+    settings: AircraftSettings, records: list[RawRecord], changes: Changes = NO_CHANGES
+) -> tuple[bytes, list[NavState]]:
+    """Fuse live, and record as the recorder does."""
+    lines, states = record(Pipeline(PipelineSettings(settings)), records, changes)
+    head = encode_head(header_for(settings, 1))
+    return (head + "".join(map(encode_line, lines))).encode(), states
 
 
 @cache
@@ -113,19 +135,12 @@ def fly_from_the_middle(
 ) -> tuple[AircraftSettings, FusionState, list[TableRow]]:
     """Return a flight cut in the middle: the stored state there and all later rows."""
     settings = make_settings(estimator)
-    pipeline, builder = Pipeline(PipelineSettings(settings)), RowBuilder()
-    records = make_flight(rng, 30)
-    state: FusionState | None = None
-    rows: list[TableRow] = []
-    for number, record in enumerate(records):
-        if number == len(records) // 2:
-            state = pipeline.aircraft[1].fusion_state
-            builder.flush()
-            rows.clear()
-        for action in pipeline.feed_record(record, record.time_us).records:
-            if isinstance(action, FusedSample | BaroRaw | GpsFix):
-                rows += builder.add(action)
-    assert state is not None
+    pipeline, records = Pipeline(PipelineSettings(settings)), make_flight(rng, 30)
+    half = len(records) // 2
+    for raw in records[:half]:
+        pipeline.feed_record(raw, raw.time_us)
+    state = pipeline.aircraft[1].fusion_state
+    rows = [line for line in record(pipeline, records[half:])[0] if isinstance(line, TableRow)]
     lines = [encode_head(header_for(settings, 1)), *map(encode_line, [state, *rows])]
     found, *again = TableReader().feed("".join(lines).encode(), final=True)
     assert isinstance(found, FusionState)

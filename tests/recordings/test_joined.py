@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from gateway.recordings.columns import COLUMNS
+from gateway.recordings.columns import TableRow
 from gateway.recordings.files import FlightError
 from gateway.recordings.joining import joined_tables
 from gateway.recordings.recorded_table import RecordedTable
-from gateway.recordings.table import TableBlock, TableHeader, TableNote
+from gateway.recordings.table import TableHeader, TableNote, block_of
 
 SECOND_US = 1_000_000
 EPOCH_US = 1_780_000_000 * SECOND_US
@@ -18,22 +18,15 @@ def table(begin_s: int, end_s: int, zero_us: int | None, session: str = "") -> R
 
     They are on a clock of their own, which begins at 0, unless they are part of a session.
     """
-    seconds = np.arange(begin_s, end_s)
     zero_s = 0 if session else begin_s
-    cells = np.full((len(seconds), len(COLUMNS)), np.nan)
-    cells[:, 0] = (seconds - zero_s) * SECOND_US
     if zero_us is not None:
         zero_us += zero_s * SECOND_US
     head = TableHeader(vehicle_id=1, unix_us_at_zero=zero_us, session=session)
-    marks = [
-        (k, TableNote((second - zero_s) * SECOND_US, f"{second}"))
-        for k, second in enumerate(seconds.tolist())
-        if second % 10 == 0
-    ]
-    half = len(seconds) // 2
-    first = TableBlock(cells[:half], tuple((k, m) for k, m in marks if k < half))
-    rest = TableBlock(cells[half:], tuple((k - half, m) for k, m in marks if k >= half))
-    return RecordedTable(head, iter([first, rest]))
+    events: list[TableRow | TableNote] = []
+    for second in range(begin_s, end_s):
+        at_us = (second - zero_s) * SECOND_US
+        events += [TableNote(at_us, str(second))] * (second % 10 == 0) + [TableRow(at_us)]
+    return RecordedTable(head, block_of(events).pieces((end_s - begin_s) // 2))
 
 
 def seconds_of(joined: RecordedTable) -> tuple[list[int], list[int]]:

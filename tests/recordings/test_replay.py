@@ -8,24 +8,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from gateway.aircraft import AircraftSettings, FusedStates, SettingsChanged
+from gateway.aircraft import AircraftSettings, FusedStates
 from gateway.estimation.columns import NAV_ALT, NAV_LAT, NAV_LON, NAV_QUAT, nav_row
 from gateway.estimation.paper import PaperSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.recordings.columns import GPS_CODEC, RowBuilder, TableRow, row_to_line
+from gateway.recordings.columns import GPS_CODEC, TableRow
 from gateway.recordings.fuse import Fusion, interpolated_positions
 from gateway.recordings.recorded_fusion import Replay
 from gateway.recordings.recorded_table import header_for, settings_of
-from gateway.recordings.table import (
-    TableEvent,
-    TableHeader,
-    TableNote,
-    TableReader,
-    block_of,
-    encode_head,
-    encode_line,
-)
-from gateway.records import BaroRaw, FusedSample, GpsFix, NavState
+from gateway.recordings.table import TableEvent, TableHeader, TableNote, TableReader, block_of
+from gateway.records import NavState
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.service import SettingsChange
 from gateway.vehicle.vehicle_settings import VehicleSettings
@@ -60,28 +52,13 @@ def test_table_fused_again_gives_bit_equal_states(rng: np.random.Generator, esti
 
 def test_settings_changed_in_flight_are_changed_in_replay(rng: np.random.Generator) -> None:
     settings = make_settings("paper")
-    pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
-    text, states = encode_head(header_for(settings, 1)), []
     changes = {
         400: SettingsChange("estimation", make_settings("eskf").estimation),
         800: SettingsChange("calibration", NodeCalibration()),
         1200: SettingsChange("vehicle", VehicleSettings()),
     }
-    records = make_flight(rng, 30)
-    for number, record in enumerate(records):
-        out = pipeline.feed_record(record, record.time_us)
-        if number in changes:
-            pipeline.aircraft[1].perform([changes[number]], record.time_us, out)
-        for action in out.records:
-            if isinstance(action, SettingsChanged):
-                text += "".join(map(row_to_line, rows.flush()))
-                text += encode_line(header_for(pipeline.aircraft[1].settings, 1))
-            elif isinstance(action, FusedSample | BaroRaw | GpsFix):
-                text += "".join(map(row_to_line, rows.add(action)))
-            if isinstance(action, FusedSample):
-                states.append(action.state)
-    reader = TableReader()
-    events = reader.feed(text.encode(), final=True)
+    table, states = fly(settings, make_flight(rng, 30), changes)
+    events = TableReader().feed(table, final=True)
     assert sum(isinstance(event, TableHeader) for event in events) == 2
     assert repr(fuse_again(settings, events)) == repr(states)
 
