@@ -127,6 +127,7 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "mission/empty-upload": (count(0, 1), ENDED, STORED | {"mission_type": 1}),
     "mission/older-request": (to_vehicle("MISSION_REQUEST", 2, 0), ENDED, NO_ITEM),
     "mission/clear": (to_vehicle("MISSION_CLEAR_ALL", 255), ENDED, STORED),
+    "mission/clear-no-such-type": (to_vehicle("MISSION_CLEAR_ALL", 7), ENDED, REFUSED),
     "mission/set-current-none": (to_vehicle("MISSION_SET_CURRENT", 4), "STATUSTEXT", {}),
     # ftp.html: an answer to every opcode, with the request's opcode in it.
     "ftp/open": (ftp_request(4, b"/general.json"), FTP, {"opcode": (128, 4)}),
