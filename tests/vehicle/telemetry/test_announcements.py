@@ -18,6 +18,7 @@ from tests.kit.mavlink import packed
 from tests.kit.records import link, report, status
 
 SECOND_US = 1_000_000
+RADIO_REPORTS = RADIO_SPAN_US // SECOND_US
 WELL = status(
     time_us=SECOND_US,
     node_time_us=SECOND_US,
@@ -67,20 +68,44 @@ def flying() -> Flying:
     return Flying()
 
 
-def test_healthy_board_is_not_announced(flying: Flying) -> None:
-    for _ in range(20):
-        flying.report()
-    flying.report(node_time_us=5, bus_errors=0, radio_failed=0)
-    assert flying.reported == [], "a restart is no error"
+REPORTS: dict[str, tuple[list[dict[str, int]], list[tuple[int, int, str]]]] = {
+    # A restart is no error.
+    "healthy": ([{}] * 20 + [{"node_time_us": 5, "bus_errors": 0, "radio_failed": 0}], []),
+    "low supply": (
+        [{"supply_mv": mv} for mv in (3000, 2980, 2960, 3050, 3090, 3000, 2990, *(3100,) * 6)],
+        [(1, WARNING, "supply low, 2.98 V"), (7, INFO, "supply OK again, 3.10 V")],
+    ),
+    # The counter starts again.
+    "bus errors": (
+        [{"bus_errors": n} for n in (65_535, 0, 1, 2)] + [{}] * QUIET_REPORTS,
+        [(0, WARNING, "bus errors, 65535 so far"), (3 + QUIET_REPORTS, INFO, "bus OK again")],
+    ),
+    "failed radio": (
+        [{"radio_failed": n} for n in (50, 109, 110)] + [{}] * RADIO_REPORTS,
+        [
+            (2, WARNING, "radio sends failed, 100 in 10 s"),
+            (1 + RADIO_REPORTS, INFO, "radio OK again"),
+        ],
+    ),
+    **{
+        f"few failed of {hz} Hz": (
+            [{"sample_rate_hz": hz, "radio_failed": 10 + n // 3} for n in range(60)], [],
+        )
+        for hz in (10, 0)
+    },
+}  # fmt: skip
+"""Changes of the reports of a node, and the numbers of those that lead to an announcement."""
 
 
-def test_low_supply_and_its_recovery_are_announced_once(flying: Flying) -> None:
-    for supply_mv in (3000, 2980, 2960, 3050, 3090, 3000, 2990, *(3100,) * 6):
-        flying.report(supply_mv=supply_mv)
-    assert flying.reported == [
-        (WARNING, "IMU node 0: supply low, 2.98 V"),
-        (INFO, "IMU node 0: supply OK again, 3.10 V"),
-    ]
+@pytest.mark.parametrize("name", REPORTS)
+def test_trouble_of_a_node_and_its_end_are_announced_once(flying: Flying, name: str) -> None:
+    reports, expected = REPORTS[name]
+    found = []
+    for number, changes in enumerate(reports):
+        flying.report(**changes)
+        found += [(number, *each) for each in flying.reported]
+        flying.reported.clear()
+    assert found == [(number, kind, f"IMU node 0: {text}") for number, kind, text in expected]
 
 
 def test_supply_without_limit_or_measurement_is_not_announced(flying: Flying) -> None:
@@ -90,37 +115,9 @@ def test_supply_without_limit_or_measurement_is_not_announced(flying: Flying) ->
     assert unlimited.reported == flying.reported == []
 
 
-def test_bus_errors_are_reported_once_even_after_the_counter_restarts(flying: Flying) -> None:
-    for errors in (65_535, 0, 1, 2):
-        flying.report(bus_errors=errors)
-    assert flying.reported == [(WARNING, "IMU node 0: bus errors, 65535 so far")]
-    for _ in range(QUIET_REPORTS):
-        flying.report()
-    assert flying.reported[1:] == [(INFO, "IMU node 0: bus OK again")]
-
-
-def test_failed_radio_sends_and_their_end_are_announced_once(flying: Flying) -> None:
-    flying.report(radio_failed=50)
-    flying.report(radio_failed=109)
-    assert flying.reported == []
-    flying.report(radio_failed=110)
-    assert flying.reported == [(WARNING, "IMU node 0: radio sends failed, 100 in 10 s")]
-    for _ in range(RADIO_SPAN_US // SECOND_US - 1):
-        flying.report()
-    assert flying.reported[1:] == [(INFO, "IMU node 0: radio OK again")]
-
-
-@pytest.mark.parametrize("rate_hz", [10, 0])
-def test_few_failed_radio_sends_are_not_announced(flying: Flying, rate_hz: int) -> None:
-    """Of a slow node, or of one without samples."""
-    for second in range(60):
-        flying.report(sample_rate_hz=rate_hz, radio_failed=10 + second // 3)
-    assert flying.reported == []
-
-
 def test_radio_trouble_within_the_hold_time_is_announced_at_its_end(flying: Flying) -> None:
     flying.report(radio_failed=110)
-    for _ in range(RADIO_SPAN_US // SECOND_US):
+    for _ in range(RADIO_REPORTS):
         flying.report()
     flying.report(radio_failed=250)
     flying.report()
