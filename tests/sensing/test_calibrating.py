@@ -116,6 +116,8 @@ def test_nose_that_was_not_raised_is_refused() -> None:
         (SIDES + np.array([0.0, 2.1, 0.0]), "bias 2.10 m/s2"),
         (1.2 * SIDES, "scale error"),
         (SIDES * [[0.93], [1.0], [1.0], [1.0], [1.0], [1.0]] - [[0], [3], [0], [0], [0], [0]], ""),
+        # Two forces on every side.
+        (np.vstack([SIDES, 1.15 * SIDES]), "residual 0.68 m/s2"),
     ],
 )
 def test_implausible_accelerometer_error_is_refused(poses: np.ndarray, reason: str) -> None:
