@@ -188,7 +188,7 @@ def test_mean_rate_at_rest_is_the_gyro_bias() -> None:
 
 
 def test_moved_gyro_is_refused() -> None:
-    with pytest.raises(solver.CalibrationError, match="still"):
+    with pytest.raises(solver.CalibrationError, match="the node was not at rest"):
         solver.calibrate_gyro(pose(SIDES[4], shaking=3.0), NodeCalibration())
 
 
