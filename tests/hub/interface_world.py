@@ -5,18 +5,15 @@ what each of the two clients received as JSON.
 """
 
 import asyncio
-import contextlib
 import json
 import socket
 import subprocess
 import sys
 
-from pymavlink.dialects.v20 import common as dialect
-
 from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
-from gateway.records import Outgoing
+from tests.kit.hub import Rig
 
 FAR_CLIENT = """
 import socket
@@ -62,51 +59,34 @@ class World:
     """The hub, its vehicle, and the client on loopback."""
 
     def __init__(self) -> None:
-        self.near = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.near.bind(("127.0.0.1", 0))
-        self.near.setblocking(False)
-        endpoints = (f"udp:127.0.0.1:{self.near.getsockname()[1]}", "udp:10.99.0.2:14550")
+        self.rig = Rig()
+        self.near = self.rig.station()
+        endpoints = (f"udp:127.0.0.1:{self.near.port}", "udp:10.99.0.2:14550")
         self.hub = Hub(HubSettings(endpoints=endpoints), lambda _: None, GatewayClock())
-        self.link = dialect.MAVLink(None, 1, 1)
         self.sent = self.received = 0
 
     async def fly(self, seconds: float) -> None:
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while loop.time() < end:
-            frame = bytes(dialect.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0).pack(self.link))
-            self.link.seq = (self.link.seq + 1) % 256
-            self.hub.send(Outgoing(frame, 30))
+            self.rig.publish(self.hub, self.rig.vehicle.attitude())
             self.sent += 1
             await asyncio.sleep(0.005)
-            self.listen()
-
-    def listen(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            while self.near.recv(4096):
-                self.received += 1
-
-    def state(self) -> str:
-        return self.hub.clients()[1].state
-
-    async def until_open(self) -> None:
-        async with asyncio.timeout(60):
-            while any(client.state != "open" for client in self.hub.clients()):
-                await asyncio.sleep(0.01)
+            self.received += len(self.near.received())
 
 
 async def fly(far: "subprocess.Popen[str]") -> dict[str, object]:
     assert far.stdout
     world = World()
     world.hub.start()
-    await world.until_open()
+    await world.rig.until_open(world.hub)
     await world.fly(0.2)
     ip("link", "set", "near0", "down")
     await world.fly(1.2)
-    state_down, dropped = world.state(), world.hub.clients()[1].dropped
+    down = world.hub.clients()[1]
     ip("link", "set", "near0", "up")
     await world.fly(0.1)
-    await world.until_open()
+    await world.rig.until_open(world.hub)
     sent_down = world.sent
     await world.fly(0.5)
     world.hub.close()
@@ -114,14 +94,14 @@ async def fly(far: "subprocess.Popen[str]") -> dict[str, object]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as last:
         last.sendto(b"", FAR_END)
     far_heard = (await asyncio.to_thread(far.stdout.read)).count("frame")
-    world.listen()
+    world.received += len(world.near.received())
     return {
-        "state while down": state_down,
-        "dropped while down": dropped,
+        "state while down": down.state,
+        "dropped while down": down.dropped,
         "loopback lost": world.sent - world.received,
         "sent after": world.sent - sent_down,
         "far end received": far_heard,
-        "far end could hear": world.sent - dropped,
+        "far end could hear": world.sent - down.dropped,
     }
 
 

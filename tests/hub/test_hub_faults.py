@@ -18,6 +18,7 @@ from gateway.hub.hub import CONNECTIONS_IN_FULL
 from gateway.hub.stats import WINDOW_US
 from gateway.hub.transports.registry import LISTENERS
 from gateway.wire.mavlink_messages import CRC_EXTRA
+from tests.conftest import ROOT
 
 pytestmark = pytest.mark.io
 
@@ -95,13 +96,13 @@ async def test_garbage_of_a_tcp_client_costs_others_no_frame(rig: Any, garbage: 
 @pytest.mark.slow
 async def test_interface_outage_loses_no_frame_of_other_clients(tmp_path: Any) -> None:
     """Run in a network namespace of its own: see `interface_world.py`."""
-    program = os.path.join(os.path.dirname(__file__), "interface_world.py")  # noqa: PTH118, PTH120
     run = await asyncio.to_thread(
         subprocess.run,
-        ["unshare", "--net", sys.executable, program],
+        ["unshare", "--net", sys.executable, "-m", "tests.hub.interface_world"],
         capture_output=True,
         text=True,
         timeout=240,
+        cwd=ROOT,
         check=False,
     )
     if "not permitted" in run.stderr:
