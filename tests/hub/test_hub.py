@@ -1,7 +1,5 @@
 """The hub between many endpoints: routing, loops, changes at run time, round trips."""
 
-import os
-import resource
 import socket
 from collections import Counter
 from typing import Any
@@ -14,7 +12,7 @@ from gateway.hub.transports import stream
 from gateway.hub.transports.base import STALE_AFTER_US
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
-from tests.kit.hub import FlyingHub
+from tests.kit.hub import FlyingHub, no_descriptors
 from tests.kit.records import BARO
 
 pytestmark = pytest.mark.io
@@ -298,9 +296,7 @@ class TestListeningPorts:
         hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
         (port,) = hub.listening_ports()
         caller = rig.station(port, socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
-        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (min(os.dup(0), soft), hard))
-        try:
+        with no_descriptors():
             if kind == "tcp":
                 caller.socket.connect_ex(caller.target)
             else:
@@ -309,8 +305,6 @@ class TestListeningPorts:
             rig.tick(hub)
             assert hub.listeners()[0].reason == "Too many open files", "no tick hides it"
             assert hub.clients() == ()
-        finally:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
         rig.tick(hub, 2)
         if kind == "udp":
             caller.send(caller.sender.heartbeat())

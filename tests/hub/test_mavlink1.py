@@ -6,6 +6,8 @@ import pytest
 from pymavlink.dialects.v10 import common as v1
 from pymavlink.dialects.v20 import common as dialect
 
+from tests.kit.mavlink import STATION, packed
+
 pytestmark = pytest.mark.io
 
 V1, V2 = 0xFE, 0xFD
@@ -13,9 +15,8 @@ PROBE_US = 6_000_000
 
 
 def heartbeat(sequence: int) -> bytes:
-    sender = v1.MAVLink(None, 254, 190)
-    sender.seq = sequence
-    return v1.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3).pack(sender)
+    message = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
+    return packed(message, 254, STATION, sequence=sequence, version=1)
 
 
 async def next_attitude(rig: Any, hub: Any, station: Any) -> bytes:
@@ -33,10 +34,8 @@ async def test_endpoint_of_version_1_gets_only_messages_of_this_version(rig: Any
     odometry = dialect.MAVLink_odometry_message(
         1, 1, 12, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0] * 21, [0] * 21
     )
-    sender = dialect.MAVLink(None, 1, 1)
-    rig.publish(hub, odometry.pack(sender))
-    first = await next_attitude(rig, hub, station)
-    second = await next_attitude(rig, hub, station)
+    rig.publish(hub, packed(odometry))
+    first, second = [await next_attitude(rig, hub, station) for _ in range(2)]
     assert [first[0], second[0]] == [V1, V1]
     assert (second[2] - first[2]) % 256 == 1
     found = v1.MAVLink(None).decode(bytearray(first))
@@ -47,18 +46,12 @@ async def test_client_that_only_sends_version_1_gets_it_after_a_probe(rig: Any) 
     """Programs that know both versions answer version 2 by version 2 within the probe."""
     hub = rig.hub("udp-listen:127.0.0.1:0")
     station = rig.station(hub.listening_ports()[0])
-    station.send(heartbeat(0))
-    await rig.until(lambda: len(hub.clients()) == 1)
-    assert (await next_attitude(rig, hub, station))[0] == V2
-    rig.clock.now_us += PROBE_US
-    count = len(rig.incoming)
-    station.send(heartbeat(1))
-    await rig.until(lambda: len(rig.incoming) > count)
-    assert (await next_attitude(rig, hub, station))[0] == V1
-    count = len(rig.incoming)
-    station.send(station.sender.heartbeat())
-    await rig.until(lambda: len(rig.incoming) > count)
-    assert (await next_attitude(rig, hub, station))[0] == V2
+    steps = [(heartbeat(0), V2), (heartbeat(1), V1), (station.sender.heartbeat(), V2)]
+    for count, (frame, version) in enumerate(steps, start=1):
+        station.send(frame)
+        await rig.until(lambda n=count: rig.received == n)
+        assert (await next_attitude(rig, hub, station))[0] == version
+        rig.clock.now_us += PROBE_US
     station.send(heartbeat(2))
     rig.clock.now_us += PROBE_US
     station.send(heartbeat(3))

@@ -2,9 +2,11 @@
 
 import asyncio
 import contextlib
+import os
+import resource
 import select
 import socket
-from collections.abc import AsyncIterator, Callable, Iterable
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,19 @@ async def receive(sock: socket.socket) -> bytes:
     """Wait for the next bytes of a socket that does not block."""
     async with asyncio.timeout(START_LIMIT_S):
         return await asyncio.get_running_loop().sock_recv(sock, 65536)
+
+
+@contextlib.contextmanager
+def no_descriptors() -> Iterator[None]:
+    """Let the process open no file and no socket."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    lowest_free = os.dup(0)
+    os.close(lowest_free)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 class Station:

@@ -12,6 +12,7 @@ import pytest
 from wsproto import ConnectionType, WSConnection
 from wsproto.events import AcceptConnection, BytesMessage, Event, Ping, Request
 
+from gateway.hub.hub import Hub
 from gateway.wire.mavlink_splitter import MavlinkSplitter
 from tests.kit.hub import Rig, receive
 from tests.kit.mavlink import frames_of
@@ -107,13 +108,19 @@ class Page:
 
 
 @pytest.fixture
+async def secure(rig: Rig, certificate: Path) -> Hub:
+    """A hub with a port of TLS."""
+    return rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
+
+
+@pytest.fixture
 async def visit(rig: Rig) -> AsyncIterator[Callable[..., Any]]:
-    """Return a function that opens a WebSocket to a hub's port."""
+    """Return a function that opens a WebSocket to a hub's first port."""
     pages: list[Page] = []
 
-    async def open_page(port: int, origin: str = "", tls: ssl.SSLContext | None = None) -> Page:
+    async def open_page(hub: Hub, origin: str = "", tls: ssl.SSLContext | None = None) -> Page:
         pages.append(Page())
-        return await pages[-1].connect(port, origin, tls)
+        return await pages[-1].connect(hub.listening_ports()[0], origin, tls)
 
     yield open_page
     for page in pages:

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import re
 import shutil
 import socket
 import ssl
@@ -13,6 +12,7 @@ from typing import Any
 import pytest
 from wsproto.events import RejectConnection, TextMessage
 
+from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from tests.hub.web.conftest import hung_up
 from tests.kit.hub import Rig, receive
@@ -27,7 +27,7 @@ Visit = Callable[..., Any]
 class TestPages:
     async def test_text_message_is_counted_as_garbage(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(LISTEN)
-        page = await visit(hub.listening_ports()[0])
+        page = await visit(hub)
         page.writer.write(page.web.send(TextMessage(data="hello")))
         await rig.until(lambda: hub.clients()[0].bytes_garbage == 5)
         assert hub.clients()[0].state == "open"
@@ -36,7 +36,7 @@ class TestPages:
         self, rig: Rig, visit: Visit, caplog: pytest.LogCaptureFixture
     ) -> None:
         hub = rig.hub(LISTEN)
-        page = await visit(hub.listening_ports()[0], "https://example.org")
+        page = await visit(hub, "https://example.org")
         assert isinstance(page.events[0], RejectConnection)
         assert page.events[0].status_code == 403
         await page.end()
@@ -47,17 +47,17 @@ class TestPages:
     async def test_page_of_an_allowed_origin_may_connect(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(f"{LISTEN}?origins=https://example.org,null&trusted=no")
         rig.publish(hub, rig.vehicle.heartbeat())
-        page = await visit(hub.listening_ports()[0], "https://example.org")
+        page = await visit(hub, "https://example.org")
         assert page.is_open
-        assert (await visit(hub.listening_ports()[0], "null")).is_open
-        assert not (await visit(hub.listening_ports()[0], "https://example.com")).is_open
+        assert (await visit(hub, "null")).is_open
+        assert not (await visit(hub, "https://example.com")).is_open
         page.send(rig.sender(255, 190).command(1, 1))
         await rig.until(lambda: bool(rig.incoming))
         assert not rig.incoming[0].trusted
 
     async def test_closing_port_sends_a_close(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(LISTEN)
-        page = await visit(hub.listening_ports()[0])
+        page = await visit(hub)
         hub.close()
         await page.end()
         assert page.events[-1].code == 1001
@@ -80,7 +80,7 @@ class TestTrouble:
     async def test_page_that_stops_answering_pings_is_dropped(self, rig: Rig, visit: Visit) -> None:
         """Half-open: its machine is gone, and no packet reports it."""
         hub = rig.hub(LISTEN, idle_timeout_s=9)
-        page, mute = [await visit(hub.listening_ports()[0]) for _ in range(2)]
+        page, mute = [await visit(hub) for _ in range(2)]
         mute.answers_pings = False
         rig.tick(hub, 3)
         pings = len(page.events) + 1
@@ -110,11 +110,10 @@ class TestTrouble:
         port = hub.listening_ports()[0]
         for _ in range(20):
             await rig.connect(port)
-        pages = [await visit(port) for _ in range(3)]
+        pages = [await visit(hub) for _ in range(3)]
         assert all(page.is_open for page in pages)
         assert len(hub.clients()) == 3
-        late = await rig.connect(port)
-        assert await hung_up(late)
+        assert await hung_up(await rig.connect(port))
         assert len(hub.clients()) == 3
 
     @pytest.mark.parametrize("seed", range(10))
@@ -122,7 +121,7 @@ class TestTrouble:
         self, rig: Rig, visit: Visit, seed: int
     ) -> None:
         hub = rig.hub(LISTEN)
-        page = await visit(hub.listening_ports()[0])
+        page = await visit(hub)
         sock = await rig.connect(hub.listening_ports()[0])
         if seed % 2:
             await self.shake_hands(rig, hub, sock)
@@ -175,17 +174,15 @@ class TestCalling:
 
 class TestTls:
     async def test_frames_pass_over_tls_to_a_hub_and_to_a_page(
-        self, rig: Rig, visit: Visit, certificate: Path
+        self, rig: Rig, visit: Visit, certificate: Path, secure: Hub
     ) -> None:
-        server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
-        port = server.listening_ports()[0]
-        hub = await rig.open(f"wss:127.0.0.1:{port}", tls_authority=str(certificate))
-        page = await visit(port, tls=ssl.create_default_context(cafile=certificate))
+        url = f"wss:127.0.0.1:{secure.listening_ports()[0]}"
+        hub = await rig.open(url, tls_authority=str(certificate))
+        page = await visit(secure, tls=ssl.create_default_context(cafile=certificate))
         rig.publish(hub, rig.sender(7).attitude())
         (frame,) = await page.frames(1)
         assert frame[5] == 7
-        for _ in range(500):
-            rig.publish(server, rig.vehicle.raw_imu())
+        rig.publish(secure, *(rig.vehicle.raw_imu() for _ in range(500)))
         await rig.until(lambda: hub.clients()[0].received == 500)
         assert len(await page.frames(501)) == 501
 
@@ -195,78 +192,58 @@ class TestTls:
         hub = rig.hub(
             "wss-listen:127.0.0.1:0?pack=1100", tls_certificate=str(certificate), queue_bytes=4096
         )
-        tls = ssl.create_default_context(cafile=certificate)
-        page = await visit(hub.listening_ports()[0], tls=tls)
+        page = await visit(hub, tls=ssl.create_default_context(cafile=certificate))
         page.writer.transport.pause_reading()
-        sent = 0
         while hub.clients()[0].dropped < 500:
-            for _ in range(50):
-                rig.publish(hub, rig.vehicle.raw_imu())
-                sent += 1
+            rig.publish(hub, *(rig.vehicle.raw_imu() for _ in range(50)))
             await asyncio.sleep(0)
         page.writer.transport.resume_reading()
         (slow,) = hub.clients()
-        got = 0
-        async with asyncio.timeout(START_LIMIT_S):
-            while got < slow.sent:
-                await page.take()
-                got = sum(len(data) for data in page.messages) // len(rig.vehicle.raw_imu())
+        size = slow.sent * len(rig.vehicle.raw_imu())
+        await page.until(lambda: sum(map(len, page.messages)) >= size)
         frames = await page.frames(1)
         assert [frame[4] for frame in frames] == [n & 255 for n in range(slow.sent)]
 
+    @pytest.mark.parametrize(
+        ("host", "authority", "reason"),
+        [
+            ("127.0.0.1", False, "tls: certificate verify failed: self-signed certificate"),
+            # The reason shows whether its name, its date or its authority is to be mended.
+            ("localhost", True, "certificate is not valid for 'localhost'"),
+        ],
+    )
     async def test_server_without_a_valid_certificate_is_refused(
-        self, rig: Rig, certificate: Path
+        self, rig: Rig, secure: Hub, certificate: Path, host: str, authority: bool, reason: str
     ) -> None:
-        server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
-        hub = rig.hub(f"wss:127.0.0.1:{server.listening_ports()[0]}")
+        known = str(certificate) if authority else ""
+        hub = rig.hub(f"wss:{host}:{secure.listening_ports()[0]}", tls_authority=known)
         await rig.until(lambda: hub.clients()[0].state == "refused")
-        assert hub.clients()[0].reason == "tls: certificate verify failed: self-signed certificate"
-        await rig.until(lambda: server.listeners()[0].turned_away == 1)
-        assert not server.clients()
-
-    async def test_certificate_for_another_name_is_reported(
-        self, rig: Rig, certificate: Path
-    ) -> None:
-        """The reason shows whether its name, its date or its authority is to be mended."""
-        server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
-        port = server.listening_ports()[0]
-        hub = rig.hub(f"wss:localhost:{port}", tls_authority=str(certificate))
-        await rig.until(lambda: hub.clients()[0].state == "refused")
-        assert "certificate is not valid for 'localhost'" in hub.clients()[0].reason
+        assert reason in hub.clients()[0].reason
+        await rig.until(lambda: secure.listeners()[0].turned_away == 1)
+        assert not secure.clients()
 
     async def test_plain_http_at_a_tls_port_is_refused(
-        self, rig: Rig, certificate: Path, caplog: pytest.LogCaptureFixture
+        self, rig: Rig, secure: Hub, caplog: pytest.LogCaptureFixture
     ) -> None:
-        hub = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
-        sock = await rig.connect(hub.listening_ports()[0])
-        await asyncio.get_running_loop().sock_sendall(sock, b"GET / HTTP/1.1\r\n\r\n")
-        await rig.until(lambda: hub.listeners()[0].turned_away == 1)
-        assert re.search("tls: http request", caplog.text)
+        sock = await rig.connect(secure.listening_ports()[0])
+        sock.send(b"GET / HTTP/1.1\r\n\r\n")
+        await rig.until(lambda: secure.listeners()[0].turned_away == 1)
+        assert "tls: http request" in caplog.text
 
-    async def test_replaced_certificate_applies_to_the_next_connection(
+    async def test_missing_or_replaced_certificate_applies_to_the_next_connection(
         self, rig: Rig, visit: Visit, certificate: Path, tmp_path: Path
     ) -> None:
-        file = tmp_path / "mine.pem"
-        shutil.copy(certificate, file)
-        hub = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(file))
-        port = hub.listening_ports()[0]
-        tls = ssl.create_default_context(cafile=certificate)
-        assert (await visit(port, tls=tls)).is_open
-        file.write_text("no certificate")
-        with pytest.raises(ConnectionError):
-            await visit(port, tls=tls)
-        shutil.copy(certificate, file)
-        assert (await visit(port, tls=tls)).is_open
-
-    async def test_missing_certificate_is_reported_until_it_exists(
-        self, rig: Rig, visit: Visit, certificate: Path, tmp_path: Path
-    ) -> None:
-        file = tmp_path / "mine.pem"
+        file, tls = tmp_path / "mine.pem", ssl.create_default_context(cafile=certificate)
         hub = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(file))
         assert hub.listeners()[0].reason == "No such file or directory"
         shutil.copy(certificate, file)
         rig.tick(hub, 2)
-        assert hub.listeners()[0].state == "open"
+        assert (await visit(hub, tls=tls)).is_open
+        file.write_text("no certificate")
+        with pytest.raises(ConnectionError):
+            await visit(hub, tls=tls)
+        shutil.copy(certificate, file)
+        assert (await visit(hub, tls=tls)).is_open
 
     def test_settings_without_a_certificate_are_refused(self) -> None:
         with pytest.raises(ValueError, match="needs a tls_certificate"):
