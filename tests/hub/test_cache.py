@@ -9,7 +9,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.hub.hub import Hub
 from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.hub import Rig, Station
-from tests.ports import free_port
+from tests.kit.messages import beat
+from tests.ports import free_ports
 
 COUNT = 30
 
@@ -20,13 +21,9 @@ class Scene:
     def __init__(self, rig: Rig, hub: Hub, vehicle: Station, stations: list[Station]) -> None:
         self.rig, self.hub, self.vehicle, self.stations = rig, hub, vehicle, stations
 
-    def telemetry(self) -> None:
-        self.vehicle.send(self.vehicle.sender.attitude(20_000))
-
-    def parameter(self, index: int, value: float) -> None:
-        name = b"P%d" % index
-        message = mavlink.MAVLink_param_value_message(name, value, 9, COUNT, index)
-        self.vehicle.send(self.vehicle.sender.pack(message))
+    def report(self, *messages: Any) -> None:
+        """Send messages of the vehicle."""
+        self.vehicle.send(*map(self.vehicle.sender.pack, messages))
 
     def ask(self, station: int, message: Any) -> None:
         one = self.stations[station]
@@ -55,19 +52,20 @@ class Scene:
         return [(frame.message_id, frame.target[0]) for frame in frames if frame.target[0]]
 
 
+def parameter(index: int, value: float) -> Any:
+    return mavlink.MAVLink_param_value_message(b"P%d" % index, value, 9, COUNT, index)
+
+
+ATTITUDE = mavlink.MAVLink_attitude_message(20_000, 0, 0, 0, 0, 0, 0)
+
+
 async def scene(rig: Rig, options: str, station_options: str = "") -> Scene:
-    chosen = (options, "", station_options)
-    hub = await rig.open(
-        *(f"udp-listen:127.0.0.1:{free_port()}?trusted=yes{each}" for each in chosen)
-    )
-    ports = hub.listening_ports()
-    vehicle = rig.station(ports[0], origin=(1, 1))
-    stations = [await rig.call(hub, number) for number in (1, 2)]
-    one = Scene(rig, hub, vehicle, stations)
-    vehicle.send(vehicle.sender.pack(mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)))
-    one.telemetry()
-    for index in range(COUNT):
-        one.parameter(index, float(index))
+    chosen = zip(free_ports(3), (options, "", station_options), strict=True)
+    urls = (f"udp-listen:127.0.0.1:{port}?trusted=yes{text}" for port, text in chosen)
+    hub = await rig.open(*urls)
+    vehicle = rig.station(hub.listening_ports()[0], origin=(1, 1))
+    one = Scene(rig, hub, vehicle, [await rig.call(hub, number) for number in (1, 2)])
+    one.report(beat(), ATTITUDE, *(parameter(index, float(index)) for index in range(COUNT)))
     await one.values(0, COUNT)
     vehicle.received()
     return one
@@ -102,7 +100,7 @@ async def test_written_value_replaces_the_kept_one(rig: Rig) -> None:
     one = await scene(rig, "&cache=yes")
     one.ask(0, mavlink.MAVLink_param_set_message(1, 1, b"P3", 8.0, 9))
     assert await one.asked() == [(mavlink.MAVLINK_MSG_ID_PARAM_SET, 1)]
-    one.parameter(3, 8.0)
+    one.report(parameter(3, 8.0))
     await one.values(1, COUNT + 1)
     one.ask(1, mavlink.MAVLink_param_request_read_message(1, 1, b"P3", -1))
     assert [m.param_value for m in await one.values(1, 1)] == [8.0]
@@ -133,6 +131,6 @@ async def test_changed_options_drop_what_was_kept(rig: Rig) -> None:
     urls = one.hub.endpoints()
     changed = (f"{urls[0]}&deny=RAW_IMU", *urls[1:])
     one.hub.apply(msgspec.structs.replace(one.hub.settings, endpoints=changed))
-    one.telemetry()
+    one.report(ATTITUDE)
     one.ask(1, listing())
     assert await one.asked() == [(mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST, 1)]

@@ -1,7 +1,6 @@
 """Which client gets which frame, at which rate and with which sequence number."""
 
 import pytest
-from pymavlink.dialects.v20 import common as dialect
 
 from gateway.hub.fanout import MAX_ROUTES, Fanout
 from gateway.hub.forwarding_step import HAND_OVER, IS_PLAIN, RUN_SENT, STATUS
@@ -212,12 +211,7 @@ def test_forged_headers_do_not_fill_the_memory(fanout: Fanout) -> None:
     source = Peer(fanout, 99)
     for system in range(1, 200):
         for component in range(1, 60):
-            frame = bytes(
-                dialect.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3).pack(
-                    dialect.MAVLink(None, system, component)
-                )
-            )
-            forward(fanout, frame, source)
+            forward(fanout, Sender(system, component).heartbeat(), source)
     assert len(source.routes) <= MAX_ROUTES
 
 

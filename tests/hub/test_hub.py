@@ -1,7 +1,6 @@
 """The hub between many endpoints: routing, loops, changes at run time, round trips."""
 
 import socket
-from collections import Counter
 from typing import Any
 
 import msgspec
@@ -12,8 +11,7 @@ from gateway.hub.transports import stream
 from gateway.hub.transports.base import STALE_AFTER_US
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
-from tests.kit.hub import FlyingHub, no_descriptors
-from tests.kit.records import BARO
+from tests.kit.hub import no_descriptors
 
 pytestmark = pytest.mark.io
 
@@ -323,27 +321,3 @@ async def test_round_trips_are_measured_at_each_interval(rig: Any) -> None:
     await rig.quiet()
     ids = [message_id_of(frame) for frame in station.received()]
     assert 9 <= ids.count(MESSAGE_IDS["PING"]) == ids.count(MESSAGE_IDS["TIMESYNC"]) <= 10
-
-
-async def test_antenna_tracker_gets_position_and_pressure_of_its_target(rig: Any) -> None:
-    """ArduPilot's requests two streams of the first vehicle whose heartbeat it receives."""
-    gateway = FlyingHub(rig, 1, "udp-listen:127.0.0.1:0")
-    gateway.fly()
-    tracker = rig.station(gateway.hub.listening_ports()[0], origin=(2, 1))
-    beat = dialect.MAVLink_heartbeat_message(dialect.MAV_TYPE_ANTENNA_TRACKER, 3, 0, 0, 4, 3)
-    tracker.send(tracker.sender.pack(beat))
-    for group in (dialect.MAV_DATA_STREAM_POSITION, dialect.MAV_DATA_STREAM_RAW_SENSORS):
-        request = dialect.MAVLink_request_data_stream_message(1, 1, group, 1, 1)
-        tracker.send(tracker.sender.pack(request))
-    await rig.quiet()
-    received: Counter[int] = Counter()
-    for _ in range(100):
-        rig.clock.now_us += 50_000
-        gateway.fly()
-        pressure = msgspec.structs.replace(BARO, time_us=rig.clock())
-        gateway.perform(gateway.vehicle.on_baro(pressure, rig.clock()))
-        await rig.quiet_some()
-        received.update(map(message_id_of, tracker.received()))
-    needed = ("HEARTBEAT", "GLOBAL_POSITION_INT", "SCALED_PRESSURE")
-    counts = [received[MESSAGE_IDS[name]] for name in needed]
-    assert all(4 <= count <= 7 for count in counts), counts

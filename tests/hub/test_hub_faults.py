@@ -6,7 +6,6 @@ import json
 import logging
 import os
 import shutil
-import socket
 import subprocess
 import sys
 from typing import Any
@@ -19,74 +18,50 @@ from gateway.hub.stats import WINDOW_US
 from gateway.hub.transports.registry import LISTENERS
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from tests.conftest import ROOT
+from tests.ports import free_port
 
 pytestmark = pytest.mark.io
 
 
-class Healthy:
-    """Clients without a fault: two configured, and one of a listening port."""
-
-    def __init__(self, rig: Any, *endpoints: str, **settings: object) -> None:
-        self.rig = rig
-        self.stations = [rig.station() for _ in range(2)]
-        configured = [f"udp:127.0.0.1:{station.port}" for station in self.stations]
-        self.hub = rig.hub("udp-listen:127.0.0.1:0", *configured, *endpoints, **settings)
-        self.stations.append(rig.station(self.hub.listening_ports()[0]))
-        self.sent: list[bytes] = []
-        self.received: list[list[int]] = [[] for _ in self.stations]
-
-    async def start(self) -> None:
-        caller = self.stations[-1]
-        caller.send(caller.sender.heartbeat())
-        await self.rig.until(lambda: len(self.hub.clients()) >= 3)
-        await self.rig.until(lambda: all(c.state == "open" for c in self.hub.clients()[:2]))
-
-    async def fly(self, frames: int) -> None:
-        """Publish frames, letting the loop and the clients run between them."""
-        for _ in range(frames):
-            frame = self.rig.vehicle.attitude()
-            self.sent.append(frame)
-            self.rig.publish(self.hub, frame)
-            await asyncio.sleep(0)
-            self.listen()
-
-    def listen(self) -> bool:
-        """Read the frames received by the clients; return whether those are all."""
-        for station, received in zip(self.stations, self.received, strict=True):
-            received += [frame[4] for frame in station.received()]
-        return all(len(received) >= len(self.sent) for received in self.received)
-
-    async def lost(self) -> int:
-        """Count the clients that did not get every frame in order."""
-        with contextlib.suppress(TimeoutError):
-            await self.rig.until(self.listen)
-        whole = [frame[4] for frame in self.sent]
-        return sum(received != whole for received in self.received)
-
-
 @pytest.mark.parametrize("garbage", [b"\xfd", b"\xfe", b"\xfd\xff\x02", bytes(range(256))])
 async def test_garbage_of_a_tcp_client_costs_others_no_frame(rig: Any, garbage: bytes) -> None:
-    flight = Healthy(rig, "tcp-listen:127.0.0.1:0")
-    await flight.start()
-    with socket.create_connection(("127.0.0.1", flight.hub.listening_ports()[1])) as rude:
-        await rig.until(lambda: len(flight.hub.clients()) == 4)
-        rude.setblocking(False)
-        for _ in range(50):
-            with contextlib.suppress(BlockingIOError):
-                rude.send(garbage * (20_000 // len(garbage)))
-            with contextlib.suppress(BlockingIOError):
-                rude.recv(1 << 20)
-            await flight.fly(20)
-        assert await flight.lost() == 0
-        client = flight.hub.clients()[-1]
-        assert client.bytes_garbage > 100_000
-        assert client.received == 0
-        heartbeat = rig.sender(200, 190).heartbeat()
-        while not flight.hub.clients()[-1].received:
-            # What looks like the head of a frame swallows the first ones.
-            with contextlib.suppress(BlockingIOError):
-                rude.send(heartbeat)
-            await flight.fly(1)
+    stations = [rig.station() for _ in range(2)]
+    urls = [f"udp:127.0.0.1:{station.port}" for station in stations]
+    hub = rig.hub("udp-listen:127.0.0.1:0", *urls, "tcp-listen:127.0.0.1:0")
+    stations.append(await rig.call(hub))
+    await rig.until_open(hub)
+    sent, got = list[bytes](), [list[bytes]() for _ in stations]
+
+    async def fly(frames: int) -> None:
+        for _ in range(frames):
+            sent.append(rig.vehicle.attitude())
+            rig.publish(hub, sent[-1])
+            await asyncio.sleep(0)
+
+    def are_complete() -> bool:
+        for station, frames in zip(stations, got, strict=True):
+            frames += station.received()
+        return all(len(frames) >= len(sent) for frames in got)
+
+    rude = await rig.connect(hub.listening_ports()[1])
+    for _ in range(50):
+        with contextlib.suppress(BlockingIOError):
+            rude.send(garbage * (20_000 // len(garbage)))
+        with contextlib.suppress(BlockingIOError):
+            rude.recv(1 << 20)
+        await fly(20)
+        are_complete()
+    await rig.until(are_complete)
+    assert got == [sent] * 3
+    client = hub.clients()[-1]
+    assert client.bytes_garbage > 100_000
+    assert client.received == 0
+    heartbeat = rig.sender(200, 190).heartbeat()
+    while not hub.clients()[-1].received:
+        # What looks like the head of a frame swallows the first ones.
+        with contextlib.suppress(BlockingIOError):
+            rude.send(heartbeat)
+        await fly(1)
 
 
 @pytest.mark.skipif(
@@ -119,42 +94,19 @@ async def test_interface_outage_loses_no_frame_of_other_clients(tmp_path: Any) -
 class TestLinkThatRaises:
     """An unexpected error closes its own link for a second and affects no other."""
 
-    async def test_link_that_raises_is_reported_and_retried_while_others_go_on(
-        self, rig: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        gone = rig.station()
-        gone.socket.close()
-        ours, device = os.openpty()
-        rig.closing += [lambda: os.close(ours), lambda: os.close(device)]
-
-        def overflow(*_: object, **__: object) -> None:
-            raise OverflowError("signed integer is greater than maximum")
-
-        with monkeypatch.context() as patched:
-            patched.setattr("serial.Serial", overflow)
-            hub = rig.hub(f"serial:{os.ttyname(device)}:57600?name=radio")
-            hub.add(f"udp:127.0.0.1:{gone.port}")
-            await rig.until(lambda: hub.clients()[1].state == "open")
-            rig.publish(hub, rig.vehicle.attitude(), rig.vehicle.attitude())
-            assert hub.clients()[1].state == "refused"
-            radio = hub.clients()[0]
-            assert (radio.state, radio.reason[:14]) == ("unreachable", "signed integer")
-            for _ in range(3):
-                rig.tick(hub, 1)
-            assert "radio is closed and opened again" in caplog.text
-            assert hub.clients()[1].state == "open", "the other one is open again"
-        rig.tick(hub, 1)
-        assert hub.clients()[0].state == "open"
-
     @pytest.mark.parametrize("kind", ["udp", "tcp"])
-    async def test_listening_port_that_raises_is_bound_again(
-        self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
+    async def test_listening_port_that_raises_is_bound_again_while_others_go_on(
+        self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
-        hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
+        hub = await rig.open(f"{kind}-listen:127.0.0.1:0?name=port", f"udp:127.0.0.1:{free_port()}")
+        rig.publish(hub, rig.vehicle.attitude(), rig.vehicle.attitude())
+        assert hub.clients()[0].state == "refused"
         with monkeypatch.context() as patched:
             patched.setattr(LISTENERS[f"{kind}-listen"], "tick", lambda *_: 1 // 0)
-            rig.tick(hub)
-            assert hub.listeners()[0].state == "closed"
+            for _ in range(3):
+                rig.tick(hub, 1)
+            assert (hub.listeners()[0].state, hub.clients()[0].state) == ("closed", "open")
+            assert "port is closed and opened again" in caplog.text
         rig.tick(hub, 2)
         assert hub.listeners()[0].state == "open"
 

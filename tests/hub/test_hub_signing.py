@@ -1,6 +1,5 @@
 """Our own frames are sent signed, on every route; frames of others are sent unchanged."""
 
-import asyncio
 from typing import Any
 
 import pytest
@@ -8,8 +7,8 @@ import pytest
 from gateway.hub.round_trip import PROBE_COMPONENT
 from gateway.records import ClientInterval
 from gateway.wire.mavlink_splitter import MavlinkSplitter, frame_of, message_id_of
+from tests.kit.hub import receive
 from tests.kit.mavlink import KEY, frames_of, signer, strict
-from tests.kit.process import START_LIMIT_S
 
 pytestmark = pytest.mark.io
 
@@ -25,9 +24,7 @@ def read(receiver: Any, frame: bytes) -> tuple[str, int, int]:
 async def test_greetings_requests_answers_and_limited_telemetry_are_signed(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0?rate=RAW_IMU:1", signer=signer())
     rig.publish(hub, rig.vehicle.heartbeat(), rig.vehicle.home())
-    station, receiver = rig.station(hub.listening_ports()[0]), strict()
-    station.send(station.sender.heartbeat())
-    await rig.until(lambda: len(hub.clients()) == 1)
+    station, receiver = await rig.call(hub), strict()
     (client,) = hub.clients()
     got = []
     hub.set_interval(ClientInterval(client.client_id, 1, 30, -1))
@@ -44,16 +41,14 @@ async def test_greetings_requests_answers_and_limited_telemetry_are_signed(rig: 
     ]
     numbers = [sequence for _, component, sequence in got if component == 1]
     assert numbers == list(range(numbers[0], numbers[0] + 5)), "signed and yet without a gap"
-    assert {kind for kind, component, _ in got if component == PROBE_COMPONENT} == {
-        "PING",
-        "TIMESYNC",
-    }
+    probes = {kind for kind, component, _ in got if component == PROBE_COMPONENT}
+    assert probes == {"PING", "TIMESYNC"}
 
 
 async def test_timestamps_follow_the_order_in_which_frames_leave_a_queue(rig: Any) -> None:
     hub = rig.hub("tcp-listen:127.0.0.1:0", signer=signer())
     rig.publish(hub, rig.vehicle.heartbeat())
-    client, loop = await rig.connect(hub.listening_ports()[0]), asyncio.get_running_loop()
+    client = await rig.connect(hub.listening_ports()[0])
     await rig.until(lambda: len(hub.clients()) == 1)
     while hub.clients()[0].queued < 50:
         rig.publish(hub, rig.vehicle.raw_imu())
@@ -61,8 +56,8 @@ async def test_timestamps_follow_the_order_in_which_frames_leave_a_queue(rig: An
         rig.publish(hub, rig.vehicle.raw_imu(), rig.vehicle.attitude())
     splitter, receiver, kinds = MavlinkSplitter(), strict(), []
     while hub.clients()[0].queued or kinds.count("ATTITUDE") < 50:
-        data = await asyncio.wait_for(loop.sock_recv(client, 65536), START_LIMIT_S)
-        kinds += [read(receiver, frame)[0] for frame in frames_of(splitter.feed(data))]
+        frames = frames_of(splitter.feed(await receive(client)))
+        kinds += [read(receiver, frame)[0] for frame in frames]
     assert "RAW_IMU" in kinds[kinds.index("ATTITUDE") :], "some were overtaken"
 
 
@@ -70,19 +65,16 @@ async def test_frames_of_others_are_unchanged(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", signer=signer())
     rig.publish(hub, rig.vehicle.heartbeat())
     port = hub.listening_ports()[0]
-    source, station, receiver = rig.station(port), rig.station(port), strict()
-    station.send(station.sender.heartbeat())
+    source, station, receiver = rig.station(port), await rig.call(hub), strict()
     autopilots = [rig.sender(40), rig.sender(41, signed=True), rig.sender(1, 100)]
-    for sent in [pilot.heartbeat() for pilot in autopilots]:
-        source.send(sent)
+    source.send(*(pilot.heartbeat() for pilot in autopilots))
 
     def received() -> int:
         return sum(client.received for client in hub.clients())
 
     await rig.until(lambda: received() == 1 + len(autopilots))
     sent = [make() for pilot in autopilots for make in (pilot.attitude, pilot.raw_imu)]
-    for frame in sent:
-        source.send(frame)
+    source.send(*sent)
     await rig.until(lambda: received() == 1 + len(autopilots) + len(sent))
     rig.publish(hub, rig.vehicle.raw_imu())
     got = []

@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.records import Outgoing
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.kit.hub import FlyingHub
+from tests.kit.mavlink import STATION, Sender, packed
 from tests.kit.records import FIX
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -34,25 +35,25 @@ def address(number: int) -> str:
 
 def hostile_datagrams(rng: np.random.Generator) -> list[bytes]:
     """Sound requests, requests that would change something, and every kind of rubbish."""
-    mav = mavlink.MAVLink(None, 255, 190)
     opening = struct.pack("<HBBBBBxI", 1, 0, 4, 13, 0, 0, 0) + b"/general.json"
+    messages = [
+        mavlink.MAVLink_param_request_list_message(1, 1),
+        mavlink.MAVLink_param_set_message(1, 1, b"RATE_ATT", 0.0, 9),
+        mavlink.MAVLink_command_long_message(1, 1, 511, 0, 30, 9000, *[0] * 5),
+        mavlink.MAVLink_command_long_message(1, 1, 2510, 0, *[0] * 7),
+        mavlink.MAVLink_mission_count_message(1, 1, 500, 0),
+        mavlink.MAVLink_mission_clear_all_message(1, 1, 255),
+        mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, opening.ljust(251, b"\0")),
+    ]
     frames = [
-        mavlink.MAVLink_param_request_list_message(1, 1).pack(mav),
-        mavlink.MAVLink_param_set_message(1, 1, b"RATE_ATT", 0.0, 9).pack(mav),
-        mavlink.MAVLink_command_long_message(1, 1, 511, 0, 30, 9000, *[0] * 5).pack(mav),
-        mavlink.MAVLink_command_long_message(1, 1, 2510, 0, *[0] * 7).pack(mav),
-        mavlink.MAVLink_mission_count_message(1, 1, 500, 0).pack(mav),
-        mavlink.MAVLink_mission_clear_all_message(1, 1, 255).pack(mav),
-        mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, opening.ljust(251, b"\0")).pack(
-            mav
-        ),
-        mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3).pack(mav, force_mavlink1=True),
+        *(packed(message, 255, STATION) for message in messages),
+        packed(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), 255, STATION, version=1),
         # A client that claims to be the vehicle itself.
-        mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 0, 3).pack(mavlink.MAVLink(None, 1, 1)),
+        Sender(1, 1).heartbeat(),
     ]
     bad = bytearray(frames[0])
     bad[-1] ^= 1
-    return [*map(bytes, frames), bytes(bad), frames[1][:9], rng.bytes(300), b"", rng.bytes(60_000)]
+    return [*frames, bytes(bad), frames[1][:9], rng.bytes(300), b"", rng.bytes(60_000)]
 
 
 class Gateway(FlyingHub):
