@@ -403,6 +403,8 @@ async def test_unexpected_error_closes_the_client_and_the_next_tick_opens_it(
         (client,) = link.hub.clients()
         assert (client.state, client.reason[:16]) == ("unreachable", "integer division")
         assert f"{link.far.url} is closed and opened again" in caplog.text
+        link.rig.publish(link.hub, link.rig.vehicle.attitude())
+        assert link.hub.clients()[0].dropped > client.dropped
     link.rig.clock.now_us += 1_000_000
     await link.until(lambda: link.hub.clients()[0].state == "open")
 

@@ -181,9 +181,10 @@ class TestDuplicates:
             assert links.check(SLOW, number, number * 5000 + 10, b"") == FAST
 
     def test_memory_is_bounded(self, links: Links) -> None:
-        verdicts = [links.check(FAST, number, 1) for number in [*range(2 * MEMORY_FRAMES + 1), 0]]
-        assert set(verdicts) == {NEW}
-        assert links.check(FAST, 0, 1) == FAST
+        now_us, count = 10 * US_PER_S, 2 * MEMORY_FRAMES + 1
+        assert {links.check(FAST, number, now_us) for number in range(count)} == {NEW}
+        assert links.check(SLOW, 0, now_us) == NEW, "no longer known"
+        assert links.check(SLOW, count - 1, now_us) == FAST
 
 
 class TestLateFrames:

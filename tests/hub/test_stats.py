@@ -44,6 +44,14 @@ AWAY = client(state="unreachable")
             id="one long outage",
         ),
         pytest.param(
+            [(0, AWAY), (ALERT_AFTER_US, AWAY)], ["tablet: unreachable"], id="at the limit"
+        ),
+        pytest.param(
+            [(n * S, client(dropped=10 * (n // 2))) for n in range(9)],
+            ["tablet is too slow: telemetry dropped"],
+            id="drops with short pauses",
+        ),
+        pytest.param(
             [(n * S, client(state="connecting")) for n in range(20)],
             ["tablet: not connected"],
             id="lost router",
@@ -96,12 +104,13 @@ def test_closed_port_is_reported_until_it_is_open() -> None:
 
 
 def test_state_of_a_client_that_left_is_discarded() -> None:
-    watch = ClientAlerts()
-    reported = [look(watch, client(state="unreachable", dropped=n), n * S) for n in range(20)]
-    assert sum(map(len, reported)) == 1
+    watch, slow = ClientAlerts(), ["tablet is too slow: telemetry dropped"]
+    assert [look(watch, client(dropped=n), n * S) for n in range(2)] == [[], slow]
+    assert look(watch, (), 2 * S) == []
+    assert look(watch, client(dropped=9), 3 * S) == [], "another client"
+    assert [look(watch, AWAY, n * S) for n in range(4, 20)].count([]) == 15
     assert look(watch, (), 20 * S) == []
-    assert look(watch, client(dropped=100), 21 * S) == [], "another client"
-    assert look(watch, client(dropped=100, state="unreachable"), 22 * S) == []
+    assert look(watch, client(), 21 * S) == look(watch, AWAY, 22 * S) == []
 
 
 def test_alerts_of_unknown_clients_are_summed_up_and_of_a_configured_one_named() -> None:

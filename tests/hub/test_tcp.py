@@ -6,8 +6,10 @@ import fcntl
 import os
 import pty
 import socket
+import struct
 import sys
 import tty
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -42,6 +44,13 @@ class TestTcpListen:
             await asyncio.sleep(0)
         assert hub.clients()[0].queued > 1000
         assert hub.clients()[0].bytes_sent < 10_000
+
+    async def test_connection_that_is_reset_ends_its_client(self, rig: Any) -> None:
+        hub = rig.hub("tcp-listen:127.0.0.1:0")
+        client = await self.narrow_client(rig, hub)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        client.close()
+        await rig.until(lambda: not hub.clients())
 
     async def test_kernel_holds_few_unsent_bytes_of_joined_writes(self, rig: Any) -> None:
         """With a wide window it may join 40 kB: 20 s of a link of 2 kB/s."""
@@ -121,6 +130,16 @@ class TestSerial:
             os.write(near, radio.pack(report))
         await rig.until(lambda: hub.clients()[0].received == 2)
         assert reports == [(1, 100), (1, 10)]
+
+    async def test_missing_device_is_reported_and_opened_when_it_appears(
+        self, rig: Any, line: tuple[int, str], tmp_path: Path
+    ) -> None:
+        hub = rig.hub(f"serial:{tmp_path / 'radio'}:57600")
+        assert hub.clients()[0].state == "unreachable"
+        assert "No such file" in hub.clients()[0].reason
+        (tmp_path / "radio").symlink_to(line[1])
+        rig.tick(hub, 1)
+        assert hub.clients()[0].state == "open"
 
     async def test_attitude_overtakes_and_sequence_numbers_stay_in_order(
         self, rig: Any, line: tuple[int, str]

@@ -121,6 +121,15 @@ async def test_one_vehicle_of_several_is_sent(outputs: OutputRig) -> None:
     assert (await sentences(outputs))["GGA"].lat == 9.0
 
 
+async def test_sentences_are_sent_at_the_rate_of_the_endpoint(outputs: OutputRig) -> None:
+    station = outputs.station()
+    outputs.of_hub = await outputs.open(f"nmea:udp:127.0.0.1:{station.port}?rate=50")
+    outputs.hear(beat(), at())
+    while read(await station.receive())["RMC"].status != "A":
+        pass
+    assert read(await station.receive())["RMC"].status == "A"
+
+
 async def test_filters_of_the_endpoint_apply(outputs: OutputRig) -> None:
     await outputs.udp("nmea", "?deny=GLOBAL_POSITION_INT&allow=GPS_RAW_INT")
     outputs.hear(beat(), at(lat_deg=3.0), gps())

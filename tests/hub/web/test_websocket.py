@@ -94,13 +94,17 @@ class TestTrouble:
         (left,) = hub.clients()
         assert left.client_id == 2, "one that never answered pings is left to the kernel"
 
-    async def test_connection_without_handshake_is_dropped(self, rig: Rig) -> None:
+    @pytest.mark.parametrize("closes", [False, True])
+    async def test_connection_without_handshake_is_dropped(self, rig: Rig, closes: bool) -> None:
         hub = rig.hub(LISTEN)
         sock = await rig.connect(hub.listening_ports()[0])
         await asyncio.get_running_loop().sock_sendall(sock, b"GET / HTTP/1.1\r\n")
         await rig.quiet()
         assert not hub.clients()
-        rig.tick(hub, 5)
+        if closes:
+            hub.close()
+        else:
+            rig.tick(hub, 5)
         assert await hung_up(sock)
 
     async def test_connections_without_handshake_do_not_keep_pages_out(
