@@ -1,6 +1,6 @@
 """mavgate: a MAVLink telemetry gateway for home-made UAV trackers.
 
-The names that a program needs to run the stages by itself, imported at their first use:
+The names that a program needs to run the stages by itself; each is imported at its first use:
 
     from gateway import AircraftSettings, Outputs, Pipeline, PipelineSettings
 """

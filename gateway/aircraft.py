@@ -1,6 +1,6 @@
-"""One aircraft: `sensing → estimation → vehicle`, and changes of their settings as they run.
+"""One aircraft: `sensing → estimation → vehicle`, and changes of their settings in operation.
 
-Pure: time is an argument, and results are added to the `Outputs` of the caller.
+Pure: time is an argument, and results are added to the `Outputs` that the caller passes.
 """
 
 import zlib
@@ -56,7 +56,7 @@ from gateway.wire.mavlink_signing import SigningClock, SigningTimestamps
 
 Order = ClientInterval | LogWarning | RecordingRequest | SaveSettings | SavePlan
 DEPRECATED: Final = {"complementary": "eskf"}
-"""Names of estimators that another one has replaced."""
+"""Present names of deprecated estimators."""
 FORMER_SECTIONS: Final = ("complementary", "compass", "rest")
 FORMER_KEYS: Final = frozenset(
     {
@@ -70,13 +70,13 @@ FORMER_KEYS: Final = frozenset(
         "unaided_velocity_mps",
     }
 )
-"""Sections and keys of earlier versions."""
+"""Sections and keys of the settings of earlier versions."""
 FILTER_KEYS: Final = frozenset(PaperSettings.__struct_fields__)
 
 
 @dataclass(frozen=True, slots=True)
 class SettingsChanged:
-    """The following samples are fused with other settings."""
+    """A change of settings, which applies to the samples after it."""
 
     vehicle_id: int
 
@@ -85,14 +85,14 @@ Recorded = FusedSample | BaroRaw | GpsFix | NodeStatus | SettingsChanged
 
 
 class Outputs(msgspec.Struct):
-    """Results of one call of the stages, to be carried out kind by kind, each in its order."""
+    """Results of a call of the stages, by kind, each kind in its order."""
 
     frames: list[Outgoing] = []
-    """To send."""
+    """Frames to send."""
     records: list[Recorded] = []
-    """For a recording, in the order of the fusion."""
+    """Records for the recording, in the order of the fusion."""
     orders: list[Order] = []
-    """Clients' rates, and files to write."""
+    """Requested message intervals of clients, files to write, and similar orders."""
 
 
 class AircraftSettings(Settings, frozen=True):
@@ -104,10 +104,10 @@ class AircraftSettings(Settings, frozen=True):
 
 
 class Aircraft:
-    """The stages of one aircraft, from its raw records on.
+    """The stages of one aircraft, which process its raw records.
 
-    Its id is that in the frames of its nodes, and its MAVLink system id. The states of a recording
-    that was fused already take the place of the estimator.
+    Its id is that in its nodes' frames, and its MAVLink system id. If a recording is played
+    that was fused before, its states replace the estimator.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Aircraft:
         self.settings = settings
         self.state: NavState | None = None
         self.received_us: int | None = None
-        """Arrival of the newest record."""
+        """Time of arrival of the newest record."""
         sections = {name: getattr(settings, name) for name in ("estimation", "calibration")}
         self.vehicle = Vehicle(
             settings.vehicle,
@@ -153,7 +153,7 @@ class Aircraft:
     def restore(self, state: FusionState) -> None:
         """Restore a state, bit for bit; raises ValueError as `make_fusion`.
 
-        Home is restored even if the rest does not fit.
+        Home is restored even if the state of the estimator cannot be.
         """
         if state.home is not None:
             *location, since_us = state.home
@@ -171,11 +171,11 @@ class Aircraft:
         elif isinstance(record, ImuCalibrated):
             self._feed_imu(None, self.chain.imu_calibrated(record), now_us, out)
         elif isinstance(record, VehicleReport):
-            # Not for the recording of the fusion: it takes no part in it.
+            # Not added to the fusion's records, since the fusion does not use it.
             self.perform(vehicle.on_report(record, now_us), now_us, out)
             self.state = vehicle.telemetry.state
         else:
-            # Before its effects: they may change the settings, which applies to the next record.
+            # Recorded before its effects, which can change the settings for the next record.
             out.records.append(record)
             if isinstance(record, BaroRaw):
                 baro = self.chain.baro(record)
@@ -197,7 +197,7 @@ class Aircraft:
         self.perform(self.vehicle.on_state(state, sample, now_us), now_us, out)
 
     def perform(self, wanted: Iterable[Action], now_us: int, out: Outputs) -> None:
-        """Carry out the vehicle's actions on the other stages, and add the rest to the outputs."""
+        """Apply the vehicle's actions to the other stages, and add all others to the outputs."""
         for action in wanted:
             if isinstance(action, Outgoing):
                 out.frames.append(action)
@@ -209,7 +209,7 @@ class Aircraft:
                 out.orders.append(action)
 
     def _recalibrate(self, measured: CalibrationMeasured, now_us: int, out: Outputs) -> None:
-        """Join the calibration with a measured one, unless no sensor has such errors."""
+        """Add a measured calibration to the present one, unless its values are not plausible."""
         try:
             fresh = corrected_by(self.settings.calibration, measured.correction)
             calibration = msgspec.convert(msgspec.to_builtins(fresh), NodeCalibration)
@@ -221,7 +221,7 @@ class Aircraft:
         self.perform(self.vehicle.apply_settings("calibration", calibration), now_us, out)
 
     def change(self, settings: AircraftSettings, now_us: int, out: Outputs) -> None:
-        """Apply what differs from the present settings, and send the parameters that differ."""
+        """Apply changed settings, and send the parameters that differ."""
         for section in ("calibration", "estimation"):
             wanted = getattr(settings, section)
             if wanted != getattr(self.settings, section):
@@ -229,13 +229,13 @@ class Aircraft:
                 self.perform(self.vehicle.apply_settings(section, wanted), now_us, out)
 
     def sign_by(self, passphrase: str, now_us: int, out: Outputs) -> None:
-        """Sign, and check signatures, with another passphrase from now on."""
+        """Sign frames, and verify signatures, with another passphrase from now on."""
         self.settings = with_passphrase(self.settings, passphrase)
         vehicle = self.settings.vehicle
         self.perform(self.vehicle.apply_settings("vehicle", vehicle), now_us, out)
 
     def _change(self, section: str, settings: Settings, out: Outputs) -> None:
-        """Rebuild the stage whose settings changed; the others keep their state."""
+        """Rebuild the stage whose settings have changed; the other stages keep their state."""
         wanted = msgspec.structs.replace(self.settings, **{section: settings})
         if section == "calibration":
             self.chain = SensorChain(wanted.calibration)
@@ -244,7 +244,7 @@ class Aircraft:
             if wanted.estimation.estimator == self.settings.estimation.estimator:
                 fresh.restore(self.estimator.snapshot())
             self.estimator = fresh
-        # Only now, so that a stage that cannot be built changes no settings.
+        # Only here, so that the settings are unchanged if a stage cannot be built.
         self.settings = wanted
         if section != "vehicle":
             out.records.append(SettingsChanged(self.vehicle_id))
@@ -253,9 +253,9 @@ class Aircraft:
 def make_fusion(
     settings: AircraftSettings, state: FusionState | None = None
 ) -> tuple[SensorChain, Estimator]:
-    """Build the two stages that turn raw records into navigation states, and restore their state.
+    """Build the two stages from raw records to navigation states, and restore their state.
 
-    Raises ValueError if the state is of another version or other settings, or damaged.
+    Raises ValueError if the state is damaged, or of another version or other settings.
     """
     chain = SensorChain(settings.calibration)
     estimator = make_estimator(settings.estimation)
@@ -267,13 +267,13 @@ def make_fusion(
 
 
 class FusedStates:
-    """The states of a recording that was fused already, in place of an estimator."""
+    """Replaces the estimator by the states of a recording that was fused before."""
 
     def __init__(self) -> None:
         self.states: deque[NDArray[np.float64]] = deque()
-        """Of the next IMU samples; shape (NAV_COLUMNS,)."""
+        """States of the next IMU samples, each of shape (NAV_COLUMNS,)."""
         self.latencies: deque[tuple[float, float] | None] = deque()
-        """`latency_in_use` after each of the next fixes."""
+        """Result of `latency_in_use` after each of the next fixes."""
         self.gps_latency_s: tuple[float, float] | None = None
 
     def update_imu(self, sample: ImuSample) -> NavState:
@@ -281,18 +281,18 @@ class FusedStates:
         return nav_state(sample.time_us, self.states.popleft())
 
     def update_baro(self, sample: BaroSample) -> None:
-        """Ignore a height: it is fused already."""
+        """Ignore a height, which has been fused already."""
 
     def update_gps(self, fix: GpsFix) -> None:  # noqa: ARG002
-        """Take over the latency that was in use after this fix."""
+        """Set the latency that was in use after this fix."""
         self.gps_latency_s = self.latencies.popleft()
 
     def snapshot(self) -> bytes:
-        """Return nothing: there is no state to restore."""
+        """Return no data: there is no state to restore."""
         return b""
 
     def restore(self, snapshot: bytes) -> None:
-        """Ignore a state: the fusion restored it."""
+        """Ignore a state, which the fusion has restored."""
 
     def reset(self) -> None:
         """Discard the states."""
@@ -301,29 +301,29 @@ class FusedStates:
 
 
 def latency_in_use(estimator: Estimator) -> tuple[float, float] | None:
-    """Return the GPS latency in use and the one that is set, s; None if it is not estimated."""
+    """Return the GPS latency in use and the configured one, s; None if it is not estimated."""
     if isinstance(estimator, KernelEstimator | FusedStates):
         return estimator.gps_latency_s
     return None
 
 
 def _fits(settings: AircraftSettings) -> str:
-    """Return a short checksum of version and settings."""
+    """Return a short checksum of the version and the settings."""
     fused_with = (settings.estimation, settings.calibration)
     return f"{__version__} {zlib.crc32(msgspec.json.encode(fused_with)):08x}"
 
 
 def with_passphrase(settings: AircraftSettings, passphrase: str) -> AircraftSettings:
-    """Give an aircraft another signing passphrase."""
+    """Return the settings with another signing passphrase."""
     vehicle = msgspec.structs.replace(settings.vehicle, signing_passphrase=passphrase)
     return msgspec.structs.replace(settings, vehicle=vehicle)
 
 
 def migrate_sections(sections: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Convert settings of earlier versions, as builtins; return remarks on the changes too.
+    """Convert settings of earlier versions, as builtins; also return remarks on the changes.
 
-    The filter chain of `sensing` is part of the paper's estimator now, and `complementary` is
-    `eskf`. Settings of estimators that no longer exist are left out.
+    The filter chain in `sensing` has become part of the paper's estimator, and `complementary` has
+    become `eskf`. Settings of estimators that no longer exist are left out.
     """
     present: dict[str, Any] = dict(sections)
     remarks: list[str] = []

@@ -1,13 +1,13 @@
-"""The gateway clock: the only place that reads the machine's clocks."""
+"""The gateway clock; only this module reads the machine's clocks."""
 
 import time
 
 
 class GatewayClock:
-    """Microseconds since the daemon started, suspended time included.
+    """Time in µs since the daemon started, including time in which the machine was suspended.
 
-    The kernel's monotonic clock stops while the machine is suspended: civil time would then seem
-    to have been set, and the earlier recording would be shifted by that time.
+    The kernel's monotonic clock stops during suspension: civil time would then seem to have been
+    set, and the recording so far would be shifted by the time of suspension.
     """
 
     def __init__(self) -> None:

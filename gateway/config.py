@@ -1,7 +1,7 @@
-"""The settings file: read from TOML, checked, and written as a documented file.
+"""The settings file: read from TOML, checked, and written with documentation.
 
-Every section is the settings of one stage or edge, declared with its code. A wrong file is
-refused with all its errors at once, each with file, key, value and what is allowed.
+Every section contains the settings of one stage or edge, which its code declares. An invalid file
+is rejected with all its errors at once, each with file, key, value and the allowed values.
 """
 
 import difflib
@@ -50,11 +50,11 @@ USUAL: Final = (
     "panel.password",
     "panel.units",
 )
-"""The settings that are changed most: those of the template."""
+"""The settings that users change most often, which are in the template."""
 COMMENT_WIDTH: Final = 96
 VEHICLE_IDS: Final = range(1, 32)
 MAX_ERRORS: Final = 20
-"""Errors of a file that are listed; to find the meant name of each unknown one takes a while."""
+"""Errors that are listed per file; suggesting a name for each unknown key takes time."""
 
 log = logging.getLogger(__name__)
 KINDS: Final = {
@@ -65,7 +65,7 @@ KINDS: Final = {
     "array": "a list in brackets",
     "object": "a table",
 }
-"""What msgspec expected, in the words of TOML."""
+"""Types that msgspec expected, in the terms of TOML."""
 
 
 class GatewaySettings(Settings, frozen=True):
@@ -93,18 +93,18 @@ class GatewaySettings(Settings, frozen=True):
     sources: Annotated[
         tuple[SourceSettings, ...],
         setting(
-            "Other sources than the receiver, each a table [[sources]] with url and vehicle: "
+            "Sources other than the receiver, each a table [[sources]] with url and vehicle: "
             'sources = [{ url = "crsf:/dev/ttyACM0", vehicle = 2 }]. docs/sources.md lists them.'
         ),
     ] = ()
 
     def __post_init__(self) -> None:
-        """Refuse sources of an unknown kind, or with an unknown option."""
+        """Reject sources of an unknown kind, or with an unknown option."""
         if len(self.sources) > MAX_SOURCES:
             raise ValueError(f"sources: at most {MAX_SOURCES}")
         if not self.sources:
             return
-        # Here, as the decoders load what small commands should not wait for.
+        # Imported here, as small commands should not wait for the decoders.
         from gateway.sources.kinds import check_source
 
         for source in self.sources:
@@ -112,12 +112,12 @@ class GatewaySettings(Settings, frozen=True):
 
     @property
     def has_other_sources(self) -> bool:
-        """Whether data may come from more than the receiver."""
+        """Whether data can come from sources other than the receiver."""
         return self.hub.has_other_sources or bool(self.sources)
 
     @property
     def default_aircraft(self) -> AircraftSettings:
-        """The settings of an aircraft without its own file."""
+        """The settings of an aircraft without a file of its own."""
         return AircraftSettings(vehicle=self.vehicle, estimation=self.estimation)
 
 
@@ -128,8 +128,7 @@ class ConfigError(UserError):
 def load(path: Path) -> GatewaySettings:
     """Read and check a TOML file; absent keys keep their defaults.
 
-    Raises ConfigError if it cannot be read, is not TOML, or has a key, type or value that is not
-    allowed.
+    Raises ConfigError if it cannot be read, is not TOML, or has an invalid key, type or value.
     """
     return msgspec.convert(_read(path, GatewaySettings), GatewaySettings)
 
@@ -152,10 +151,10 @@ def load_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
 
 
 def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: AircraftSettings) -> Path:
-    """Write the settings of an aircraft that differ from the settings file.
+    """Write those settings of an aircraft that differ from the settings file.
 
-    Comments and order of an existing file are kept; it is replaced whole or not at all. Raises
-    OSError if it cannot be written, or the existing one is not TOML, which is left unchanged.
+    Comments and order of an existing file are kept; it is replaced completely or not at all. Raises
+    OSError if it cannot be written, or if the existing file is not TOML, which is left unchanged.
     """
     file = aircraft_file(settings, vehicle_id)
     document = _document(file)
@@ -163,18 +162,18 @@ def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: Aircraft
     try:
         msgspec.convert(values, AircraftSettings)
     except msgspec.ValidationError as error:
-        raise OSError(errno.EINVAL, f"would not be read again: {error}", str(file)) from error
+        raise OSError(errno.EINVAL, f"would be invalid: {error}", str(file)) from error
     _write_difference(document, msgspec.to_builtins(settings.default_aircraft), values)
-    # It may hold a passphrase, whatever the file had before.
+    # It may contain a passphrase, so its previous mode does not matter.
     _write_document(file, document, PRIVATE)
     return file
 
 
 def save_endpoint(file: Path, url: str) -> None:
-    """Add an endpoint to those of a settings file, which is created if it does not exist.
+    """Add an endpoint to a settings file, which is created if it does not exist.
 
-    Comments and order are kept; the file is replaced whole or not at all. Raises ConfigError if the
-    file is wrong, or would be with this endpoint, and OSError if it cannot be written.
+    Comments and order are kept; the file is replaced completely or not at all. Raises ConfigError
+    if the file is invalid, with or without this endpoint, and OSError if it cannot be written.
     """
     settings = load(file) if file.exists() else GatewaySettings()
     urls = [*settings.hub.endpoints, url]
@@ -188,7 +187,7 @@ def save_endpoint(file: Path, url: str) -> None:
         table["endpoints"].append(url)
     else:
         table["endpoints"] = urls
-    # A service must still be able to read what root changed for it.
+    # The mode is kept: a service must still be able to read a file that root changed.
     rights = stat.S_IMODE(file.stat().st_mode) if file.exists() else PRIVATE
     _write_document(file, document, rights)
 
@@ -239,7 +238,7 @@ def aircraft_folder(settings: GatewaySettings) -> Path:
 def render(settings: GatewaySettings, keys: Sequence[str] = ("",)) -> str:
     """Return a documented TOML file, with meaning, unit and range of every setting as comments.
 
-    `keys` are the settings in it, as `section.name`; each stands for all that begin with it.
+    `keys` selects the settings, as `section.name`; each stands for all that begin with it.
     """
     head = _comment(
         "Settings of mavgate. Every key may be left out: its value here is the default. "
@@ -266,7 +265,7 @@ def _read(path: Path, kind: type[Settings]) -> dict[str, Any]:
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge one tree of settings into another."""
+    """Return a tree of settings merged with overriding values."""
     merged = dict(base)
     for key, value in over.items():
         below = merged.get(key)
@@ -280,7 +279,7 @@ def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 def _write_difference(
     table: MutableMapping[str, Any], default: Mapping[str, Any], value: Mapping[str, Any]
 ) -> None:
-    """Write what differs from the default to a TOML table, and remove what does not."""
+    """Write values that differ from the default to a TOML table, and remove the others."""
     for key, new in value.items():
         old = default.get(key)
         if new == old:
@@ -299,7 +298,7 @@ def _check(table: Mapping[str, Any], kind: type[Settings], prefix: str) -> Itera
             yield from errors
         else:
             sound[key] = value
-    # Each of these is valid by itself; the remaining rules are between them and within texts.
+    # Each value is valid by itself; the remaining rules concern several values, or parts of texts.
     try:
         msgspec.convert(sound, kind)
     except msgspec.ValidationError as error:
@@ -323,9 +322,9 @@ def _check_key(key: str, value: Any, fields: Mapping[str, Field], prefix: str) -
 
 
 def _check_path(path: str, value: Any, field: Field) -> Iterator[str]:
-    """Check that a path may exist, and `~` or `~user` at its start is a home folder."""
+    """Check that a path is possible, and that `~` or `~user` at its start is a home folder."""
     if field.is_path and "\0" in value:
-        yield f"{path} = {value!r}: no path has a zero byte"
+        yield f"{path} = {value!r}: a path cannot contain a zero byte"
     elif field.is_path:
         try:
             Path(value).expanduser()
@@ -348,7 +347,7 @@ def _wrong_value(path: str, value: Any, field: Field, error: msgspec.ValidationE
 
 
 def _wanted(field: Field, error: str) -> str:
-    """Describe the values that a setting may have, given msgspec's error of one that it may not."""
+    """Describe the allowed values of a setting, given msgspec's error for another value."""
     if field.choices:
         return "one of the choices"
     if field.range and ("`float`" in error or "`int`" in error):
@@ -363,7 +362,7 @@ def _wanted(field: Field, error: str) -> str:
 
 
 def _choice_hint(value: Any, field: Field) -> str:
-    """Return the allowed choices, and the one probably meant."""
+    """Return the allowed choices, with the most similar one first."""
     if not field.choices:
         return ""
     near = difflib.get_close_matches(str(value), field.choices, n=1)
@@ -372,7 +371,7 @@ def _choice_hint(value: Any, field: Field) -> str:
 
 
 def _uncapital(text: str) -> str:
-    # The name of a message stays as it is.
+    # The name of a message keeps its capitals.
     return (text[:1] if text[:2].isupper() else text[:1].lower()) + text[1:].rstrip(".")
 
 
@@ -401,7 +400,7 @@ def _render_key(field: Field, value: Any) -> Iterator[str]:
 
 
 def _in_toml(value: Any) -> str:
-    """Write a value; tables of a list stay in its brackets, one per line."""
+    """Convert a value to TOML; a list of tables is written inline, one table per line."""
     if isinstance(value, list | tuple) and value and isinstance(value[0], dict):
         tables = []
         for entry in value:

@@ -1,12 +1,12 @@
 """Extensions of the gateway by other installed packages.
 
-A package names a function in its `pyproject.toml`:
+A package declares a function in its `pyproject.toml`:
 
     [project.entry-points."mavgate.extensions"]
     my-extension = "my_package:extend"
 
-It is called once, without arguments, when a `mavgate` command starts that does more than ask a
-running gateway, and adds to the registries; docs/extend.md shows how.
+It is called once, without arguments, when a `mavgate` command starts that does more than send a
+request to a running gateway, and adds to the registries; docs/extend.md shows how.
 """
 
 import logging
@@ -19,17 +19,17 @@ log = logging.getLogger(__name__)
 
 GROUP: Final = "mavgate.extensions"
 SHIPPED: Final = metadata.EntryPoint("outputs", "gateway.outputs:extend", GROUP)
-"""The kinds of endpoint that are not MAVLink are added as those of other packages are."""
+"""The endpoint kinds other than MAVLink, which are added like those of other packages."""
 
 
 class ExtensionError(UserError):
-    """An extension that cannot be used; the text says which and why."""
+    """An extension that cannot be used; the text states which one and the reason."""
 
 
 def load_extensions() -> tuple[str, ...]:
     """Call the function of every installed extension, and return their names.
 
-    Raises ExtensionError if one cannot be imported, or an addition is refused.
+    Raises ExtensionError if one cannot be imported, or what it adds is rejected.
     """
     found = []
     for entry in (SHIPPED, *metadata.entry_points(group=GROUP)):

@@ -1,4 +1,4 @@
-"""Optional parts: the packages that each needs, and the command that installs them here."""
+"""Optional extras: the packages that each requires, and the command to install them here."""
 
 import re
 import shlex
@@ -18,33 +18,33 @@ EXTRAS: Final = {
     "fast": ("uvloop",),
     "mqtt": ("aiomqtt",),
 }
-"""The modules of each extra of `pyproject.toml`."""
+"""Modules by extra, as in `pyproject.toml`."""
 DEBIAN_PACKAGE: Final = Path("/usr/lib/mavgate")
-"""Where `make deb` puts all; what is installed by pip is not found from there."""
+"""Folder in which `make deb` installs everything; packages installed by pip are not found there."""
 
 
 class MissingExtraError(UserError):
-    """An optional part that is not installed; the text contains the command that installs it."""
+    """A missing extra; the text contains the command that installs it."""
 
 
 def missing(extra: str) -> list[str]:
-    """List the modules of an extra that are not installed."""
+    """Return the modules of an extra that are not installed."""
     return [name for name in EXTRAS[extra] if find_spec(name) is None]
 
 
 def require(what: str, extra: str) -> None:
-    """Raise MissingExtraError if something needs an extra that is not installed."""
+    """Raise MissingExtraError if an extra that is needed for something is not installed."""
     if missing(extra):
         raise MissingExtraError(how_to_add(what, extra))
 
 
 def how_to_add(what: str, extra: str) -> str:
-    """Return a line: what needs the extra, and the command that installs it here."""
+    """Return a line that names the extra and the command to install it here."""
     return f"{what} needs the extra {extra}; to install it: {_command(extra)}"
 
 
 def _command(extra: str) -> str:
-    """Return the command, by the kind of environment that this Python is in."""
+    """Return the command to install an extra in this Python's kind of environment."""
     if Path(__file__).is_relative_to(DEBIAN_PACKAGE):
         return "see Elsewhere in /usr/share/doc/mavgate/service.md, as Debian has no such package"
     # Imported here, as it takes 20 ms.

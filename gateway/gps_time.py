@@ -1,7 +1,7 @@
 """GPS time and UTC.
 
-GPS time has no leap seconds, so it is ahead of UTC by those inserted since its epoch. They are
-announced half a year before, in Bulletin C of the IERS.
+GPS time has no leap seconds, so it is ahead of UTC by those inserted since its epoch. Leap seconds
+are announced half a year in advance, in Bulletin C of the IERS.
 """
 
 from bisect import bisect_right
@@ -11,7 +11,7 @@ from typing import Final
 from gateway.units import US_PER_S
 
 GPS_EPOCH_UNIX_US: Final = 315_964_800 * US_PER_S
-"""6 January 1980."""
+"""6 January 1980, the epoch of GPS time."""
 WEEK_US: Final = 604_800 * US_PER_S
 
 
@@ -29,7 +29,7 @@ _LEAPS_US: Final = [
 ]
 """Civil time at the end of each leap second."""
 LEAPS_KNOWN_UNTIL_US: Final = _unix_us(2027, 6, 28)
-"""No other leap second was announced for the time before this."""
+"""Time up to which no further leap second was announced."""
 
 
 def unix_us_of_gps(gps_us: int) -> int:

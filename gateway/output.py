@@ -1,8 +1,8 @@
-"""The only writer of output files: whole or not at all.
+"""The only writer of output files, which are written completely or not at all.
 
-No file is replaced without permission, none that is not a regular file, and none that is being
-read. A file is written next to the target and gets its name once it is whole, so nobody finds half
-of it or nothing under that name: not after a power loss, and not after it was killed.
+No file is replaced without permission, if it is not a regular file, or while it is read. A file is
+written next to the target and renamed when it is complete, so nobody finds an incomplete file under
+that name, not even after a power loss or a kill.
 """
 
 import contextlib
@@ -15,19 +15,19 @@ from pathlib import Path
 from typing import Final
 
 READABLE: Final = 0o666
-"""Less the user's umask."""
+"""Mode of files in general, before the user's umask."""
 PRIVATE: Final = 0o600
-"""For files with a passphrase."""
+"""Mode of files with a passphrase."""
 LETTERS: Final = 40
-"""Of a file's name that its temporary file shares: four bytes each, of 255 that a name may have."""
+"""Characters of a file's name in the name of its temporary file: up to 4 bytes each, of 255."""
 
 
 def check_output(
     path: Path, inputs: Iterable[Path | None] = (), *, overwrite: bool = False
 ) -> None:
-    """Check that a file may be written here, before the work for it.
+    """Check that a file can be written here, before the work for it is done.
 
-    Raises FileExistsError if it exists and may not be replaced, OSError for any other reason.
+    Raises FileExistsError if it exists and must not be replaced, OSError for any other reason.
     """
     try:
         there = path.lstat()
@@ -36,7 +36,7 @@ def check_output(
         return
     for read in inputs:
         if read is not None and read.exists() and os.path.samestat(read.stat(), path.stat()):
-            raise OSError(errno.EINVAL, "is what the output is made of; name another", str(path))
+            raise OSError(errno.EINVAL, "is an input; give another output", str(path))
     if not stat.S_ISREG(there.st_mode):
         raise OSError(errno.EINVAL, "is not a regular file, and is not replaced", str(path))
     if not overwrite:
@@ -45,13 +45,13 @@ def check_output(
 
 
 def check_ending(path: Path, endings: Iterable[str]) -> None:
-    """Raise OSError if the ending of a file's name is not one of its format."""
+    """Raise OSError if the suffix of a file's name is not one of its format."""
     if path.suffix not in endings:
         raise OSError(errno.EINVAL, f"the output must end in {', '.join(endings)}", str(path))
 
 
 def check_folder(path: Path, *, overwrite: bool = False) -> None:
-    """Check that files may be written into a folder; raises OSError as `check_output`."""
+    """Check that files can be written into a folder; raises OSError as `check_output`."""
     there = next(each for each in (path, *path.parents) if each.exists() or each.is_symlink())
     if not there.is_dir():
         raise OSError(errno.ENOTDIR, "is not a folder", str(there))
@@ -62,7 +62,7 @@ def check_folder(path: Path, *, overwrite: bool = False) -> None:
 
 def _check_writable(path: Path, folder: Path) -> None:
     if not folder.is_dir():
-        raise FileNotFoundError(errno.ENOENT, "is in a folder that is not there", str(path))
+        raise FileNotFoundError(errno.ENOENT, "is in a folder that does not exist", str(path))
     if not os.access(folder, os.W_OK | os.X_OK):
         raise PermissionError(errno.EACCES, "is in a folder that cannot be written", str(path))
 
@@ -75,11 +75,11 @@ def write_new(
     inputs: Iterable[Path | None] = (),
     rights: int | None = None,
 ) -> int:
-    """Write a file in full or not at all, and return its size in bytes.
+    """Write a file completely or not at all, and return its size in bytes.
 
-    Only with `overwrite` may a regular file be there, which it replaces, but never one of `inputs`.
-    Its mode is `rights`, by default that of the file that it replaces, or `READABLE`. Raises
-    OSError as `check_output`, or if the disk fails.
+    A regular file is replaced only with `overwrite`, and never if it is one of `inputs`. Its mode
+    is `rights`, by default that of the replaced file, or `READABLE`. Raises OSError as
+    `check_output`, or if the disk fails.
     """
     check_output(path, inputs, overwrite=overwrite)
     if rights is None:
@@ -107,7 +107,7 @@ def write_new(
 
 @contextlib.contextmanager
 def written_together(folder: Path) -> Iterator[Path]:
-    """Have files written that belong together: all of them get into a folder, or none.
+    """Write files that belong together: all of them are moved into a folder, or none.
 
     Raises OSError as `check_output`, or if the disk fails.
     """
@@ -134,14 +134,14 @@ def written_together(folder: Path) -> Iterator[Path]:
 
 
 def _remove_if_empty(folder: Path) -> None:
-    """Remove a folder that was made for files that did not come."""
+    """Remove a folder that was created for files that were not written."""
     with contextlib.suppress(OSError):
         folder.rmdir()
 
 
 @contextlib.contextmanager
 def _named(path: Path, prefix: str) -> Iterator[None]:
-    """Name the file that the disk refuses, not the temporary one; others keep their names."""
+    """Put the target's name into errors of the temporary file; other errors are unchanged."""
     try:
         yield
     except OSError as error:
@@ -151,13 +151,13 @@ def _named(path: Path, prefix: str) -> Iterator[None]:
 
 
 def _put_where_none_is(fresh: Path, path: Path) -> None:
-    """Give a whole file its name; raises FileExistsError if another program has taken it."""
+    """Rename a complete file; raises FileExistsError if the name has been taken since."""
     try:
         os.link(fresh, path)
     except FileExistsError as error:
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from error
     except OSError:
-        # FAT has no links.
+        # FAT does not support hard links.
         path.touch(exist_ok=False)
         fresh.replace(path)
 
@@ -166,7 +166,7 @@ def sync_folder(folder: Path) -> None:
     """Sync a folder, so that new names in it survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        # Some file systems (FAT among them) cannot; then there is nothing to do.
+        # Some file systems, such as FAT, do not support this, and do not need it.
         with contextlib.suppress(OSError):
             os.fsync(descriptor)
     finally:

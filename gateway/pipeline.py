@@ -1,4 +1,4 @@
-"""From the receiver's bytes to each aircraft: `wire → sensing → estimation → vehicle`.
+"""Process the receiver's bytes for each aircraft: `wire → sensing → estimation → vehicle`.
 
     receiver's bytes ─ Link ─ raw records ─┬─ Aircraft 1: SensorChain ─ Estimator ─ Vehicle ─┐
                                            └─ Aircraft 2: …                                  │
@@ -6,9 +6,9 @@
                                                                                           Outputs
 
 Pure: time is an argument, and results are returned as `Outputs`. An aircraft is created with its
-first record. One that sends nothing for `GONE_US` disappears, and returns with its state when a
-record of it is received again. Live, demo and playback differ only in the caller of `feed` (bytes)
-or `take` (raw records of a recording).
+first record. One that sends nothing for `GONE_US` is removed, and restored with its state when a
+record of it is received again. Live operation, demo and playback differ only in the caller of
+`feed` (bytes) or `feed_record` (raw records of a recording).
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,32 +45,32 @@ from gateway.wire.timesync import GpsTime
 
 REPORT_INTERVAL_US: Final = US_PER_S
 RADIOHEAD_HEADER: Final = 4
-"""Bytes: to, from, id and flags."""
+"""Size in bytes: to, from, id and flags."""
 GONE_US: Final = 600 * US_PER_S
-"""Timeout after which an aircraft disappears; longer than a change of batteries."""
+"""Timeout after which an aircraft is removed; longer than a change of batteries."""
 
 
 @dataclass(frozen=True, slots=True)
 class PipelineSettings:
-    """The settings of every aircraft."""
+    """The settings of all aircraft."""
 
     default: AircraftSettings
     aircraft: Mapping[int, AircraftSettings] = field(default_factory=dict)
-    """By vehicle id, in place of the default."""
+    """Settings of single aircraft instead of the default, by vehicle id."""
     unix_us_at_zero: int = 0
-    """Civil time at the gateway clock's zero, as far as known."""
+    """Civil time at zero of the gateway clock, as far as known."""
     fused: FusedStates | None = None
-    """The states of a recording, in place of an estimator."""
+    """States of a recording that replace the estimator."""
     plans: Mapping[int, StoredPlan] = field(default_factory=dict)
-    """Missions, marks and homes kept from an earlier run, by vehicle id."""
+    """Missions, marks and home positions stored by an earlier run, by vehicle id."""
     timestamps: Mapping[int, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
-    """Signing timestamps kept from an earlier run, by vehicle id; see `SigningTimestamps`."""
+    """Signing timestamps stored by an earlier run, by vehicle id; see `SigningTimestamps`."""
     sources: Sequence[SourceInput] = ()
     """Sources other than the receiver."""
 
 
 class Pipeline:
-    """All stages between the source's bytes and the clients' frames."""
+    """All stages from the bytes of the sources to the frames for clients."""
 
     def __init__(self, settings: PipelineSettings) -> None:
         self._settings = settings
@@ -78,7 +78,7 @@ class Pipeline:
         self.sources = settings.sources
         self._signing_clock = SigningClock(settings.unix_us_at_zero)
         self.signer = FrameSigner(self._signing_clock)
-        """Signs the frames of every aircraft with a passphrase where they are sent."""
+        """Signs the frames of all aircraft that have a passphrase, when they are sent."""
         self._set_shared_key(settings.default.vehicle.signing_passphrase)
         self._timestamps = {
             key: SigningTimestamps(kept) for key, kept in settings.timestamps.items()
@@ -91,7 +91,7 @@ class Pipeline:
         """The present aircraft, by vehicle id."""
         self._gone: dict[int, Aircraft] = {}
         self.report: LinkReport = self._link.report(0, connected=False, port="")
-        """The newest link report, renewed once a second."""
+        """The newest link report, updated once a second."""
 
     def feed(self, data: bytes, now_us: int) -> Outputs:
         """Process bytes of the receiver, read at `now_us`."""
@@ -104,7 +104,7 @@ class Pipeline:
 
     @property
     def ported(self) -> list[SourceInput]:
-        """The sources that have a transport of their own."""
+        """The sources with a transport of their own."""
         return [source for source in self.sources if source.url.transport != "receiver"]
 
     def _feed_packets(self, now_us: int, out: Outputs) -> None:
@@ -145,7 +145,7 @@ class Pipeline:
         aircraft = self.aircraft.get(vehicle_id)
         if aircraft is None:
             aircraft = self._aircraft_of(vehicle_id)
-            # Its heartbeat comes first: before it ground stations ignore an aircraft's messages.
+            # The heartbeat must be first: ground stations ignore an aircraft's messages before it.
             aircraft.perform(aircraft.vehicle.poll(now_us), now_us, out)
         aircraft.received_us = now_us
         aircraft.feed(record, now_us, out)
@@ -171,7 +171,7 @@ class Pipeline:
         return aircraft
 
     def _set_key(self, aircraft: Aircraft) -> None:
-        """Let the signer use an aircraft's key, or none."""
+        """Set an aircraft's key in the signer, or remove it."""
         key = aircraft.vehicle.signing_key
         if key is None:
             self.signer.keys.pop(aircraft.vehicle_id, None)
@@ -179,19 +179,19 @@ class Pipeline:
             self.signer.keys[aircraft.vehicle_id] = key
 
     def _set_shared_key(self, passphrase: str) -> None:
-        """Let the signer renew signatures of other systems that have the common passphrase."""
+        """Set the key with which the signer renews signatures of other systems."""
         self.signer.shared_key = key_from_passphrase(passphrase) if passphrase else b""
 
     def find(self, vehicle_id: int) -> Aircraft:
-        """Return an aircraft that was ever received; raises KeyError for another."""
+        """Return an aircraft that was received at some time; raises KeyError for any other."""
         found = self.aircraft.get(vehicle_id)
         return self._gone[vehicle_id] if found is None else found
 
-    def _ever(self) -> list[Aircraft]:
+    def _all_aircraft(self) -> list[Aircraft]:
         return [*self.aircraft.values(), *self._gone.values()]
 
     def change(self, vehicle_id: int, settings: AircraftSettings, now_us: int) -> Outputs:
-        """Change an aircraft's settings, as when it was recorded."""
+        """Change an aircraft's settings, at the time of the change in the recording."""
         out = Outputs()
         if (aircraft := self.aircraft.get(vehicle_id)) is not None:
             aircraft.change(settings, now_us, out)
@@ -202,9 +202,9 @@ class Pipeline:
         self._aircraft_of(state.vehicle_id).restore(state)
 
     def sign_by(self, common: str, own: Mapping[int, str], now_us: int) -> Outputs:
-        """Sign, and check signatures, with other passphrases from now on; empty is none.
+        """Sign frames, and verify signatures, with other passphrases from now on; empty for none.
 
-        `common` is that of every aircraft without its own.
+        `common` is used by every aircraft without its own.
         """
         known = self._settings
         aircraft = {
@@ -215,13 +215,13 @@ class Pipeline:
         self._settings = replace(known, default=default, aircraft=aircraft)
         self._set_shared_key(common)
         out = Outputs()
-        for each in self._ever():
+        for each in self._all_aircraft():
             each.sign_by(own.get(each.vehicle_id, common), now_us, out)
             self._set_key(each)
         return out
 
     def timestamps_to_keep(self) -> dict[int, KeptTimestamps] | None:
-        """Return the signing timestamps of all aircraft if they must be written now."""
+        """Return the signing timestamps of all aircraft if they must be stored now."""
         if not any(book.is_due for book in self._timestamps.values()):
             return None
         return {key: book.to_keep() for key, book in self._timestamps.items()}
@@ -231,7 +231,7 @@ class Pipeline:
         return {key: found for key, book in self._timestamps.items() if (found := book.exact())}
 
     def connect(self, port: str) -> None:
-        """Note that the source was opened; partly received data is dropped."""
+        """Set the state to connected; partly received data is dropped."""
         self._link.reopened()
         self._connected, self._port = True, port
         for source in self.sources:
@@ -240,7 +240,7 @@ class Pipeline:
         self._report_due_us = 0
 
     def disconnect(self, port: str) -> None:
-        """Note that the source is gone."""
+        """Set the state to disconnected."""
         self._connected, self._port = False, port
         for source in self.sources:
             if source.url.transport == "receiver":
@@ -248,19 +248,19 @@ class Pipeline:
         self._report_due_us = 0
 
     def handle(self, incoming: Incoming, now_us: int) -> Outputs:
-        """Pass a client's frame to every aircraft; the addressed one answers."""
+        """Pass a client's frame to all aircraft; the addressed one answers."""
         out = Outputs()
         for aircraft in self.aircraft.values():
             aircraft.perform(aircraft.vehicle.handle(incoming, now_us), now_us, out)
         return out
 
     def remove_client(self, client_id: int) -> None:
-        """Drop what was kept for a client that has gone."""
-        for aircraft in self._ever():
+        """Drop the state kept for a client that has disconnected."""
+        for aircraft in self._all_aircraft():
             aircraft.vehicle.remove_client(client_id)
 
     def say(self, status: StatusText, now_us: int) -> Outputs:
-        """Send a text from every aircraft."""
+        """Send a text from all aircraft."""
         out = Outputs()
         for aircraft in self.aircraft.values():
             aircraft.perform(aircraft.vehicle.say(status, now_us), now_us, out)
@@ -289,23 +289,23 @@ class Pipeline:
 
     @property
     def refused(self) -> int:
-        """Requests to change something from clients that may not."""
-        return sum(aircraft.vehicle.refusals for aircraft in self._ever())
+        """Number of requests to change something from clients without permission."""
+        return sum(aircraft.vehicle.refusals for aircraft in self._all_aircraft())
 
     @property
     def failed_requests(self) -> tuple[LoggedRequest, ...]:
-        """Requests of clients that were refused, failed or had no answer, the newest last."""
-        found = (entry for each in self._ever() for entry in each.vehicle.requests.entries)
+        """Requests of clients that were refused, failed or not answered, the newest last."""
+        found = (entry for each in self._all_aircraft() for entry in each.vehicle.requests.entries)
         return tuple(sorted(found, key=lambda entry: entry.time_us))
 
     @property
     def forged(self) -> int:
-        """Requests whose signature was wrong, old, or repeated."""
-        return sum(a.vehicle.faults[BAD_SIGNATURE] for a in self._ever())
+        """Number of requests with a wrong, old or repeated signature."""
+        return sum(a.vehicle.faults[BAD_SIGNATURE] for a in self._all_aircraft())
 
     def on_stall(self, stalled_us: int, now_us: int) -> None:
-        """Excuse sensors and nodes for a time in which this program was not running."""
-        for each in self._ever():
+        """Extend timeouts of sensors and nodes by a time in which this program did not run."""
+        for each in self._all_aircraft():
             each.vehicle.health.on_stall(stalled_us, now_us)
             if each.received_us is not None:
                 each.received_us += stalled_us
@@ -313,7 +313,7 @@ class Pipeline:
     def on_recorder(
         self, trouble: str, now_us: int, *, recording: bool, expected: bool = True
     ) -> Outputs:
-        """Note whether a recording runs and should, or why not; this is announced."""
+        """Announce whether a recording runs and should run, or why not."""
         out = Outputs()
         for each in self.aircraft.values():
             found = each.vehicle.on_recorder(
@@ -329,7 +329,7 @@ class Pipeline:
         if reporting:
             self._report_due_us = now_us + REPORT_INTERVAL_US
             self.report = self._whole_report(now_us)
-            self._let_go(now_us)
+            self._remove_gone(now_us)
         for aircraft in self.aircraft.values():
             if reporting:
                 report = self._report_for(aircraft.vehicle_id)
@@ -338,7 +338,7 @@ class Pipeline:
         return out
 
     def _whole_report(self, now_us: int) -> LinkReport:
-        """Sum up the receiver's line and all other sources."""
+        """Return the report with the receiver's line and all other sources."""
         report = self._link.report(now_us, connected=self._connected, port=self._port)
         if not self.sources:
             return report
@@ -347,7 +347,7 @@ class Pipeline:
         return msgspec.structs.replace(report, nodes=report.nodes + links, sources=sources)
 
     def _report_for(self, vehicle_id: int) -> LinkReport:
-        """Return the report with the state of that from which a vehicle's records come."""
+        """Return the report with the state of the source of a vehicle's records."""
         report = self.report
         for source in self.sources:
             if vehicle_id in source.vehicles:
@@ -355,7 +355,7 @@ class Pipeline:
                 return msgspec.structs.replace(report, **known)
         return report
 
-    def _let_go(self, now_us: int) -> None:
+    def _remove_gone(self, now_us: int) -> None:
         for vehicle_id, aircraft in list(self.aircraft.items()):
             if aircraft.received_us is None:
                 aircraft.received_us = now_us
@@ -363,6 +363,6 @@ class Pipeline:
                 self._gone[vehicle_id] = self.aircraft.pop(vehicle_id)
 
     def next_due_us(self) -> int:
-        """Return when `poll` is to be called next, at the latest."""
+        """Return when `poll` must be called next, at the latest."""
         due = [aircraft.vehicle.next_due_us() for aircraft in self.aircraft.values()]
         return min([self._report_due_us, *due])

@@ -1,6 +1,6 @@
-"""The player's composition root: opens recordings and plays their vehicles to a hub.
+"""Composition root of the player: opens recordings and plays their vehicles to a hub.
 
-The counterpart of `daemon.py` for playback: from the command line, the panel, a test.
+It corresponds to `daemon.py`, for playback from the command line, the panel, or a test.
 """
 
 import asyncio
@@ -33,7 +33,7 @@ from gateway.wire.frame_editing import renumbered
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 
 READY_S: Final = 3.0
-"""A name that takes longer to be resolved is not waited for."""
+"""Maximum time to wait for names to be resolved."""
 READY_STEP_S: Final = 0.01
 RESOLVING: Final = "resolving"
 REFUSED: Final = "refused"
@@ -41,7 +41,7 @@ REFUSED: Final = "refused"
 
 @dataclass(frozen=True, slots=True)
 class PlayPlan:
-    """How to play: range, speed, gaps, and which part of the recording."""
+    """Options of a playback: range, speed, gaps, and messages to play."""
 
     begin: Moment | None = None
     end: Moment | None = None
@@ -50,9 +50,9 @@ class PlayPlan:
     loop: bool = False
     paused: bool = False
     with_commands: bool = False
-    """Play messages of stations and other requests to a vehicle too."""
+    """Also play messages of ground stations, and other requests to a vehicle."""
     commands_anywhere: bool = False
-    """Let recorded commands leave this machine; the user was asked."""
+    """Allow recorded commands to leave this machine; the user has confirmed it."""
 
 
 def prepare(flights: Sequence[PlayedFlight], plan: PlayPlan) -> None:
@@ -72,12 +72,12 @@ def prepare(flights: Sequence[PlayedFlight], plan: PlayPlan) -> None:
 
 
 def endpoints_beyond(settings: HubSettings) -> list[str]:
-    """Return the endpoints that lead to other machines."""
+    """Return the endpoints on other machines."""
     return [url for url in settings.endpoints if not stays_here(parse_endpoint(url))]
 
 
 class PlayerDaemon:
-    """A player with its clients: sends frames of recordings, answers clients' requests.
+    """A player with its clients: sends frames of recordings, and answers clients' requests.
 
     Raises ValueError if recorded commands would leave this machine without the user's consent.
     """
@@ -90,7 +90,7 @@ class PlayerDaemon:
         files: Sequence[str],
     ) -> None:
         if plan.with_commands and not plan.commands_anywhere and endpoints_beyond(settings.hub):
-            raise ValueError("recorded commands stay on this machine unless the user says yes")
+            raise ValueError("recorded commands stay on this machine unless the user confirms")
         self._now_us = GatewayClock()
         self._plan = plan
         self._player = self._make_player(flights)
@@ -123,7 +123,7 @@ class PlayerDaemon:
     async def start(self) -> None:
         """Open everything and start.
 
-        Raises ControlError without a control socket, FlightError if no endpoint's name is known.
+        Raises ControlError without a control socket, FlightError if no name can be resolved.
         """
         await self._control.start()
         asyncio.get_running_loop().set_default_executor(_LookUps())
@@ -170,7 +170,7 @@ class PlayerDaemon:
             max_gap_us=None if plan.max_gap_s is None else round(plan.max_gap_s * US_PER_S),
             loop=plan.loop,
         )
-        # It waits for the network, and then if the user wants to start paused.
+        # Pause until the network is ready, and longer if the user wants to start paused.
         player.pause(self._now_us())
         return player
 
@@ -225,10 +225,10 @@ class PlayerDaemon:
 
 
 class _LookUps(ThreadPoolExecutor):
-    """Look names up in daemon threads: no end of the process waits for a resolver."""
+    """Resolve names in daemon threads, so that the process can exit while a resolver is waiting."""
 
     def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Begin a job in a thread of its own; each client has at most one."""
+        """Start a job in its own thread; each client has at most one."""
         job: Future[Any] = Future()
         job.set_running_or_notify_cancel()
 
@@ -243,9 +243,9 @@ class _LookUps(ThreadPoolExecutor):
 
 
 class _Numbering:
-    """Sequence numbers: a frame between recorded ones must not look like a loss.
+    """Renumber frames, so that inserted frames do not appear as losses.
 
-    Until the first inserted frame of a sender its frames are played byte for byte.
+    Frames of a sender are played byte for byte until its first inserted frame.
     """
 
     def __init__(self) -> None:
@@ -260,7 +260,7 @@ class _Numbering:
         return renumbered(read, sequence).data if added else frame
 
     def inserted(self, frame: bytes) -> bytes:
-        """Return an answer or a repeated frame, numbered in between the recorded frames."""
+        """Return an answer or a repeated frame, numbered to fit between the recorded frames."""
         read = frame_of(frame)
         sequence = self._last[read.origin] = self._last.get(read.origin, 0xFF) + 1 & 0xFF
         self._added[read.origin] = self._added.get(read.origin, 0) + 1

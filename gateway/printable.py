@@ -1,4 +1,4 @@
-"""Texts for people: sanitised texts of others, errors and states in words."""
+"""Texts for users: sanitised texts from others, errors, and states."""
 
 import logging
 import math
@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import Final
 
 _CONTROL: Final = (*range(0x20), *range(0x7F, 0xA0))
-"""C0 and C1 control characters move the cursor, rename the window, or type for the user."""
+"""C0 and C1 control characters, which can move the cursor, rename the window, or enter input."""
 _INVISIBLE: Final = (
     *(0xAD, 0x61C, 0x180E, 0x200B, 0x200E, 0x200F),
     *range(0x2028, 0x202F),
@@ -16,18 +16,18 @@ _INVISIBLE: Final = (
     *range(0xE0000, 0xE0080),
 )
 """Unicode controls of direction and line breaks, and invisible format characters: a name with
-U+202E is read backwards. The joiners U+200C and U+200D are left, since scripts need them."""
+U+202E is displayed backwards. U+200C and U+200D are excluded, since scripts need them."""
 _KEPT: Final = frozenset(map(ord, "\n\t"))
 LONGEST: Final = 2000
-"""Letters of a log line; an address requested from the panel may have 60,000."""
+"""Maximum characters of a log line; an address requested from the panel may have 60,000."""
 UNKNOWN: Final = "—"
-"""In place of a number that is unknown."""
+"""Shown instead of an unknown number."""
 FEW_BYTES: Final = 200
-"""The end of a frame, or what an adapter still held."""
+"""Bytes that may be the end of a frame, or the buffer of an adapter, not another device."""
 
 
 class UserError(Exception):
-    """An error whose text names the fault and the remedy; it ends a command without a traceback."""
+    """An error whose text states fault and remedy; it ends a command without a traceback."""
 
 
 def _escape(code: int) -> str:
@@ -49,7 +49,7 @@ _JSON_ESCAPES: Final = {code: _json_escape(code) for code in (*_CONTROL[0x20:], 
 def printable(text: str) -> str:
     r"""Return a text with control and direction characters escaped, as `\xNN` or `\uNNNN`.
 
-    Line feeds and tabs stay.
+    Line feeds and tabs are kept.
     """
     return text.translate(_ESCAPES)
 
@@ -85,9 +85,9 @@ def figure(value: float | None, form: str, unit: str = "") -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """Return the text of an error, the operating system's if there is one."""
+    """Return the text of an error, from the operating system if it has one."""
     if hasattr(error, "library"):
-        # Of TLS, whose numbers are not the operating system's.
+        # A TLS error, whose number is not the operating system's.
         reason = getattr(error, "reason", None)
         return reason.replace("_", " ").lower() if reason else "no certificate and key in PEM"
     number = getattr(error, "errno", None) or 0
@@ -110,7 +110,7 @@ def unknown_choice(what: str, word: str, choices: Iterable[str]) -> str:
 
 
 def receiver_state(port: str, connected: bool, bytes_received: int, frames: int) -> str:
-    """Describe the receiver's port: a wrong device or speed is open, too, and sends no frames."""
+    """Describe the receiver's port; a wrong device or bit rate also opens, but yields no frames."""
     if not connected and port == "none":
         return "receiver: none"
     if not connected:

@@ -2,11 +2,11 @@
 
 Names follow the rule quantity, frame, unit. Body frame `_b` is FRD (x forward, y right, z down);
 navigation frame `_n` is NED. Times are integers in microseconds: `time_us` on the gateway clock
-(monotonic, zero when the daemon starts), `node_time_us` on a node's own clock. A float that is not
-known is NaN; a whole record that does not exist yet is None.
+(monotonic, zero when the daemon starts), `node_time_us` on a node's own clock. An unknown float is
+NaN; a record that does not exist yet is None.
 
-They are msgspec structs: created for every sample, they cost an eighth of a frozen dataclass, and
-are not tracked by the garbage collector. `msgspec.structs.replace` copies one with changes.
+They are msgspec structs: these are created for every sample, cost an eighth of a frozen dataclass,
+and are not tracked by the garbage collector. `msgspec.structs.replace` copies one with changes.
 """
 
 from enum import IntEnum, IntFlag
@@ -22,7 +22,7 @@ NAN = float("nan")
 UNKNOWN_VEC3: Vec3 = (NAN, NAN, NAN)
 
 RECORDED_ONLY = -1
-"""Client id of an outgoing frame that is written to the recording and sent to nobody."""
+"""Client id of an outgoing frame that is only written to the recording."""
 NODE_IMU: Final = 1 << 0
 NODE_GPS: Final = 1 << 3
 """Bits of `NodeStatus.sensors_present`."""
@@ -32,40 +32,40 @@ SOURCE_NODE: Final = 8
 START_V2: Final = 0xFD
 PAYLOAD_V1: Final = 6
 PAYLOAD_V2: Final = 10
-"""Where the payload of a MAVLink frame begins."""
+"""Offset of the payload in a MAVLink 2 frame."""
 EVERYBODY: Final = (0, 0)
 """Target of a message without one."""
 HEARTBEAT_TYPE_OFFSET: Final = 4
 _TYPE_GCS: Final = bytes((6,))
-"""MAV_TYPE_GCS."""
+"""MAV_TYPE_GCS as a byte."""
 _NO_AUTOPILOT: Final = bytes((8,))
-"""MAV_AUTOPILOT_INVALID."""
+"""MAV_AUTOPILOT_INVALID as a byte."""
 TXBUF_OFFSET: Final = 6
-"""Of RADIO_STATUS, behind its two counters and the two signal strengths."""
+"""Offset in RADIO_STATUS, after its two counters and the two signal strengths."""
 
 
 class ImuFlags(IntFlag):
     """State of an IMU node, one bit each; the first eight are those of the radio payload."""
 
     ACCEL_FILTERED = 1 << 0
-    """The node has low-passed the acceleration; the gateway must not do it again."""
+    """The node has low-pass filtered the acceleration; the gateway must not do it again."""
     GYRO_FILTERED = 1 << 1
-    """The node has high-passed the angular rate; the gateway must not do it again."""
+    """The node has high-pass filtered the angular rate; the gateway must not do it again."""
     MAG_NEW = 1 << 2
-    """The magnetometer values were sampled since the previous IMU payload."""
+    """The magnetometer values are new since the previous IMU payload."""
     MAG_ABSENT = 1 << 3
     BARO_ABSENT = 1 << 4
     SELF_TEST_FAILED = 1 << 5
     ACCEL_CLIPPED = 1 << 6
     GYRO_CLIPPED = 1 << 7
     MAG_UNCALIBRATED = 1 << 8
-    """Set by the gateway: the compass was never calibrated, hard and soft iron are not removed."""
+    """Set by the gateway: the compass has no calibration, so hard and soft iron are not removed."""
     GYRO_UNCALIBRATED = 1 << 9
     ACCEL_UNCALIBRATED = 1 << 10
-    """Set by the gateway too: a sensor whose bias is not removed."""
+    """Set by the gateway: the bias of the sensor is not removed."""
 
     __and__ = int.__and__  # type: ignore[assignment]
-    """Returns a plain int to test a bit: building a flag would cost six times as much."""
+    """Return a plain int, to test a bit: creating a flag would take six times as long."""
 
 
 class GpsFixType(IntEnum):
@@ -80,7 +80,7 @@ class GpsFixType(IntEnum):
 
 
 class NavFlags(IntFlag):
-    """State of an estimator, and which of its outputs are valid."""
+    """State of an estimator, and validity of its outputs."""
 
     ATTITUDE_VALID = 1 << 0
     """Roll and pitch have converged."""
@@ -90,32 +90,32 @@ class NavFlags(IntFlag):
     VELOCITY_VALID = 1 << 3
     ALTITUDE_VALID = 1 << 4
     AT_REST = 1 << 5
-    """Rest was detected; gyro bias is being learned."""
+    """At rest; the gyroscope bias is being estimated."""
     USING_GPS = 1 << 6
     USING_MAG = 1 << 7
     USING_BARO = 1 << 8
     MAG_DISTURBED = 1 << 9
     GPS_REJECTED = 1 << 10
-    """The newest fixes failed the innovation check and were not used."""
+    """The newest fixes failed the innovation check, and were not used."""
     DEAD_RECKONING = 1 << 11
-    """Position and velocity run on inertial data only, because the last fix is old."""
+    """Position and velocity are from inertial data only, because the last fix is old."""
     SENSOR_FAULT = 1 << 12
-    """A sensor is stuck, saturated or not finite, and was left out."""
+    """A sensor is stuck, saturated or not finite, and was not used."""
     DEGRADED = 1 << 13
-    """At least one output is worse than the estimator's normal working."""
+    """At least one output is less accurate than in normal operation."""
     MAG_MISPLACED = 1 << 14
-    """The field turns otherwise than the aircraft, since axes of the compass are swapped or
-    reversed; it is not used."""
+    """The field rotates differently from the aircraft, because axes of the compass are swapped or
+    reversed; the compass is not used."""
 
     __and__ = int.__and__  # type: ignore[assignment]
-    """As in `ImuFlags`."""
+    """See `ImuFlags`."""
 
 
 class NodeId(msgspec.Struct, frozen=True, gc=False):
-    """The node and aircraft that a payload comes from."""
+    """The node and the aircraft of a payload."""
 
     vehicle_id: int
-    """1 to 31; becomes the MAVLink system id unless the settings say otherwise."""
+    """1 to 31; it is the MAVLink system id unless the settings state another one."""
     node_id: int
     """0 to 7, unique within the aircraft."""
 
@@ -137,14 +137,14 @@ class ImuRaw(msgspec.Struct, frozen=True, gc=False):
 
 
 class ImuCalibrated(msgspec.Struct, frozen=True, gc=False):
-    """One IMU sample in SI and body FRD without counts, as from other programs' logs."""
+    """One IMU sample in SI and body FRD without counts, as in other programs' logs."""
 
     time_us: int
     node: NodeId
     accel_b_mps2: Vec3
     gyro_b_radps: Vec3
     mag_b_ut: Vec3 | None
-    """None unless newly sampled."""
+    """Magnetic field; None unless it is a new sample."""
     temperature_degc: float
     flags: ImuFlags
 
@@ -160,7 +160,7 @@ class BaroRaw(msgspec.Struct, frozen=True, gc=False):
 
 
 class GpsFix(msgspec.Struct, frozen=True, gc=False):
-    """One GPS fix at its arrival on the gateway clock; it was valid `latency` earlier."""
+    """One GPS fix at its arrival on the gateway clock; it was valid earlier by the latency."""
 
     time_us: int
     node: NodeId
@@ -168,21 +168,21 @@ class GpsFix(msgspec.Struct, frozen=True, gc=False):
     itow_ms: int
     fix_type: GpsFixType
     fix_ok: bool
-    """The receiver's own gnssFixOK: within its accuracy masks."""
+    """The receiver's gnssFixOK: the fix is within its accuracy masks."""
     satellites: int
     lat_dege7: int
     lon_dege7: int
     alt_amsl_m: float
     vel_n_mps: Vec3
     alt_ellipsoid_m: float
-    """NaN until a quality payload has given the geoid separation."""
+    """NaN until a quality payload has contained the geoid separation."""
     h_acc_m: float
     v_acc_m: float
     speed_acc_mps: float
     course_acc_deg: float
     pdop: float
     utc_us: int | None
-    """Unix time of the fix, or None while the receiver does not report date and time as valid."""
+    """Unix time of the fix; None while the receiver reports date or time as invalid."""
 
 
 class RadioState(IntEnum):
@@ -191,13 +191,13 @@ class RadioState(IntEnum):
     OK = 0
     ABSENT = 1
     LOSES_SETTINGS = 2
-    """It does not keep its configuration."""
+    """The module does not keep its configuration."""
     ACTIVATED = 3
-    """It works, but needed ACTIVATE: it is no nRF24L01+."""
+    """The module works, but required ACTIVATE, so it is not an nRF24L01+."""
 
     @property
     def problem(self) -> str:
-        """The fault, for people; empty if it works."""
+        """Description of the fault; empty if there is none."""
         match self:
             case RadioState.ABSENT:
                 return "radio module does not answer"
@@ -208,20 +208,20 @@ class RadioState(IntEnum):
 
 
 def node_role(sensors_present: int) -> str:
-    """Name a node's role by its sensors."""
+    """Return a node's role, from its sensors."""
     if sensors_present & NODE_IMU:
         return "IMU node"
     return "GPS node" if sensors_present & NODE_GPS else "Node"
 
 
 def board_name(node: NodeId, sensors_present: int = 0) -> str:
-    """Name a board by aircraft and sensors, `1 IMU`, or before its report by number: `1.0`."""
+    """Return a board's name: aircraft and sensors, `1 IMU`; before its report `1.0`."""
     role = node_role(sensors_present).removesuffix(" node")
     return f"{node.vehicle_id}.{node.node_id}" if role == "Node" else f"{node.vehicle_id} {role}"
 
 
 class NodeStatus(msgspec.Struct, frozen=True, gc=False):
-    """A node's own once-a-second report."""
+    """A node's report on itself, sent once a second."""
 
     time_us: int
     node: NodeId
@@ -238,11 +238,11 @@ class NodeStatus(msgspec.Struct, frozen=True, gc=False):
     supply_mv: int
     radio: RadioState = RadioState.OK
     chips: tuple[str, ...] = ()
-    """Names of the chips found since its start; empty from firmware before 1.1."""
+    """Names of the chips detected since its start; empty from firmware before 1.1."""
 
 
 class PipeCounters(msgspec.Struct, frozen=True, gc=False):
-    """Counts of the receiver on one of its six radio pipes since it started."""
+    """Counts of the receiver since its start for one of its six radio pipes."""
 
     received: int
     lost: int
@@ -250,19 +250,19 @@ class PipeCounters(msgspec.Struct, frozen=True, gc=False):
 
 
 def channel_name(channel: int) -> str:
-    """Name the channel of a receiver's report."""
+    """Return the name of the channel in a receiver's report."""
     return "LoRa" if channel == LORA_CHANNEL else f"channel {channel}"
 
 
 class ReceiverStatus(msgspec.Struct, frozen=True, gc=False):
-    """The receiver's own once-a-second report."""
+    """The receiver's report on itself, sent once a second."""
 
     time_us: int
     receiver_time_us: int
     channel: int
-    """Of an nRF24L01+: 2400 MHz plus this; `LORA_CHANNEL` for a LoRa radio."""
+    """Channel of an nRF24L01+, 2400 MHz plus this; `LORA_CHANNEL` for a LoRa radio."""
     noise_percent: int
-    """Share of idle listening in which the channel held a carrier above -64 dBm, or -100 dBm."""
+    """Share of idle time in which the channel had a carrier above -64 dBm (LoRa: -100 dBm)."""
     uart_dropped: int
     reset_cause: int
     pipes: tuple[PipeCounters, ...]
@@ -277,10 +277,10 @@ class ImuSample(msgspec.Struct, frozen=True, gc=False):
 
     time_us: int
     accel_b_mps2: Vec3
-    """Specific force, calibrated, in the node's bandwidth; level at rest (0, 0, -9.81)."""
+    """Specific force, calibrated, in the node's bandwidth; (0, 0, -9.81) when level at rest."""
     gyro_b_radps: Vec3
     mag_b_ut: Vec3 | None
-    """Calibrated magnetic field, None unless newly sampled."""
+    """Calibrated magnetic field; None unless it is a new sample."""
     temperature_degc: float
     flags: ImuFlags
 
@@ -316,40 +316,40 @@ class NavState(msgspec.Struct, frozen=True, gc=False):
 
 
 class FusedSample(msgspec.Struct, frozen=True, gc=False):
-    """One IMU sample and the state it led to.
+    """One IMU sample and the resulting state.
 
-    Together with the `BaroRaw` and `GpsFix` records in between, in their order, it is all that a
-    recording needs to be fused again bit for bit.
+    Together with the `BaroRaw` and `GpsFix` records in between, in their order, these are all data
+    that a recording requires to be fused again bit for bit.
     """
 
     vehicle_id: int
     imu: ImuRaw | None
-    """None where the source has no counts."""
+    """None if the source has no counts."""
     sample: ImuSample
     state: NavState
 
 
 class FusionState(msgspec.Struct, frozen=True, gc=False):
-    """The state of one aircraft between two samples that is needed to continue exactly."""
+    """The state of one aircraft between two samples, with which fusion continues exactly."""
 
     vehicle_id: Annotated[int, msgspec.Meta(ge=1, le=255)]
     fits: str
-    """Checksum of version and settings that it can be restored with."""
+    """Checksum of the version and the settings with which it can be restored."""
     estimation: bytes
-    """Private to the stage that writes it."""
+    """State in a format private to the stage that writes it."""
     home: tuple[float, float, float, int] | None = None
-    """Latitude and longitude in degrees, height in m AMSL, and since when on the gateway clock."""
+    """Latitude and longitude in degrees, height in m AMSL, time of setting on the gateway clock."""
 
 
 class RadioSignal(msgspec.Struct, frozen=True, gc=False):
-    """How a packet was received, by a radio that measures it."""
+    """Signal of a received packet, from a radio that measures it."""
 
     rssi_dbm: int
     snr_db: float
 
 
 class BatteryReport(msgspec.Struct, frozen=True, gc=False, kw_only=True):
-    """A battery as an autopilot or a tracker reports it; unknown values are NaN."""
+    """A battery as reported by an autopilot or a tracker; unknown values are NaN."""
 
     number: int = 0
     voltage_v: float = NAN
@@ -360,18 +360,18 @@ class BatteryReport(msgspec.Struct, frozen=True, gc=False, kw_only=True):
 
 
 class VehicleReport(msgspec.Struct, frozen=True, gc=False, kw_only=True):
-    """Part of a vehicle's state as its own autopilot reports it: passed on, never fused.
+    """Part of a vehicle's state as reported by its own autopilot: passed on, never fused.
 
-    Each report has a few of the fields; the others are NaN, None or empty, and leave as they are
-    those that earlier reports have set.
+    A report contains some of the fields; the others are NaN, None or empty, and do not change the
+    values of earlier reports.
     """
 
     time_us: int
     node: NodeId
     attitude_rad: Vec3 | None = None
-    """Roll, pitch and yaw; yaw is from true north, as far as the autopilot knows it."""
+    """Roll, pitch and yaw; yaw is from true north, as far as the autopilot can determine it."""
     heading_rad: float = NAN
-    """Heading, where roll and pitch are unknown."""
+    """Heading, used if roll and pitch are unknown."""
     climb_mps: float = NAN
     airspeed_mps: float = NAN
     alt_home_m: float = NAN
@@ -382,7 +382,7 @@ class VehicleReport(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     battery: BatteryReport | None = None
     mode: str = ""
     custom_mode: int | None = None
-    """Number of the mode as ArduPilot counts them, by which ground stations name it."""
+    """Number of the mode in ArduPilot's numbering, which ground stations use to name it."""
     armed: bool | None = None
     vehicle_type: int | None = None
     """A MAV_TYPE."""
@@ -391,34 +391,34 @@ class VehicleReport(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     link_quality_percent: float = NAN
     signal: "RadioSignal | None" = None
     channels_us: tuple[int, ...] = ()
-    """Pulse widths of the radio control's channels."""
+    """Pulse widths of the remote control's channels."""
     values: tuple[tuple[str, float], ...] = ()
     """Other measurements by name, such as temperatures."""
 
 
 class NodeLink(msgspec.Struct, frozen=True, gc=False):
-    """Counts of the gateway for one node since it started."""
+    """Counts of the gateway for one node since the gateway's start."""
 
     node: NodeId
     pipe: int
     received: int
     lost: int
-    """Gaps in the node's sequence, less late payloads."""
+    """Gaps in the node's sequence numbers, minus late payloads."""
     duplicates: int
     reordered: int
     restarts: int
     rate_hz: float
-    """Payloads per second, over the last second."""
+    """Payloads per second, measured over the last second."""
     last_time_us: int
-    """Arrival of the newest payload on the gateway clock."""
+    """Time of arrival of the newest payload on the gateway clock."""
     clock_skew_ppm: float
-    """How much faster than the gateway's the node's clock runs."""
+    """Clock rate of the node relative to the gateway's; positive if it is faster."""
     signal: RadioSignal | None = None
-    """Of the newest payload; None from a radio that does not measure it."""
+    """Signal of the newest payload; None from a radio that does not measure it."""
 
 
 class LinkReport(msgspec.Struct, frozen=True, gc=False):
-    """State of the serial link and of every node behind it; built once a second."""
+    """State of the serial link and of all nodes behind it; created once a second."""
 
     time_us: int
     connected: bool
@@ -426,15 +426,15 @@ class LinkReport(msgspec.Struct, frozen=True, gc=False):
     bytes_received: int
     frames: int
     frames_lost: int
-    """Gaps in the receiver's own frame sequence."""
+    """Gaps in the receiver's own frame numbers."""
     faults: tuple[tuple[str, int], ...]
-    """Kind and number of faults, only of kinds that occurred."""
+    """Kind and number of the faults that have occurred."""
     nodes: tuple[NodeLink, ...]
     receiver: ReceiverStatus | None
     foreign: int = 0
     """Packets of other programs that the receiver passed on."""
     name: str = "Receiver"
-    """Of that which is connected or not."""
+    """Name of the device whose connection is reported."""
     sources: "tuple[SourceReport, ...]" = ()
 
 
@@ -445,97 +445,97 @@ class SourceReport(msgspec.Struct, frozen=True, gc=False):
     node: NodeId
     connected: bool
     reason: str
-    """Why it is not connected; empty if it is."""
+    """Reason why it is not connected; empty if it is."""
     bytes_received: int
     records: int
     faults: tuple[tuple[str, int], ...]
-    """Kind and number."""
+    """Kind and number of the faults that have occurred."""
     newest_fault: str
     last_time_us: int | None
-    """Of the newest record."""
+    """Time of the newest record."""
 
 
 class MavFrame(msgspec.Struct, frozen=True, gc=False):
-    """One complete frame with its header read; made once, then passed on unchanged."""
+    """One complete frame with its decoded header; created once, then passed on unchanged."""
 
     data: bytes
     """The frame, byte for byte."""
     key: bytes
-    """System, component and message as header bytes: the kind of frame, as a dictionary key."""
+    """System, component and message as header bytes, which identify the kind of frame in a dict."""
     message_id: int
     origin: tuple[int, int]
     """System and component that sent it."""
     target: tuple[int, int]
-    """System and component that it addresses; 0 is everybody."""
+    """System and component that it addresses; 0 addresses all."""
     sequence: int
     signed: bool
 
     @property
     def payload(self) -> bytes:
-        """The payload as sent: version 2 cuts trailing zeros off."""
+        """The payload as sent: MAVLink 2 truncates trailing zeros."""
         begin = PAYLOAD_V2 if self.data[0] == START_V2 else PAYLOAD_V1
         return self.data[begin : begin + self.data[1]]
 
     @property
     def is_station_heartbeat(self) -> bool:
-        """Whether this HEARTBEAT reports that its sender is a ground station."""
+        """Whether this HEARTBEAT is from a ground station."""
         return self.payload[HEARTBEAT_TYPE_OFFSET : HEARTBEAT_TYPE_OFFSET + 1] == _TYPE_GCS
 
     @property
     def is_autopilot_heartbeat(self) -> bool:
-        """Whether this HEARTBEAT is an autopilot's, and not a station's or a companion's."""
+        """Whether this HEARTBEAT is from an autopilot, not from a station or a companion."""
         autopilot = self.payload[HEARTBEAT_TYPE_OFFSET + 1 : HEARTBEAT_TYPE_OFFSET + 2]
         return not self.is_station_heartbeat and autopilot != _NO_AUTOPILOT
 
     @property
     def free_percent(self) -> int:
-        """Free part of the transmit buffer in this RADIO_STATUS."""
+        """Free share of the transmit buffer in this RADIO_STATUS, percent."""
         payload = self.payload
         return payload[TXBUF_OFFSET] if len(payload) > TXBUF_OFFSET else 0
 
 
 class Outgoing(msgspec.Struct, frozen=True, gc=False):
-    """One encoded MAVLink frame and where it goes."""
+    """One encoded MAVLink frame and its destination."""
 
     frame: bytes
     message_id: int
     client_id: int | None = None
-    """The one client it answers, None for every client, or `RECORDED_ONLY`."""
+    """The client that it answers, None for all clients, or `RECORDED_ONLY`."""
     header: MavFrame | None = None
-    """The same frame with its header, if the encoder has provided it."""
+    """The same frame with its decoded header, if the encoder has provided it."""
 
 
 class ClientInterval(msgspec.Struct, frozen=True, gc=False):
-    """A client's requested rate for one message of one system."""
+    """A client's requested interval for one message of one system."""
 
     client_id: int
     system_id: int
     message_id: int
     interval_us: int
-    """Least time between two frames; 0 for the settings' rate, -1 for none at all."""
+    """Minimum time between two frames; 0 for the rate in the settings, -1 to stop the message."""
 
 
 class Incoming(msgspec.Struct, frozen=True, gc=False):
-    """One MAVLink frame that a client sent."""
+    """One MAVLink frame received from a client."""
 
     client_id: int
     frame: bytes
     trusted: bool
-    """Whether the settings let this client change state."""
+    """Whether the settings allow this client to change the state."""
     forwarded: bool = False
-    """Whether it is forwarded to other systems too, and so recorded there."""
+    """Whether it is also forwarded to other systems, and recorded there."""
 
 
 class LoggedRequest(msgspec.Struct, frozen=True, gc=False):
-    """One kind of request of one sender, with one outcome."""
+    """Requests of one kind from one sender, with one outcome."""
 
     vehicle_id: int
     system_id: int
     component_id: int
     request: str
-    """Message, and what it is about: `COMMAND_LONG REQUEST_MESSAGE 62`."""
+    """Message and its subject, such as `COMMAND_LONG REQUEST_MESSAGE 62`."""
     outcome: str
     """Reason, such as `UNSUPPORTED` or `no answer`."""
     count: int
     time_us: int
-    """When the newest was received, on the gateway clock."""
+    """Time on the gateway clock at which the newest one was received."""

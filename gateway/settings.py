@@ -1,4 +1,4 @@
-"""Base of every stage's settings: frozen, strict, and documented where they are declared.
+"""Base of all settings: frozen, strict, and documented where they are declared.
 
 A stage declares its own `…Settings(Settings)` in the file of the code that uses it; each field is
 `Annotated` with `Setting(...)`, which carries its unit, meaning and range. `config.py` only fills
@@ -15,7 +15,7 @@ import msgspec
 
 
 class Settings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of all settings: immutable, keyword-only, unknown keys refused."""
+    """Base of all settings: immutable, keyword-only; unknown keys are rejected."""
 
 
 def setting(
@@ -38,13 +38,13 @@ def setting(
     unit : str
         Unit of the value; empty for a name, a switch or a pure number.
     ge, le, pattern : optional
-        Least and greatest allowed number; regular expression that a text must match.
+        Minimum and maximum of a number; regular expression that a text must match.
     rotation : bool
-        Whether the value is a rotation matrix, which is set by angles as a parameter.
+        Whether the value is a rotation matrix, which is set as angles by parameters.
     path : bool
         Whether the value is a file or folder, where `~` is the home folder.
     choices : collection of str, optional
-        The allowed texts if the type does not list them, as for a registry that may grow. The
+        The allowed texts if the type does not list them, as for an extensible registry. The
         settings class checks them itself.
     """
     extra = {"unit": unit, "rotation": rotation, "path": path, "choices": choices}
@@ -54,35 +54,35 @@ def setting(
 
 
 def _exact(bound: float | None) -> float | None:
-    """Return a whole bound as an integer, which msgspec needs for an integer field."""
+    """Return an integral bound as an int, which msgspec requires for an int field."""
     return int(bound) if bound is not None and float(bound).is_integer() else bound
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One key of a settings class, with the facts of its annotation."""
+    """One key of a settings class, with the facts from its annotation."""
 
     name: str
     type: Any
-    """The annotated type, as msgspec converts to it."""
+    """The annotated type, as msgspec requires it for conversion."""
     default: Any
     section: "type[Settings] | None"
-    """The settings class, if the key is a section of its own."""
+    """The settings class, if the key is a section."""
     choices: tuple[str, ...]
-    """The allowed texts, if it is one of a few."""
+    """The allowed texts, if the type is a choice."""
     meaning: str
     unit: str
     is_rotation: bool
-    """Whether the value is the matrix of a rotation."""
+    """Whether the value is a rotation matrix."""
     is_path: bool
-    """Whether the value names a file or folder."""
+    """Whether the value is the path of a file or folder."""
     bounds: tuple[float | None, float | None]
-    """Least and greatest allowed number, of a vector of each of its components; None where there
-    is no bound."""
+    """Minimum and maximum of a number, or of each component of a vector; None if there is no
+    bound."""
 
     @property
     def range(self) -> str:
-        """The bounds as text, such as `0 to 1000`; empty without any."""
+        """The bounds as text, such as `0 to 1000`; empty if there are none."""
         low, high = self.bounds
         if low is not None and high is not None:
             return f"{low:.12g} to {high:.12g}"
@@ -92,7 +92,7 @@ class Field:
 
 
 def fields_of(kind: type[Settings]) -> list[Field]:
-    """List the keys of a settings class, plain keys before sections as TOML requires."""
+    """Return the keys of a settings class, plain keys before sections, as TOML requires."""
     found = []
     for info in msgspec.structs.fields(kind):
         factory = info.default_factory
@@ -134,7 +134,7 @@ def _plain(kind: Any) -> Any:
 
 
 def _metas(kind: Any) -> Iterator[msgspec.Meta]:
-    """Find every `setting(...)` in a type, the outermost first."""
+    """Yield every `setting(...)` in a type, the outermost first."""
     for meta in getattr(kind, "__metadata__", ()):
         if isinstance(meta, msgspec.Meta):
             yield meta

@@ -1,4 +1,4 @@
-"""Status of the daemon at one moment, for the live view, the status command and the metrics."""
+"""Status of the daemon at one moment, for live view, status command and metrics."""
 
 import math
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class RecorderStatus:
     name: str
     part: int
     duration_s: float
-    """Of the recording so far, or of the last one."""
+    """Duration of the recording so far, or of the last one."""
     part_bytes: int
     free_bytes: int
     reason: str
@@ -38,7 +38,7 @@ class RelativeLocation:
     lon_deg: float
     alt_amsl_m: float
     distance_m: float | None
-    """Over ground; None while the aircraft's position is not known."""
+    """Distance over ground; None if the aircraft's position is unknown."""
     bearing_deg: float | None
 
 
@@ -48,11 +48,11 @@ class AircraftStatus:
 
     vehicle_id: int
     fix: GpsFix | None
-    """The newest, good or not."""
+    """The newest fix, valid or not."""
     home: RelativeLocation | None
     mark: RelativeLocation | None
     boards: tuple[NodeStatus, ...]
-    """The newest report of each node about itself."""
+    """The newest report of each node."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,26 +62,26 @@ class Snapshot:
     time_us: int
     report: LinkReport
     states: tuple[tuple[int, NavState], ...]
-    """Newest state by vehicle id; an aircraft without IMU samples yet is not in it."""
+    """Newest state by vehicle id; an aircraft without IMU samples so far is left out."""
     clients: tuple[ClientStats, ...]
     sent: tuple[tuple[int, int], ...]
-    """MAVLink message id and how many were sent since the start."""
+    """MAVLink message id, and the number of messages sent since the start."""
     hub: HubCounters
     listeners: tuple[ListenerStats, ...] = ()
     places_not_kept: int = 0
-    """Changes of missions, marks and homes that could not be written since the start."""
+    """Changes of missions, marks and home positions since the start that could not be written."""
     refused: int = 0
-    """Requests to change something from clients that may not."""
+    """Number of requests to change something from clients without permission."""
     forged: int = 0
-    """Requests whose signature was wrong, old, or repeated."""
+    """Number of requests with a wrong, old or repeated signature."""
     simulated: bool = False
-    """Whether the receiver is the simulated one."""
+    """Whether the receiver is simulated."""
     aircraft: tuple[AircraftStatus, ...] = ()
     recorder: RecorderStatus | None = None
     slow_s: float = 0.0
-    """How late the event loop was at most while the computer is too slow; 0 while it keeps up."""
+    """Greatest delay of the event loop while the computer is too slow; 0 otherwise."""
     requests: tuple[LoggedRequest, ...] = ()
-    """Requests of clients that were refused, failed or had no answer."""
+    """Requests of clients that were refused, failed or not answered."""
 
 
 def status_of(aircraft: Aircraft) -> AircraftStatus:
@@ -110,7 +110,7 @@ def _seen_from(here: Location | None, there: Location | None) -> RelativeLocatio
 
 
 def summary_line(snapshot: Snapshot) -> str:
-    """Summarise a snapshot in one line for a log."""
+    """Summarise a snapshot in one line for the log."""
     report = snapshot.report
     received = report.bytes_received, report.frames
     parts = [receiver_state(report.port, report.connected, *received)]

@@ -1,4 +1,4 @@
-"""TOML files of users: settings and column maps, bounded in size, nesting and kind of file."""
+"""TOML files of users: settings and column maps, limited in size, nesting and kind of file."""
 
 import os
 import re
@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, Final
 
 MAX_BYTES: Final = 1_000_000
-"""A complete settings file with its comments has some 40 kB."""
+"""Maximum size; a complete settings file with its comments has about 40 kB."""
 MAX_DEPTH: Final = 8
-"""Levels of sections, lists and tables; a parser takes quadratic time for a deep one."""
+"""Levels of sections, lists and tables; the time of a parser is quadratic in the depth."""
 
 _TOKENS: Final = re.compile(
     r'"""(?:\\.|[^\\])*?"""'
@@ -24,7 +24,7 @@ _TOKENS: Final = re.compile(
 
 
 class TomlError(ValueError):
-    """A file that cannot be used; the text says why, without the file's name."""
+    """A file that cannot be used; the text states the reason, without the file's name."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -32,12 +32,12 @@ def read_toml(path: Path) -> dict[str, Any]:
     text = read_toml_text(path)
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # Also endless numbers.
+    except (ValueError, RecursionError) as error:  # Includes numbers with too many digits.
         raise TomlError(f"is not valid TOML: {error}") from error
 
 
 def read_toml_text(path: Path) -> str:
-    """Read the text of a file; raises TomlError as `read_toml`, but does not parse it."""
+    """Read the text of a file without parsing it; raises TomlError as `read_toml`."""
     try:
         data = _read(path)
     except OSError as error:
@@ -52,7 +52,7 @@ def read_toml_text(path: Path) -> str:
 
 
 def _read(path: Path) -> bytes:
-    # A pipe that nobody writes to would wait here.
+    # Non-blocking: opening a pipe without a writer would wait forever.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     with os.fdopen(descriptor, "rb") as file:
         mode = os.fstat(descriptor).st_mode
@@ -65,7 +65,7 @@ def _read(path: Path) -> bytes:
 
 
 def _check_depth(text: str) -> None:
-    """Refuse nesting that a parser would take too long for, by brackets and dotted keys."""
+    """Reject nesting on which a parser would take too long, by brackets and dotted keys."""
     depth = dots = 0
     line = 1
     for found in _TOKENS.finditer(text):

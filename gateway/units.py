@@ -1,4 +1,4 @@
-"""Physical constants, the factors between external units and SI, and numbers with their noun."""
+"""Physical constants, factors between external units and SI, and numbers with a noun."""
 
 from typing import Final
 
@@ -18,5 +18,5 @@ PA_PER_HPA: Final = 100.0
 
 
 def counted(number: int, noun: str) -> str:
-    """Return a number and what it counts: `1 line`, `2 lines`."""
+    """Return a number with its noun: `1 line`, `2 lines`."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -136,7 +136,7 @@ async def test_recorded_high_latency_messages_are_played(make: Make, station: Pl
 def test_commands_to_other_machines_need_confirmation(make: Make, url: str) -> None:
     urls = ("udp:127.0.0.1:14550", "tcp:[::1]:5760", url)
     assert endpoints_beyond(settings_of(*urls).hub) == [url]
-    with pytest.raises(ValueError, match="yes"):
+    with pytest.raises(ValueError, match="unless the user confirms"):
         make(*urls, with_commands=True)
     make(*urls, with_commands=True, commands_anywhere=True)
     make(*urls)

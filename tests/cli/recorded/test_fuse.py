@@ -63,7 +63,7 @@ def test_settings_file_overrides_facts_of_the_log(log: Path) -> None:
 def test_input_as_output_is_refused(log: Path, force: list[str]) -> None:
     before = log.read_bytes()
     result = invoke("fuse", log, "-o", log, *force, code=2)
-    assert "is what the output is made of" in result.output
+    assert "is an input; give another output" in result.output
     assert log.read_bytes() == before
 
 
