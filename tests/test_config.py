@@ -123,26 +123,20 @@ def test_error_names_file_key_value_and_allowed_values(
 
 
 def test_all_errors_are_reported_at_once(tmp_path: Path) -> None:
-    text = "[serial]\nbaud = 1\nport = 2\n[vehicle]\nnope = 3\n"
-    assert len(errors_in(tmp_path, text)) == 3
-
-
-def test_every_endpoint_is_reported_next_to_other_errors(tmp_path: Path) -> None:
     urls = ["udp:", "tcp:host:99999", "udp:127.0.0.1:14550", "udp:127.0.0.1:14550?name=b"]
-    text = f"[hub]\nmax_clients = 0\nendpoints = {urls}\n[serial]\nbaud = 1\n"
-    lines = errors_in(tmp_path, text)
-    assert len(lines) == 5
-    for words in ("max_clients", "'udp:'", "99999", "is given twice", "serial.baud"):
+    hub = f"[hub]\nmax_clients = 0\nendpoints = {urls}\n"
+    lines = errors_in(tmp_path, f"{hub}[serial]\nbaud = 1\nport = 2\n[vehicle]\nnope = 3\n")
+    errors = ("'udp:'", "99999", "is given twice", "serial.baud", "serial.port", "vehicle.nope")
+    assert len(lines) == 7
+    for words in ("max_clients", *errors):
         assert sum(words in line for line in lines) == 1
 
 
 def test_error_of_a_choice_lists_the_allowed_values(tmp_path: Path) -> None:
     text = '[estimation.paper]\naccel_filter = "chebishev"\n[vehicle]\ntype = "ufo"\n'
     chosen, vehicle = sorted(errors_in(tmp_path, text))
-    assert "did you mean 'chebyshev'? allowed: " in chosen
-    assert "butterworth" in chosen
-    assert "allowed: " in vehicle
-    assert "quadrotor" in vehicle
+    assert re.search("did you mean 'chebyshev'\\? allowed: .*butterworth", chosen)
+    assert re.search("allowed: .*quadrotor", vehicle)
 
 
 def test_missing_file_is_an_error(tmp_path: Path) -> None:
@@ -158,8 +152,8 @@ def settings(tmp_path: Path) -> GatewaySettings:
 def test_aircraft_file_overrides_common_settings(settings: GatewaySettings) -> None:
     estimation = msgspec.convert({"paper": {"accel_cutoff_hz": 7.0}}, EstimationSettings)
     settings = msgspec.structs.replace(settings, estimation=estimation)
-    folder = Path(settings.aircraft_folder)
-    folder.mkdir()
+    assert load_aircraft(settings) == {}
+    (folder := Path(settings.aircraft_folder)).mkdir()
     (folder / "3.toml").write_text(
         '[vehicle]\ntype = "quadrotor"\n[calibration]\ngyro_bias_radps = [0.1, 0.0, -0.1]\n'
         '[estimation.paper]\naccel_filter = "chebyshev"\n'
@@ -173,14 +167,10 @@ def test_aircraft_file_overrides_common_settings(settings: GatewaySettings) -> N
     assert (paper.accel_cutoff_hz, paper.accel_filter) == (7.0, "chebyshev")
 
 
-def test_missing_aircraft_folder_gives_no_aircraft(settings: GatewaySettings) -> None:
-    assert load_aircraft(settings) == {}
-
-
 def test_invalid_aircraft_files_are_reported(settings: GatewaySettings) -> None:
-    Path(settings.aircraft_folder).mkdir()
-    (Path(settings.aircraft_folder) / "1.toml").write_text("[calibration]\nbias = 3\n")
-    (Path(settings.aircraft_folder) / "2.toml").write_text("[calibration\n")
+    (folder := Path(settings.aircraft_folder)).mkdir()
+    (folder / "1.toml").write_text("[calibration]\nbias = 3\n")
+    (folder / "2.toml").write_text("[calibration\n")
     with pytest.raises(ConfigError) as caught:
         load_aircraft(settings)
     first, second = str(caught.value).splitlines()
@@ -198,10 +188,8 @@ def test_only_changed_settings_are_saved_and_comments_kept(settings: GatewaySett
     assert save_aircraft(settings, 2, aircraft) == file
     assert load_aircraft(settings)[2] == aircraft
     text = file.read_text()
-    assert "# my plane" in text
-    assert "# slow" in text
-    assert "accel_bias_mps2" in text
-    assert "mounting" not in text
+    kept = [each in text for each in ("# my plane", "# slow", "accel_bias_mps2", "mounting")]
+    assert kept == [True, True, True, False]
 
 
 def test_setting_restored_to_default_is_removed_from_file(settings: GatewaySettings) -> None:
@@ -215,17 +203,14 @@ def test_setting_restored_to_default_is_removed_from_file(settings: GatewaySetti
 
 
 @pytest.mark.io
-def test_aircraft_file_is_readable_by_owner_only(
-    settings: GatewaySettings,
-) -> None:
+def test_aircraft_file_is_readable_by_owner_only(settings: GatewaySettings) -> None:
     secret = VehicleSettings(signing_passphrase="correct horse")
     aircraft = msgspec.structs.replace(settings.default_aircraft, vehicle=secret)
-    file = save_aircraft(settings, 3, aircraft)
-    assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    file.chmod(0o644)
-    save_aircraft(settings, 3, aircraft)
-    assert stat.S_IMODE(file.stat().st_mode) == 0o600
-    assert [path.name for path in file.parent.iterdir()] == [file.name]
+    for _ in range(2):
+        file = save_aircraft(settings, 3, aircraft)
+        assert stat.S_IMODE(file.stat().st_mode) == 0o600
+        assert [*file.parent.iterdir()] == [file]
+        file.chmod(0o644)
 
 
 @pytest.mark.io
@@ -249,19 +234,15 @@ def test_damaged_aircraft_file_is_not_overwritten(settings: GatewaySettings) -> 
 
 def test_endpoint_is_added_to_file_with_comments_kept(tmp_path: Path) -> None:
     file = tmp_path / "new" / "gateway.toml"
-    save_endpoint(file, "tcp-listen:127.0.0.1:5760")
-    assert load(file).hub.endpoints == (
-        *GatewaySettings().hub.endpoints,
-        "tcp-listen:127.0.0.1:5760",
-    )
+    save_endpoint(file, url := "tcp-listen:127.0.0.1:5760")
+    assert load(file).hub.endpoints == (*GatewaySettings().hub.endpoints, url)
     file.write_text('# mine\n[hub]\nendpoints = [\n  "udp:127.0.0.1:1", # here\n]\n')
     file.chmod(0o644)
     save_endpoint(file, "udp:127.0.0.1:2")
     assert stat.S_IMODE(file.stat().st_mode) == 0o644, "a service can still read it"
     assert load(file).hub.endpoints == ("udp:127.0.0.1:1", "udp:127.0.0.1:2")
-    assert "# mine" in file.read_text()
-    assert "# here" in file.read_text()
     before = file.read_text()
+    assert re.search("# mine(?s:.*)# here", before)
     for wrong in ("udp:127.0.0.1:2", "nonsense"):
         with pytest.raises(ConfigError):
             save_endpoint(file, wrong)

@@ -20,7 +20,8 @@ def environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[...
     def pretend(*absent: str) -> Path:
         monkeypatch.setattr(sys, "prefix", str(tmp_path))
         monkeypatch.setattr(sys, "executable", "/env/bin/python")
-        monkeypatch.setattr(extras, "find_spec", lambda name: None if name in absent else name)
+        for name in absent:
+            monkeypatch.setitem(sys.modules, name, None)
         return tmp_path
 
     return pretend

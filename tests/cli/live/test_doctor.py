@@ -8,6 +8,7 @@ import sys
 from getpass import getuser
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from msgspec.structs import replace
@@ -146,11 +147,8 @@ def test_clock_that_may_be_unsynchronised_is_noted(
 def test_missing_kernels_are_wrong_with_a_hint(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, missing: bool
 ) -> None:
-    def load() -> None:
-        if missing:
-            raise LibraryError(Path("kernels.so"), "is missing")
-
-    monkeypatch.setattr(doctor, "load_entry_points", load)
+    error = LibraryError(Path("kernels.so"), "is missing")
+    monkeypatch.setattr(doctor, "load_entry_points", Mock(side_effect=error if missing else None))
     found = one(doctor.check_kernels, settings)
     assert found.grade is (Grade.FAIL if missing else Grade.OK)
     assert ("make kernels" in found.text) == missing
