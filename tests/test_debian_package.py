@@ -56,10 +56,9 @@ def dpkg(root: Path, *words: object) -> str:
 )
 def test_package_installs_and_purge_keeps_flights(package: Path, tmp_path: Path) -> None:
     root = tmp_path / "root"
-    (root / "var/lib/dpkg/info").mkdir(parents=True)
-    (root / "var/lib/dpkg/updates").mkdir()
+    for folder in ("var/lib/dpkg/info", "var/lib/dpkg/updates", "etc"):
+        (root / folder).mkdir(parents=True)
     (root / "var/lib/dpkg/status").touch()
-    (root / "etc").mkdir()
     dpkg(root, "--install", package)
     assert "Status: install ok installed" in dpkg(root, "--status", "mavgate")
     users = dict(line.split(":", 1) for line in (root / "etc/passwd").read_text().splitlines())
@@ -162,11 +161,8 @@ def test_documents_and_completion_are_installed(unpacked: Path) -> None:
     documents = unpacked / "usr/share/doc/mavgate"
     shipped = {path.name for path in documents.glob("*.md")}
     assert shipped >= {path.name for path in (ROOT / "docs").glob("*.md")}
-    for path in (
-        "bash-completion/completions/mavgate",
-        "zsh/vendor-completions/_mavgate",
-        "fish/vendor_completions.d/mavgate.fish",
-    ):
+    bash, zsh = "bash-completion/completions/mavgate", "zsh/vendor-completions/_mavgate"
+    for path in (bash, zsh, "fish/vendor_completions.d/mavgate.fish"):
         assert "_MAVGATE_COMPLETE" in (unpacked / "usr/share" / path).read_text()
 
 

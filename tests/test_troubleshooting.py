@@ -34,18 +34,20 @@ def sources() -> Sources:
     return Sources(ROOT / "gateway")
 
 
+@pytest.fixture
+def radio(tmp_path: Path) -> Sources:
+    (tmp_path / "radio.py").write_text(PACKAGE)
+    return Sources(tmp_path)
+
+
 def test_page_contains_every_message_with_cause_and_remedy(sources: Sources) -> None:
     page, wrong = page_of(sources, tomllib.loads(EXPLANATIONS.read_text()))
     assert wrong == [], "explain it in docs/troubleshooting.toml"
     assert PAGE.read_text() == page, "run python -m tools.make_troubleshooting"
 
 
-def test_tool_finds_messages_behind_parameters_conditions_and_constants(tmp_path: Path) -> None:
-    folder = tmp_path / "package"
-    folder.mkdir()
-    (folder / "radio.py").write_text(PACKAGE)
-    found = {(each.kind, each.pattern) for each in Sources(folder).messages()}
-    assert found == {
+def test_tool_finds_messages_behind_parameters_conditions_and_constants(radio: Sources) -> None:
+    assert {(each.kind, each.pattern) for each in radio.messages()} == {
         ("text", "radio lost"),
         ("text", "radio … is back"),
         ("text", "Note: …"),
@@ -58,24 +60,12 @@ def test_messages_of_every_part_are_found(sources: Sources) -> None:
     found = sources.messages()
     assert len({message.pattern for message in found}) > 80
     files = {message.source.rpartition("/")[0] for message in found}
-    for part in (
-        "gateway/vehicle",
-        "gateway/hub",
-        "gateway/live",
-        "gateway/fleet",
-        "gateway/panel",
-    ):
-        assert any(file.startswith(part) for file in files), part
+    for part in ("vehicle", "hub", "live", "fleet", "panel"):
+        assert any(file.startswith(f"gateway/{part}") for file in files), part
 
 
-def test_tool_reports_unexplained_messages(tmp_path: Path) -> None:
-    folder = tmp_path / "package"
-    folder.mkdir()
-    (folder / "radio.py").write_text(PACKAGE)
-    entries = [
-        {"match": "radio", "cause": "a", "remedy": "b"},
-        *({"match": word, "cause": "a", "remedy": "b"} for word in ("Note", *STATES)),
-    ]
-    _, wrong = explained(Sources(folder).messages(), entries)
-    assert len(wrong) == 1
-    assert "no answer after" in wrong[0]
+def test_tool_reports_unexplained_messages(radio: Sources) -> None:
+    words = ("radio", "Note", *STATES)
+    entries = [{"match": word, "cause": "a", "remedy": "b"} for word in words]
+    _, [wrong] = explained(radio.messages(), entries)
+    assert "no answer after" in wrong

@@ -64,15 +64,11 @@ def test_every_python_child_is_started_with_a_safe_module_path() -> None:
     unsafe = []
     for path in sorted((ROOT / "gateway").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
-            words = getattr(node, "elts", None) or getattr(node, "args", None) or []
-            if not isinstance(words, list) or not words:
-                continue
-            first = words[0]
-            if not isinstance(first, ast.expr) or ast.unparse(first) != "sys.executable":
-                continue
-            option = words[1].value if isinstance(words[1], ast.Constant) else None
-            if option not in ("-P", "-I"):
-                unsafe.append(f"{path.relative_to(ROOT)}:{first.lineno}")
+            match getattr(node, "elts", None) or getattr(node, "args", None):
+                case [ast.Attribute(value=ast.Name(id="sys"), attr="executable") as first, *rest]:
+                    options = [each.value for each in rest[:1] if isinstance(each, ast.Constant)]
+                    if options not in (["-P"], ["-I"]):
+                        unsafe.append(f"{path.relative_to(ROOT)}:{first.lineno}")
     assert unsafe == []
 
 

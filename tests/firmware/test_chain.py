@@ -23,7 +23,8 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import START_UNIX_US
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.framing import FrameDecoder
-from gateway.wire.payloads import GpsFixPayload, RadioFrame, decode_content
+from gateway.wire.payloads import GpsFixPayload, decode_content
+from tests.kit.ground_station import of_kind
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -80,8 +81,8 @@ def fly(programs: Path, parts: Parts, disturb: Disturb) -> Flown:
         frames = [*pipeline.feed(data, time_us).frames, *pipeline.poll(time_us).frames]
         heard += [parser.decode(bytearray(sent.frame)) for sent in frames]
     tracker.close()
-    attitudes = [m for m in heard if m.get_type() == "ATTITUDE_QUATERNION"]
-    positions = [m for m in heard if m.get_type() == "GLOBAL_POSITION_INT" and m.lat]
+    attitudes = of_kind(heard, "ATTITUDE_QUATERNION")
+    positions = [m for m in of_kind(heard, "GLOBAL_POSITION_INT") if m.lat]
     times, alt_times = (
         np.array([START_S + m.time_boot_ms / 1000 for m in messages])
         for messages in (attitudes, positions)
@@ -97,16 +98,13 @@ def fly(programs: Path, parts: Parts, disturb: Disturb) -> Flown:
         Counter(m.get_type() for m in heard),
         sum(node.lost for node in pipeline.report.nodes),
         fixes,
-        [m.text for m in heard if m.get_type() == "STATUSTEXT"],
+        [m.text for m in of_kind(heard, "STATUSTEXT")],
     )
 
 
 def count_fixes(decoder: FrameDecoder, data: bytes) -> int:
     frames = [decode_content(e) for e in decoder.feed(data) if isinstance(e, bytes)]
-    return sum(
-        isinstance(frame, RadioFrame) and isinstance(frame.payload, GpsFixPayload)
-        for frame in frames
-    )
+    return sum(isinstance(getattr(frame, "payload", None), GpsFixPayload) for frame in frames)
 
 
 def chunks(tracker: Tracker) -> Iterator[tuple[int, bytes]]:
@@ -151,11 +149,11 @@ def nothing_happens(tracker: Tracker, time_s: float) -> None:
 
 
 def compass_disappears(tracker: Tracker, time_s: float) -> None:
-    tracker.imu.compass.absent = 12.0 <= time_s < 16.0
+    tracker.imu.compass.absent = FAULT_S <= time_s < FAULT_S + 4.0
 
 
 def barometer_disappears(tracker: Tracker, time_s: float) -> None:
-    tracker.imu.barometer.absent = 12.0 <= time_s < 16.0
+    tracker.imu.barometer.absent = FAULT_S <= time_s < FAULT_S + 4.0
 
 
 def imu_loses_its_supply(tracker: Tracker, time_s: float) -> None:

@@ -24,6 +24,9 @@ LIMIT_S = 240.0
 SPI_CLOCK = 1 << 5
 
 
+Plug = Callable[[Board], UsbSerial]
+
+
 @pytest.fixture(scope="session")
 def tools(programs: Path) -> None:
     if shutil.which("avrdude") is None or not BOOTLOADERS.is_dir():
@@ -33,7 +36,7 @@ def tools(programs: Path) -> None:
 
 
 @pytest.fixture
-def plugged() -> Iterator[Callable[[Board], UsbSerial]]:
+def plugged() -> Iterator[Plug]:
     made: list[UsbSerial] = []
 
     def plug(board: Board) -> UsbSerial:
@@ -63,26 +66,18 @@ def flash(usb: UsbSerial, *words: str) -> str:
 
 
 def test_boards_flashed_through_optiboot_fly_with_their_settings(
-    tools: None,
-    programs: Path,
-    imu_rig: MakeRig,
-    plugged: Callable[[Board], UsbSerial],
-    tmp_path: Path,
+    tools: None, programs: Path, imu_rig: MakeRig, plugged: Plug, tmp_path: Path
 ) -> None:
-    settings = BoardSettings(radio_channel=81, radio_kbps=250, radio_power_dbm=-6)
-    image = with_settings(IntelHex(str(programs / "receiver.hex")), settings)
+    other = BoardSettings(radio_channel=81, radio_kbps=250, radio_power_dbm=-6)
+    image = with_settings(IntelHex(str(programs / "receiver.hex")), other)
     flashed = tmp_path / "receiver.hex"
     flashed.write_bytes(NEW_BOOTLOADER.with_suffix(".hex").read_bytes() + b"\n" + image)
     rig, node = imu_rig(receiver=str(flashed.with_suffix("")), program=str(NEW_BOOTLOADER))
     usb = plugged(node)
     flash(usb, "imu", "--vehicle", "2", "--channel", "80", "--rate", "250", "--send-rate", "60")
     shown = flash(usb, "--show")
-    for text in (
-        "imu, version",
-        "vehicle_id       2",
-        "radio_channel    80",
-        "imu_send_hz      60",
-    ):
+    settings = ("vehicle_id       2", "radio_channel    80", "imu_send_hz      60")
+    for text in ("imu, version", *settings):
         assert text in shown
     # The receiver on another channel receives nothing.
     rig.run(2.5)
@@ -100,7 +95,7 @@ def test_boards_flashed_through_optiboot_fly_with_their_settings(
 
 
 def test_old_bootloader_is_found_and_gets_the_restart_by_interrupt(
-    tools: None, bench: MakeBench, plugged: Callable[[Board], UsbSerial]
+    tools: None, bench: MakeBench, plugged: Plug
 ) -> None:
     rig = bench()
     usb = plugged(rig.imu_node(program=str(OLD_BOOTLOADER)))

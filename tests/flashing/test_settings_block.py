@@ -76,12 +76,11 @@ def test_block_of_version_1_is_that_of_an_nrf24() -> None:
 
 def test_patch_changes_the_block_alone_and_reads_back() -> None:
     image = image_with(with_crc(BLOCK))
-    others = (
+    for settings in (
         BoardSettings(),
         BoardSettings(vehicle_id=31, radio_channel=125, radio_address=0xFFFFFFFF),
         BoardSettings(radio_kbps=2000, radio_power_dbm=-18, accel_range_g=2, gyro_range_dps=2000),
-    )
-    for settings in others:
+    ):
         offset, block = patch(image, settings)
         assert len(block) == SIZE
         patched = image[:offset] + block + image[offset + SIZE :]

@@ -218,3 +218,15 @@ def test_template_is_written_once_into_a_new_folder(
     assert (again.exit_code, f"{file}: exists, and is not overwritten" in again.output) == (2, True)
     assert file.read_text() == "# mine"
     assert invoke("check-config", "--all").output.count("\n[") > template.count("\n[")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "code", "words"),
+    [
+        ("udp-listen:127.0.0.1:0", 2, "uses any free port"),
+        ("udp-listen:127.0.0.1:14550", 0, "all settings are valid"),
+    ],
+)
+def test_settings_are_checked(tmp_path: Path, endpoint: str, code: int, words: str) -> None:
+    (file := tmp_path / "gateway.toml").write_text(f'[hub]\nendpoints = ["{endpoint}"]\n')
+    assert words in invoke("check-config", file, code=code).output
