@@ -13,16 +13,17 @@ import msgspec
 import pytest
 
 from gateway.aircraft import AircraftSettings
-from gateway.recordings.columns import COLUMNS
+from gateway.recordings.columns import TableRow
 from gateway.recordings.recorded_table import header_for
-from gateway.recordings.table import FORMAT_LINE, encode_head
-from gateway.records import NavFlags
+from gateway.recordings.table import FORMAT_LINE
 from tests.kit.cli import run
-from tests.kit.recordings import make_frames
+from tests.kit.recordings import make_frames, write_table
+from tests.kit.records import state_at
 
 pytestmark = pytest.mark.io
 
 NAMES = "time_s,ax,ay,az,gx,gy,gz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m"
+VEHICLE = '"vehicle_id":1'
 NUMBERS = ("0", "0", "-9.8", "0", "0", "0", "100", "0.1", "47", "8", "500")
 
 
@@ -39,11 +40,7 @@ def log(path: Path, **odd: str) -> Path:
 def table(path: Path, **head: object) -> Path:
     """Write a table of one state."""
     header = msgspec.structs.replace(header_for(AircraftSettings(), 1), **head)
-    cells = dict.fromkeys(COLUMNS, "") | {"time_us": "1000", "nav_time_us": "1000"}
-    cells |= dict.fromkeys((name for name in COLUMNS if name.startswith("nav_")), "1")
-    cells["nav_flags"] = str(int(NavFlags.POSITION_VALID))
-    path.write_text(encode_head(header) + ",".join(cells.values()) + "\n")
-    return path
+    return write_table(path, header, [TableRow(1000, state=state_at(1000))])
 
 
 @pytest.mark.parametrize(
@@ -103,12 +100,26 @@ def damage(path: Path) -> None:
     path.write_bytes(gzip.compress(log(path).read_bytes())[:-8] + bytes(8))
 
 
-def bomb(path: Path) -> None:
-    """Pack comment lines without end."""
+def packed(path: Path, head: bytes, piece: bytes, mb: int) -> Path:
+    """Pack a head and many copies of a piece of a megabyte."""
     with gzip.open(path, "wb") as file:
-        file.write(NAMES.encode() + b"\n")
-        for _ in range(17):
-            file.write(b"#\n" * (1 << 20))
+        file.write(head)
+        for _ in range(mb):
+            file.write(piece)
+    return path
+
+
+def bomb(path: Path) -> None:
+    packed(path, NAMES.encode() + b"\n", b"#\n" * (1 << 19), 34)
+
+
+def run_within(peak_mb: int, *words: object) -> str:
+    """Run a command that is refused, within bounded memory."""
+    tracemalloc.start()
+    printed = run(*words, code=2)
+    assert tracemalloc.get_traced_memory()[1] < peak_mb << 20
+    tracemalloc.stop()
+    return printed
 
 
 DEVICE = "is a pipe or a device; save its bytes as a file"
@@ -138,28 +149,17 @@ def test_unreadable_file_is_refused_in_a_moment(
     assert not out.exists()
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_packed_file_is_recognised_by_its_first_bytes_not_its_name(
-    tmp_path: Path, packed: bool
-) -> None:
-    data = log(tmp_path / "plain").read_bytes()
-    path = tmp_path / ("log.csv" if packed else "log.csv.gz")
-    path.write_bytes(gzip.compress(data) if packed else data)
-    assert "100 records in 0:00.990" in run("info", path)
+def test_packed_file_is_recognised_by_its_first_bytes_not_its_name(tmp_path: Path) -> None:
+    plain, zipped = log(tmp_path / "log.csv.gz"), tmp_path / "log.csv"
+    zipped.write_bytes(gzip.compress(plain.read_bytes()))
+    for path in (plain, zipped):
+        assert "100 records in 0:00.990" in run("info", path)
 
 
 def test_overlong_line_is_refused_within_bounded_memory(tmp_path: Path) -> None:
-    path = tmp_path / "log.csv.gz"
-    with gzip.open(path, "wb") as file:
-        file.write(NAMES.encode() + b"\n")
-        for _ in range(64):
-            file.write(b"1" * (1 << 20))
-    tracemalloc.start()
-    printed = run("fuse", path, "-o", tmp_path / "out.csv", code=2)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
+    path = packed(tmp_path / "log.csv.gz", NAMES.encode() + b"\n", b"1" * (1 << 20), 64)
+    printed = run_within(32, "fuse", path, "-o", tmp_path / "out.csv")
     assert "line 2 is longer than 1 MB" in printed
-    assert peak < 32 << 20
 
 
 @pytest.mark.parametrize(
@@ -174,25 +174,17 @@ def test_overlong_line_is_refused_within_bounded_memory(tmp_path: Path) -> None:
 def test_packed_log_beyond_the_unpacked_limit_is_refused_and_fills_neither_memory_nor_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, head: bytes
 ) -> None:
-    path, temporary = tmp_path / "bomb.gz", tmp_path / "temporary"
-    with gzip.open(path, "wb") as file:
-        file.write(head)
-        for _ in range(128):
-            file.write(bytes(1 << 20))
+    path, temporary = packed(tmp_path / "bomb.gz", head, bytes(1 << 20), 128), tmp_path / "new"
     config = tmp_path / "gateway.toml"
     config.write_text("[recording]\nunpacked_limit_mb = 8\n")
     temporary.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     words = ["-o", tmp_path / "out.csv"] if command in ("fuse", "convert") else []
-    tracemalloc.start()
-    printed = run(command, path, *words, "--config", config, code=2)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
+    printed = run_within(48, command, path, *words, "--config", config)
     # To play it, all of it is read to find its format.
     reason = RATIO if command == "play" else "unpacks to more than 8 MB"
     assert f"bomb.gz: {reason}" in printed
     assert ("unpacked_limit_mb" in printed) == (command != "play")
-    assert peak < 48 << 20
     assert not list(temporary.iterdir())
 
 
@@ -208,24 +200,16 @@ def test_times_beyond_the_calendar_are_written_and_reported(
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "words"),
+    ("after", "words"),
     [
-        (
-            FORMAT_LINE,
-            "# mavgate table 2",
-            "line 1: table version '2'; this mavgate reads",
-        ),
-        *(
-            ('"vehicle_id":1', f'"vehicle_id":{number}', "line 2: Expected `int`")
-            for number in (-5, 0, 300)
-        ),
+        ("# mavgate table 2", "line 1: table version '2'; this mavgate reads"),
+        *((f'"vehicle_id":{number}', "line 2: Expected `int`") for number in (-5, 0, 300)),
     ],
-    ids=["newer version", "negative id", "id zero", "large id"],
 )
 def test_unusable_head_of_a_table_is_refused_with_its_line(
-    tmp_path: Path, before: str, after: str, words: str
+    tmp_path: Path, after: str, words: str
 ) -> None:
-    path = table(tmp_path / "table.csv")
+    path, before = table(tmp_path / "table.csv"), FORMAT_LINE if after[0] == "#" else VEHICLE
     path.write_text(path.read_text().replace(before, after))
     printed = run("convert", path, "-o", tmp_path / "out.tlog", code=2)
     assert f"table.csv: {words}" in printed
