@@ -62,20 +62,19 @@ def test_json_output_is_escaped_and_decodes_to_the_same_value() -> None:
     assert all(letter.isprintable() for letter in shown)
 
 
-@pytest.mark.parametrize("make", [str, Text, lambda text: _table(text)])
+def table(text: str) -> Table:
+    table = Table(text)
+    table.add_row(Text(text))
+    return table
+
+
+@pytest.mark.parametrize("make", [str, Text, table])
 def test_console_escapes_text_of_any_renderable(make: object) -> None:
     console = console_of()
     console.file = io.StringIO()
     console.print(make(f"Site {RIGHT_TO_LEFT}\x9b2J"))
     assert r"Site \u202e\x9b2J" in console.file.getvalue()
     assert not {RIGHT_TO_LEFT, "\x9b"} & set(console.file.getvalue())
-
-
-def _table(text: str) -> Table:
-    table = Table()
-    table.add_column(text)
-    table.add_row(Text(text))
-    return table
 
 
 def test_log_line_is_escaped_and_its_length_bounded() -> None:
@@ -104,11 +103,12 @@ def test_port_without_frames_is_described(
     assert (state == "receiver: auto connected") == (frames > 0)
 
 
-@pytest.mark.parametrize("value", [None, math.nan, math.inf, -math.inf])
-def test_unknown_number_is_a_dash_without_its_unit(value: float | None) -> None:
-    assert figure(value, ".1f", "m") == "—"
-
-
-def test_known_number_is_followed_by_its_unit() -> None:
-    assert figure(2.25, ".1f", "m") == "2.2 m"
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(None, "—"), (math.nan, "—"), (math.inf, "—"), (-math.inf, "—"), (2.25, "2.2 m")],
+)
+def test_known_number_is_followed_by_its_unit_and_an_unknown_one_is_a_dash(
+    value: float | None, shown: str
+) -> None:
+    assert figure(value, ".1f", "m") == shown
     assert figure(0.1, ".0%") == "10%"

@@ -64,18 +64,16 @@ class TestUbx:
         for message, (fix, quality) in zip(messages, solutions, strict=True):
             read = UBXReader.parse(message.serialize())
             assert fix.itow_ms == quality.itow_ms == read.iTOW
-            assert fix.lat_dege7 == round(read.lat * 1e7)
-            assert fix.lon_dege7 == round(read.lon * 1e7)
-            assert fix.alt_amsl_mm == read.hMSL
+            location = (round(read.lat * 1e7), round(read.lon * 1e7), read.hMSL)
+            assert (fix.lat_dege7, fix.lon_dege7, fix.alt_amsl_mm) == location
             assert fix.vel_n_cmps == tuple(
                 max(-32_767, min(32_767, math.trunc(v / 10)))
                 for v in (read.velN, read.velE, read.velD)
             )
             assert fix.fix_type == GpsFixType(read.fixType)
             assert (fix.fix_ok, fix.satellites) == (bool(read.gnssFixOk), read.numSV)
-            assert quality.h_acc_cm == held(read.hAcc / 10)
-            assert quality.v_acc_cm == held(read.vAcc / 10)
-            assert quality.speed_acc_cmps == held(read.sAcc / 10)
+            errors = (quality.h_acc_cm, quality.v_acc_cm, quality.speed_acc_cmps)
+            assert errors == tuple(held(v / 10) for v in (read.hAcc, read.vAcc, read.sAcc))
             assert quality.course_acc_cdeg == held(round(read.headAcc * 1e5) / 1000)
             assert quality.pdop_centi == round(read.pDOP * 100)
             date, time = (read.year, read.month, read.day), (read.hour, read.min, read.second)
@@ -132,8 +130,8 @@ class TestUbx:
         assert fix.vel_n_cmps == (1234, -567, -89)
         assert (fix.fix_type, fix.fix_ok, fix.satellites) == (GpsFixType.FIX_3D, True, 9)
         assert (quality.h_acc_cm, quality.v_acc_cm, quality.speed_acc_cmps) == (180, 310, 42)
-        assert (quality.course_acc_cdeg, quality.pdop_centi) == (275, 161)
-        assert quality.geoid_separation_cm == 2345
+        others = (quality.course_acc_cdeg, quality.pdop_centi, quality.geoid_separation_cm)
+        assert others == (275, 161, 2345)
         assert quality.utc == datetime(2026, 11, 19, 0, 0, 2, 200_000, tzinfo=UTC)
 
 

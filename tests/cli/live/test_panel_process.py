@@ -36,13 +36,18 @@ async def link_of(panel: PanelProcess) -> str:
 
 
 @pytest.mark.io
-@pytest.mark.parametrize(("begin", "code"), [("", -15), (STUBBORN, -9)])
+@pytest.mark.parametrize(
+    ("begin", "is_started", "code"), [("", True, -15), (STUBBORN, True, -9), ("", False, -15)]
+)
 async def test_closing_waits_for_the_end_of_the_process(
-    begin: str, code: int, monkeypatch: pytest.MonkeyPatch
+    begin: str, is_started: bool, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(panel_command, "END_S", 0.2 if begin else 60.0)
     panel = panel_that_runs(begin + SAYING)
-    await link_of(panel)
+    if is_started:
+        await link_of(panel)
+    else:
+        panel.launch()
     await panel.close()
     assert panel._child is not None
     assert panel._child.returncode == code
@@ -61,15 +66,6 @@ async def test_launched_panel_receives_the_path_of_the_control_socket() -> None:
     panel.launch()
     assert await link_of(panel) == "no.sock"
     await panel.close()
-
-
-@pytest.mark.io
-async def test_panel_that_is_launched_but_not_started_ends_when_closed() -> None:
-    panel = panel_that_runs(SAYING)
-    panel.launch()
-    await panel.close()
-    assert panel._child is not None
-    assert panel._child.returncode == -15
 
 
 async def test_panel_is_closed_while_it_waits_for_the_gateway() -> None:

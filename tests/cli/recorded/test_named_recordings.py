@@ -85,10 +85,9 @@ def test_play_accepts_a_name(config: Path, tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(play, "_serve", serve)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    run("play", "alps", "--config", config)
-    run("play", "last", "--config", config)
-    assert played[0] == "alps_01.tlog"
-    assert len(played) == 2
+    for name in ("alps", "last"):
+        run("play", name, "--config", config)
+    assert (played[0], len(played)) == ("alps_01.tlog", 2)
 
 
 def test_sweep_accepts_a_name(config: Path, tmp_path: Path) -> None:
