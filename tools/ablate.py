@@ -4,9 +4,10 @@
 
 Each mechanism is disabled in turn: one function or constant is replaced, and the kernels are
 compiled again, for some 20 s each. The errors are those of `tools.score_estimators`, on recorded
-flights and on flights with the disturbances of `tools.spoil_flight`. A ratio above 1 means larger
-errors without the mechanism, as geometric mean over the flights; a flight counts as worse or better
-if its own mean differs by more than 1 %. A score that only the full filter has counts as worse.
+flights and on flights with the disturbances of `tools.spoil_flight`. The ratio is a geometric mean
+over the flights; above 1, errors are larger without the mechanism. A flight counts as worse or
+better if its own mean differs by more than 1 %. A score that only the full filter has counts as
+worse.
 """
 
 import argparse
@@ -62,7 +63,7 @@ class Mechanism(NamedTuple):
     name: str
     replacement: object
     parts: tuple[str, ...]
-    """Its modules, or functions as `module.function`, to count their lines."""
+    """Its modules, or functions as `module.function`, whose lines are counted."""
 
 
 FILTER: Final = "gateway.estimation.eskf"
@@ -110,7 +111,7 @@ MECHANISMS: Final = (
 FULL: Final = "full filter"
 FLIGHTS: Final = ("arduplane", "quad106", "phantom", "mocap", "car_", "walk", "px4_", "broad_")
 DISTURBED: Final = ("arduplane", "phantom_rtk", "broad_06")
-"""Words in the names of the flights that are scored as recorded, and with disturbances."""
+"""Words in the names of the flights that are scored both as recorded and with disturbances."""
 EQUAL: Final = 0.01
 """A flight whose errors change by a smaller share counts as equal."""
 
@@ -118,7 +119,7 @@ Board = dict[str, dict[str, Scores]]
 
 
 def add_scores(recorded: Board, disturbed: Board, name: str, flights: Sequence[Flight]) -> None:
-    """Score all flights with the kernels as they are now."""
+    """Score all flights with the present kernels."""
     for flight in flights:
         recorded.setdefault(flight.name, {})[name] = score(flight, run_eskf)
         if any(word in flight.name for word in DISTURBED):
@@ -127,7 +128,7 @@ def add_scores(recorded: Board, disturbed: Board, name: str, flights: Sequence[F
 
 
 def comparison(board: Board, name: str) -> tuple[str, str, str]:
-    """Return the numbers of flights that are worse and better without it, and the mean ratio."""
+    """Return the numbers of worse and better flights without a mechanism, and the mean ratio."""
     worse, better, logarithms = 0, 0, []
     for flight, scores in board.items():
         ratios = geometric_means({flight: scores}, FULL)

@@ -2,8 +2,8 @@
 
     .venv/bin/python -m tools.attack                 # two minutes; --only WORD for some
 
-Each attack is one that guests, local programs or hostile files can make. It holds if the operator
-is still served, and the gateway sends, stores and computes no more than its limits allow.
+Each attack is possible for untrusted clients, local programs or hostile files. The gateway holds if
+it still serves the operator, and sends, stores and computes no more than its limits allow.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from tests.ports import free_port
 
 OPERATOR, VIEWER = "operator's", "viewer's"
 COMMAND_S: Final = 30.0
-"""Longest time for a command to refuse a hostile file; its start takes some seconds."""
+"""Timeout of a command that must refuse a hostile file; its start takes some seconds."""
 CONFIG = """
 [recording]
 folder = "{folder}/recordings"
@@ -50,7 +50,7 @@ viewer_password = "{viewer}"
 
 @dataclass
 class Target:
-    """A demo and a panel that shows it."""
+    """A demo and a panel for it."""
 
     folder: Path
     port: int
@@ -72,7 +72,7 @@ class Target:
         return str(cookie)
 
     def status_of(self, cookie: str, method: str = "GET", body: bytes | None = None) -> int:
-        """Ask for the page, or post to the REST API; return the status of the answer."""
+        """Request the page, or post to the REST API; return the status of the answer."""
         connection = self.connection()
         path = "/v1/mavlink" if method == "POST" else "/"
         connection.request(method, path, body, {"cookie": cookie})
@@ -97,7 +97,7 @@ def forged_source(target: Target) -> bool:
 
 
 def idle_control_connections(target: Target) -> bool:
-    """Open connections to the control socket that ask nothing."""
+    """Open connections to the control socket that send no request."""
     path = target.folder / "mavgate" / "run.sock"
     with contextlib.ExitStack() as opened:
         for _ in range(64):
@@ -107,7 +107,7 @@ def idle_control_connections(target: Target) -> bool:
 
 
 def devices_as_clients(target: Target) -> bool:
-    """Let the gateway open devices that are no serial ports."""
+    """Request the gateway to open devices that are not serial ports."""
     path = target.folder / "mavgate" / "run.sock"
     for device in ("/dev/null", "/dev/ptmx", "/dev/zero"):
         try:
@@ -119,7 +119,7 @@ def devices_as_clients(target: Target) -> bool:
 
 
 def viewer_sessions(target: Target) -> bool:
-    """Log in as a viewer until no place is left, and load pages without their scripts."""
+    """Log in as a viewer until no slot is left, and load pages without their scripts."""
     operator = target.log_in(OPERATOR)
     viewers = [target.log_in(VIEWER) for _ in range(70)]
     pages = [target.status_of(viewers[-1]) for _ in range(40)]
@@ -189,7 +189,7 @@ def _refuses(*arguments: str) -> bool:
 
 
 Attacks = Mapping[str, Callable[[Target], bool]]
-"""By name; each returns whether the target held."""
+"""Attacks by name; each returns whether the target held."""
 OF_FILES: Final = {
     "hostile settings files": hostile_settings,
     "comment lines packed to a thousandth": packed_comments,
@@ -208,7 +208,7 @@ OF_PANEL: Final = {
 
 @contextlib.contextmanager
 def started(folder: Path, *, panel: bool) -> Iterator[Target]:
-    """Start a demo, and a panel if one is wanted."""
+    """Start a demo, with a panel if `panel`."""
     (folder / "recordings").mkdir()
     target = Target(folder, free_port())
     hashes = {"operator": hash_password(OPERATOR), "viewer": hash_password(VIEWER)}

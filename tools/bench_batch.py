@@ -1,4 +1,4 @@
-"""Measure work on many recordings: one after the other, in processes, on a Dask cluster.
+"""Measure work on many recordings: serial, in processes, on a Dask cluster.
 
     python tools/bench_batch.py                        # all of it, in some 20 minutes
     python tools/bench_batch.py judge --flights 24     # or report, sweep: serial and in processes
@@ -7,9 +7,9 @@
     python tools/bench_batch.py catalogue --files 10000   # a catalogue: index, index again, ask
     python tools/bench_batch.py --quick                # all of it with few, short flights
 
-Recordings are simulated once and stay in --folder. Each measurement has a fresh process of its own,
-so that memory is that of this work alone. `start` is what is paid once: to load the estimators, to
-start a cluster; `wall` and `CPU` are of the work, CPU of all processes together.
+Recordings are simulated once and stay in --folder. Each measurement runs in a new process, so that
+memory is that of this work alone. `start` is the cost that occurs once, of loading the estimators
+or starting a cluster; `wall` and `CPU` are of the work, CPU of all processes together.
 """
 
 import argparse
@@ -52,7 +52,7 @@ from gateway.units import US_PER_S
 from tests.batch.season_flights import line_of
 
 SEEDS = 4
-"""Different flights; the others are these under another aircraft and day."""
+"""Number of different flights; the others are copies with another aircraft and day."""
 WORKERS = 2
 SHORT_S = 60.0
 CATALOGUED_S = 10.0
@@ -67,9 +67,9 @@ QUERIES = (
     "error is not null",
 )
 SHARE = {"judge": 1, "report": 16, "sweep": 4}
-"""Of the flights that are fused, `all` reports and sweeps one in so many."""
+"""Divisor by which `all` uses fewer flights for reports and sweeps than for fusing."""
 BROKEN = 100
-"""One file in so many of the catalogue is broken."""
+"""One in this many files of the catalogue is broken."""
 ROW = "{:<8} {:<10} {:>7} {:>7} {:>8} {:>8} {:>9} {:>9} {:>9} {:>8}"
 HEAD = ("part", "by", "flights", "failed", "start, s", "wall, s", "s/flight", "CPU, s", "worker MB",
         "here MB")  # fmt: skip
@@ -87,7 +87,7 @@ def main() -> None:
         "--folder", type=Path, default=Path(tempfile.gettempdir(), "mavgate-season")
     )
     parser.add_argument("--flights", type=int, help="recordings; `all` reports and sweeps fewer")
-    parser.add_argument("--files", type=int, help="of the catalogue")
+    parser.add_argument("--files", type=int, help="files of the catalogue")
     parser.add_argument("--quick", action="store_true", help="few flights, of 60 s")
     chosen = parser.parse_args()
     quick = chosen.quick
@@ -106,7 +106,7 @@ def main() -> None:
 
 
 def work(folder: Path, part: str, flights: int) -> None:
-    """Measure the parts that work on flights, and print their comparisons at the end."""
+    """Measure the parts for flights, and print their comparisons at the end."""
     print("\n" + ROW.format(*HEAD), flush=True)
     done: dict[tuple[str, str, int], Cost] = {}
 
@@ -145,7 +145,7 @@ def work(folder: Path, part: str, flights: int) -> None:
 
 @dataclass(frozen=True)
 class Cost:
-    """What one measurement found."""
+    """Result of one measurement."""
 
     failed: int
     start_s: float
@@ -155,7 +155,7 @@ class Cost:
     here_mb: float
 
     def cells(self, flights: int) -> tuple[str, ...]:
-        """Write it for the table."""
+        """Return the cells of a row of the table."""
         each = f"{self.wall_s / flights:.2f}"
         times = (f"{self.start_s:.1f}", f"{self.wall_s:.1f}", each, f"{self.cpu_s:.1f}")
         return (str(self.failed), *times, f"{self.worker_mb:.0f}", f"{self.here_mb:.0f}")
@@ -189,12 +189,12 @@ def task_of(part: str) -> FlightTask:
 
 
 Used = Callable[[], tuple[float, float]]
-"""Returns the CPU of all processes together in s, and the memory of the largest worker in MB."""
+"""Returns the CPU time of all processes, s, and the memory of the largest worker, MB."""
 
 
 @contextmanager
 def executor_of(by: str) -> Iterator[tuple[Executor, Used]]:
-    """Have somebody who works, ready to; a cluster has two processes of one thread."""
+    """Yield an executor that is ready; a cluster has two processes of one thread."""
     if by != "dask":
         yield LocalProcesses(1 if by == "serial" else WORKERS), _children
         return
@@ -204,7 +204,7 @@ def executor_of(by: str) -> Iterator[tuple[Executor, Used]]:
         dashboard_address=None,
     ) as cluster:  # fmt: skip
         client = DaskCluster(cluster.scheduler_address)
-        # A worker imports the modules once in its life.
+        # A worker imports the modules only once.
         dict(client.run(_ready, range(4 * WORKERS)))
 
         def used() -> tuple[float, float]:
@@ -232,7 +232,7 @@ def _children() -> tuple[float, float]:
 
 
 def make(folder: Path, count: int, duration_s: float) -> None:
-    """Write the recordings that are not there yet: some aircraft on some days, in processes."""
+    """Write the missing recordings, of some aircraft on some days, in processes."""
     folder.mkdir(parents=True, exist_ok=True)
     there = {path.name for path in folder.iterdir()}
     wanted = [number for number in range(count) if _name(number) not in there]
@@ -281,7 +281,7 @@ def simulated_rows(seed: int, duration_s: float) -> tuple[TableHeader, str]:
 
 
 def catalogue(place: Path, count: int) -> None:
-    """Index many short recordings, again with nothing new, again with some new, and ask."""
+    """Index many short recordings, again without changes, again with some changes, and query."""
     make(place, count, CATALOGUED_S)
     paths = sorted(place.glob("flight*.csv"))
     for number in range(count // BROKEN):
@@ -327,13 +327,13 @@ def _index(place: Path, what: str) -> None:
 def fresh_process(
     function: Callable[Arguments, Result], *arguments: Arguments.args, **named: Arguments.kwargs
 ) -> Result:
-    """Call in a process that has done nothing before."""
+    """Call a function in a new process."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
         return pool.submit(function, *arguments, **named).result()
 
 
 def progress_of(part: str) -> Callable[[str, int, int], None]:
-    """Return what shows on a terminal how far a part is."""
+    """Return a function that shows the progress of a part on a terminal."""
     show = _bar(part)
 
     def show_part(what: str, done: int, total: int) -> None:
@@ -344,7 +344,7 @@ def progress_of(part: str) -> Callable[[str, int, int], None]:
 
 
 def _bar(part: str) -> Callable[[int, int], None]:
-    """Return what shows a count: in one line of a terminal, in four lines of a file."""
+    """Return a function that shows a count: in one line of a terminal, in four lines of a file."""
 
     def show(done: int, total: int) -> None:
         if sys.stderr.isatty():

@@ -1,9 +1,8 @@
-"""Measure how soon stations are ready behind a radio of 9,600 baud, without and with `cache=yes`.
+"""Measure the loading time of stations behind a 9,600 baud radio, without and with `cache=yes`.
 
 A pseudo-terminal with a simulated vehicle carries 960 bytes a second in either direction. One
-station after the other loads all parameters and the mission: the time it takes, and the bytes of
-its requests and their answers on the radio. Telemetry, which is the same in all cases, is not
-counted.
+station after the other loads all parameters and the mission; printed are the time, and the bytes of
+requests and answers on the radio. Telemetry, which is the same in all cases, is not counted.
 """
 
 import argparse
@@ -31,7 +30,7 @@ PARAMETERS: Final = 907
 ITEMS: Final = 40
 TELEMETRY_S: Final = 0.5
 QUIET_S: Final = 3.0
-"""Without an answer for so long a station asks again."""
+"""Timeout after which a station repeats a request."""
 
 
 class Vehicle(threading.Thread):
@@ -44,16 +43,16 @@ class Vehicle(threading.Thread):
         os.set_blocking(self.master, False)
         self.path, self._slave = os.ttyname(slave), slave
         self.radio = 0
-        """Bytes of requests and answers."""
+        """Bytes of requests and answers on the radio."""
         self.stopped = threading.Event()
         self._mav: Any = mavlink.MAVLink(None, 1, 1)
         self._mav.robust_parsing = True
         self._out: deque[bytes] = deque()
         self._left: deque[int] = deque()
-        """Parameters of the list that are left to be sent."""
+        """Parameters of the list that are still to be sent."""
 
     def run(self) -> None:
-        """Carry so many bytes in either direction at each step."""
+        """Transfer the bytes of each step in either direction."""
         begin_s = next_s = sent_s = time.monotonic()
         pending = b""
         while not self.stopped.is_set():
@@ -138,7 +137,7 @@ class Vehicle(threading.Thread):
 
 
 class Station:
-    """A ground station that asks for what is missing, with pymavlink."""
+    """A ground station with pymavlink that requests missing data again."""
 
     def __init__(self, port: int, system: int) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -152,7 +151,7 @@ class Station:
         self._mav.seq = (self._mav.seq + 1) % 256
 
     def load(self) -> float:
-        """Load all parameters, then the mission; return the time it took in s."""
+        """Load all parameters, then the mission; return the time in s."""
         while self._next("ATTITUDE") is None:
             self.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
         begin_s = time.monotonic()
@@ -179,7 +178,7 @@ class Station:
             self.send(request)
 
     def _next(self, kind: str) -> Any:
-        """Return the next message of a kind; None if none comes for a while."""
+        """Return the next message of a kind; None after a timeout."""
         until_s = time.monotonic() + QUIET_S
         while time.monotonic() < until_s:
             try:

@@ -3,11 +3,11 @@
 For each number of sites: frames lost, latency from the load generator's clock before it publishes
 to this process's clock when the ground station reads (p50 and p99), CPU of router and fleet in per
 cent of a core, their memory. The sites are load generators, several in each of a few processes:
-they publish ATTITUDE frames that carry the time; no gateway runs behind them. `--plain` measures
-one site that comes to a plain hub over TCP, without Zenoh, as the baseline.
+they publish ATTITUDE frames that contain the time, without a gateway. `--plain` measures one site
+that connects to a plain hub over TCP, without Zenoh, as the baseline.
 
-`--unsubscribed N` adds sites whose names no pattern matches: what they publish must cost the fleet
-nothing. `--fleets 2` splits the sites between two fleets on one router.
+`--unsubscribed N` adds sites whose names no pattern matches, and which must not cost the fleet
+anything. `--fleets 2` splits the sites between two fleets on one router.
 """
 
 import argparse
@@ -39,7 +39,7 @@ RATE_HZ = 60
 GENERATORS = 2
 START_S = 60.0
 MOST = 0.98
-"""Of what was sent: when nothing more comes then, the rest is lost."""
+"""Share of the sent frames after which, at a timeout, the rest counts as lost."""
 SETTLE_S = 3.0
 ATTITUDE = 30
 
@@ -106,16 +106,16 @@ with socket.create_connection(("127.0.0.1", int(sys.argv[1]))) as link:
 
 @dataclass(frozen=True)
 class FleetRun:
-    """One run."""
+    """Results of one run."""
 
     sites: int
     way: str
     sent: int
     lost: int
     lost_before: int
-    """Of these, those that the fleet itself has missed by their numbers."""
+    """Lost frames that the fleet itself has counted by their sequence numbers."""
     shed: int
-    """Of these, those that the fleet could not take in time, and has counted."""
+    """Lost frames that the fleet could not process in time, and has counted."""
     p50_us: float
     p99_us: float
     router_cpu_percent: float
@@ -126,33 +126,33 @@ class FleetRun:
 
 @dataclass(frozen=True)
 class Processes:
-    """What runs: what is measured, and what makes the load."""
+    """The measured processes and the load generators."""
 
     watched: "list[subprocess.Popen[str]]"
-    """The router, if there is one, and the fleets or the hub."""
+    """The router, if any, and the fleets or the hub."""
     loads: "list[subprocess.Popen[str]]"
     sockets: list[Path]
-    """Where the fleets can be asked."""
+    """Control sockets of the fleets."""
 
 
 @dataclass
 class Station:
-    """A ground station: the time in each frame of one message, and when the frame was read."""
+    """A ground station that notes the time in each frame of one message, and when it was read."""
 
     message_id: int
     clock: Callable[[], int] = time.monotonic_ns
     sock: socket.socket = field(default_factory=udp_socket)
     splitter: MavlinkSplitter = field(default_factory=MavlinkSplitter)
     got: list[tuple[int, int]] = field(default_factory=list)
-    """The time in the first four bytes of a frame's payload, and that of the clock in ns."""
+    """The time in the first four bytes of each frame's payload, and the clock at reading, ns."""
 
     @property
     def port(self) -> int:
-        """Its port."""
+        """Port of the station."""
         return int(self.sock.getsockname()[1])
 
     def read(self, wait_s: float = 0.0) -> bool:
-        """Take all that has arrived; return whether anything arrived within a time."""
+        """Read all received datagrams; return whether any arrived within a time."""
         if not select.select([self.sock], [], [], wait_s)[0]:
             return False
         with contextlib.suppress(BlockingIOError):
@@ -172,7 +172,7 @@ def free_locator() -> str:
 
 
 def start(*words: str, home: Path | None = None) -> "subprocess.Popen[str]":
-    """Start a Python process whose lines can be read."""
+    """Start a Python process whose output lines can be read."""
     env = os.environ | ({"HOME": str(home), "XDG_RUNTIME_DIR": str(home)} if home else {})
     return subprocess.Popen(
         [sys.executable, *words],
@@ -193,7 +193,7 @@ def start_router(locator: str) -> "subprocess.Popen[str]":
 
 
 def wait_for(file: Path) -> None:
-    """Wait until a fleet can be asked."""
+    """Wait until a fleet answers requests."""
     limit = time.monotonic() + START_S
     while not file.exists():
         if time.monotonic() > limit:
@@ -204,7 +204,7 @@ def wait_for(file: Path) -> None:
 def generators(
     locator: str, names: list[str], rate_hz: int, seconds: float
 ) -> list["subprocess.Popen[str]"]:
-    """Start the load, the sites shared out to a few processes."""
+    """Start the load generators, with the sites divided between a few processes."""
     shares = [names[n::GENERATORS] for n in range(min(GENERATORS, len(names)))]
     return [
         start("-c", GENERATOR, locator, ",".join(share), str(rate_hz), str(seconds))
@@ -238,7 +238,7 @@ def run(sites: int, unsubscribed: int, fleets: int, rate_hz: int, seconds: float
 
 
 def run_plain(rate_hz: int, seconds: float) -> FleetRun:
-    """Measure one site that comes to a plain hub over TCP."""
+    """Measure one site that connects to a plain hub over TCP."""
     station = Station(ATTITUDE, time.time_ns)
     _, *words = hub_command("tcp-listen:127.0.0.1:0", f"udp:127.0.0.1:{station.port}")
     hub = start(*words)
@@ -306,7 +306,7 @@ def _measure(
 
 
 def lost_in(path: Path) -> tuple[int, int]:
-    """Ask a fleet what it missed by the numbers, and how much of that it could not take in time."""
+    """Return a fleet's count of lost frames, and of those that it could not process in time."""
     status = request(path, "fleet.status")
     lost = [vehicle["lost"] for site in status["sites"] for vehicle in site["vehicles"]]
     return sum(lost), status["overflowed"]
@@ -348,7 +348,7 @@ def main() -> None:
     parser.add_argument("--plain", action="store_true", help="one site over TCP before")
     parser.add_argument("--fleets", type=int, default=1)
     parser.add_argument("--rate", type=int, default=RATE_HZ, help="messages/s of each site")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each run")
+    parser.add_argument("--seconds", type=float, default=10.0, help="duration of each run")
     options = parser.parse_args()
     runs = [run_plain(options.rate, options.seconds)] if options.plain else []
     runs += [

@@ -1,7 +1,7 @@
-"""Measure recordings: opening and seeking, replay, and what recording costs.
+"""Measure recordings: opening and seeking, replay, and the cost of recording.
 
-Each figure is compared with pymavlink's `mavlogfile`, with which MAVProxy and mavlogdump read, in
-the same run, on the same file. Nothing leaves this machine.
+Each figure is compared with pymavlink's `mavlogfile`, which MAVProxy and mavlogdump use, in the
+same run, on the same file. No network is needed.
 
     python tools/bench_flightlog.py [--messages 1000000] [--json FILE]
 """
@@ -75,7 +75,7 @@ def make_frames(count: int) -> list[bytes]:
 
 
 def write_tlog(path: Path, count: int) -> None:
-    """Write a tlog of so many messages."""
+    """Write a tlog of `count` messages."""
     frames = make_frames(1024)
     with path.open("wb") as file:
         for begin in range(0, count, 1024):
@@ -87,7 +87,7 @@ def write_tlog(path: Path, count: int) -> None:
 
 
 def flight_frames(second: int) -> list[bytes]:
-    """Pack what the gateway sends in one second at its default rates, in 50 steps."""
+    """Pack the frames that the gateway sends in one second at its default rates, in 50 steps."""
     mav = mavlink.MAVLink(None, 1, 1)
     frames = []
     for step in range(50):
@@ -117,7 +117,7 @@ def flight_frames(second: int) -> list[bytes]:
 
 
 def write_flight(path: Path, count: int) -> None:
-    """Write the tlog of a flight, of at least so many messages."""
+    """Write the tlog of a flight, of at least `count` messages."""
     written, second = 0, 0
     with path.open("wb") as file:
         while written < count:
@@ -128,7 +128,7 @@ def write_flight(path: Path, count: int) -> None:
 
 
 def cpu_of(*command: str) -> float:
-    """Run a program and return how long it was on a processor."""
+    """Run a program and return its processor time."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -136,12 +136,12 @@ def cpu_of(*command: str) -> float:
 
 
 def measure_files(folder: Path, count: int) -> dict[str, float]:
-    """Convert and sum up a flight; the baseline, mavlogdump, writes out one of its messages."""
+    """Convert and summarise a flight; the baseline, mavlogdump, prints one of its messages."""
     path, table = folder / "flight.tlog", folder / "flight.csv"
     write_flight(path, count)
     mavgate = (sys.executable, "-m", "gateway.cli")
     dump = str(Path(sys.executable).with_name("mavlogdump.py"))
-    # The first run may write bytecode files: it is not measured.
+    # The first run is not measured, since it may write bytecode files.
     write_flight(folder / "tiny.tlog", 1000)
     cpu_of(*mavgate, "convert", str(folder / "tiny.tlog"), "-o", str(folder / "tiny.csv"))
     found = {
@@ -163,7 +163,7 @@ HOLE = 2 << 30
 
 
 def run_of(*command: str) -> dict[str, float]:
-    """Run a program; return how long it took, and its own greatest memory."""
+    """Run a program; return its duration, and its peak memory."""
     begin = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
@@ -205,7 +205,7 @@ def measure_edits(folder: Path, count: int) -> dict[str, float]:
 
 
 def timed(job: Callable[[], Any]) -> tuple[float, Any]:
-    """Run a job and return how long it took and what it gave."""
+    """Run a job; return its duration and its result."""
     begin = time.perf_counter()
     result = job()
     return time.perf_counter() - begin, result
@@ -232,9 +232,9 @@ print(json.dumps({"memory_kept_mb": own, "memory_at_most_with_the_mapped_file_mb
 
 
 def memory_of_opening(path: Path) -> dict[str, float]:
-    """Measure in a process that has opened nothing but a tiny file: no freed memory is used again.
+    """Measure in a process that has opened only a tiny file, so that no freed memory is reused.
 
-    The kernel resets its record of the peak before.
+    The kernel's record of the peak is reset before.
     """
     tiny = path.with_name("tiny.tlog")
     write_tlog(tiny, 16)
@@ -245,7 +245,7 @@ def memory_of_opening(path: Path) -> dict[str, float]:
 
 def measure_index(path: Path, count: int) -> dict[str, float]:
     """Open and seek, ours and pymavlink's."""
-    # Bring the file into the page cache for all.
+    # Read the file into the page cache for all programs.
     TlogFile(path).close()
     open_s, file = timed(lambda: TlogFile(path))
     assert file.index.count == count
@@ -275,7 +275,7 @@ def measure_index(path: Path, count: int) -> dict[str, float]:
 
 
 def read_until(path: Path, time_us: int) -> None:
-    """Seek as `mavlogfile` does: by reading on."""
+    """Seek like `mavlogfile`: by reading up to the time."""
     log = mavutil.mavlogfile(str(path))
     while (message := log.recv_msg()) is not None:
         if round(message._timestamp * 1e6) >= time_us:  # noqa: SLF001
@@ -284,7 +284,7 @@ def read_until(path: Path, time_us: int) -> None:
 
 
 class Counter:
-    """Clients in a process of their own that count what they get."""
+    """Clients in a separate process that count received datagrams."""
 
     def __init__(self) -> None:
         self.sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(CLIENTS)]
@@ -298,7 +298,7 @@ class Counter:
             self._count()
 
     def _count(self) -> None:
-        """Count until nothing has come for a second, in the child."""
+        """Count, in the child, until a second without data."""
         got = 0
         while True:
             ready, _, _ = select.select(self.sockets, [], [], 1.0 if got else 60.0)
@@ -313,7 +313,7 @@ class Counter:
         os._exit(0)
 
     def result(self) -> int:
-        """Return how many came."""
+        """Return the number of received datagrams."""
         got = int(os.read(self._read, 32))
         os.waitpid(self.process, 0)
         for place in self.sockets:
@@ -348,7 +348,7 @@ def measure_replay(path: Path) -> dict[str, float]:
 
 
 async def play_all(path: Path, ports: list[int]) -> tuple[float, int]:
-    """Play a tlog to the ports; return how long it took and how many frames it sent."""
+    """Play a tlog to the ports; return the duration and the number of frames sent."""
     clock = GatewayClock()
     hub = Hub(
         HubSettings(endpoints=tuple(f"udp:127.0.0.1:{port}" for port in ports)),
@@ -374,12 +374,12 @@ async def play_all(path: Path, ports: list[int]) -> tuple[float, int]:
 
 
 def measure_recording(folder: Path) -> dict[str, float]:
-    """Record frames and fused samples; the disk's own time is given separately."""
+    """Record frames and fused samples; the time of the disk is reported separately."""
     return asyncio.run(record_all(folder))
 
 
 async def record_all(folder: Path) -> dict[str, float]:
-    """Measure what one frame and one sample cost the loop."""
+    """Measure the cost of one frame and of one sample on the event loop."""
     settings = RecordingSettings(folder=str(folder), mode="always", free_floor_mb=0)
     recorder = Recorder(
         settings, GatewayClock(), unix_time_us, lambda _: TableHeader(), lambda _, __: None
@@ -409,7 +409,7 @@ async def record_all(folder: Path) -> dict[str, float]:
 
 
 def make_sample(i: int) -> FusedSample:
-    """Make a sample with floats of full length, as in life."""
+    """Make a sample with floats of full length, like real ones."""
     x = math.sin(i) / 3
     v = (x, x * x, -x)
     raw = ImuRaw(
@@ -432,11 +432,11 @@ def show(title: str, figures: dict[str, float]) -> None:
 
 
 def main() -> None:
-    """Measure all, print, and write the figures if asked to."""
+    """Measure and print all, and write the figures to a file if requested."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--messages", type=int, default=1_000_000)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--files", action="store_true", help="only convert and sum up")
+    parser.add_argument("--files", action="store_true", help="only convert and summarise")
     parser.add_argument("--edits", action="store_true", help="only make tlogs of tlogs")
     args = parser.parse_args()
     results: dict[str, dict[str, float]] = {}

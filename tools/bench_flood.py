@@ -1,11 +1,11 @@
-"""Measure how long a flood of foreign frames holds up the hub's loop, and how fast it goes through.
+"""Measure the delay of the hub's loop by a flood of foreign frames, and its throughput.
 
     python tools/bench_flood.py --clients 4 16 64
 
 A vehicle's link sends as fast as the hub reads, by UDP or by TCP, and each frame goes to N clients.
 Printed are frames delivered a second, their processor time, and the longest turn of the hub's loop,
-in which nothing else is sent. The baseline, in turns with it, is the same hub reading up to 4 KiB
-at one wake-up, however many clients they go to.
+during which no other data is sent. The baseline, which alternates with it, is the same hub reading
+up to 4 KiB at one wake-up for any number of clients.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from tools.bench_hub import source_frames, udp_socket
 from tools.turns import TurnWatch
 
 BATCH = 64
-"""Datagrams sent between two rests, so that the hub gets a processor."""
+"""Datagrams sent between two pauses, so that the hub gets a processor."""
 REST_S = 0.0002
 
 
@@ -55,7 +55,7 @@ def flood(kind: str, port: int) -> None:
 async def forward(
     make: type[Hub], kind: str, clients: int, watch: TurnWatch, seconds: float
 ) -> tuple[float, float]:
-    """Forward the flood; return the frames delivered a second and the processor time of each."""
+    """Forward the flood; return frames delivered a second and processor time per frame."""
     sinks = [udp_socket() for _ in range(clients)]
     taking = [f"udp:127.0.0.1:{sink.getsockname()[1]}" for sink in sinks]
     endpoints = (f"{kind}-listen:127.0.0.1:0", *taking)

@@ -1,25 +1,25 @@
-"""Measure how the hub forwards MAVLink over UDP and WebSocket, next to a plain UDP forwarder.
+"""Measure the hub's forwarding of MAVLink over UDP and WebSocket, next to a plain UDP forwarder.
 
 A source sends frames of foreign vehicles to the forwarder, which passes them to N clients, all on
 loopback. Three figures for each forwarder and N:
 
-* the lossless maximum: the source keeps at most a window of frames under way and the forwarder
-  sets the pace; the run lasts until every client has received every frame, so that nothing is left
-  in any buffer, and a frame that is not received within half a second is lost;
-* the CPU time that the forwarder uses for each delivered message meanwhile;
+* the lossless maximum: the source keeps at most a window of frames in transit and the forwarder
+sets the rate; the run lasts until every client has received every frame, so that all buffers are
+empty, and a frame that is not received within half a second is lost;
+* the CPU time of the forwarder for each delivered message in this run;
 * latency and CPU share at a fixed rate, from the source's clock before the send to the kernel's
-  stamp at the client's socket, datagram or stream, so that the clients' own wake-ups do not count.
-  The kernel gives bytes of a stream that lie there together the stamp of the last: the clients
-  read whatever comes at once.
+timestamp at the client's socket, datagram or stream, so that the clients' own wake-ups do not
+count. The kernel gives all waiting bytes of a stream the timestamp of the last one, so the
+clients read data as soon as it arrives.
 
 The plain forwarder receives with a blocking `recvfrom` and sends with a blocking `sendto` for each
-client, looking at nothing. Forwarders take turns in short rounds, so that other load on the
-machine meets them alike; all are sent to from the same port, and run on a core of their own if
+client, without reading the content. Forwarders take turns in short rounds, so that other load on
+the machine affects them equally; all receive from the same port, and run on a separate core if
 there are two. The median of the rounds counts.
 
-"WebSocket" is the hub with its clients at a WebSocket port, "packed" the hub whose clients take
-several frames in one datagram. With `--systems` the source is a link with so many vehicles behind
-it, and the first client sends each of them a command.
+"WebSocket" is the hub with its clients at a WebSocket port, "packed" the hub whose clients get
+several frames in one datagram. With `--systems N` the source is a link to N vehicles, and the first
+client sends each of them a command.
 """
 
 import argparse
@@ -54,18 +54,18 @@ SOURCE_SYSTEM = 42
 FRAMES = 20_000
 """Distinct frames, so that the hub's memory of duplicates works as in operation."""
 WINDOWS = (128, 32, 8)
-"""Frames under way; a forwarder that loses some of the first window is given a smaller one."""
+"""Windows, frames in transit; a forwarder with losses in the first one gets a smaller one."""
 STALL_S = 0.5
 BATCH = 64
-"""Frames that are sent or received by one call."""
+"""Maximum frames sent or received by one call."""
 START_LIMIT_S = 20.0
 SO_TIMESTAMPNS = 35
 CORES = sorted(os.sched_getaffinity(0))
-"""The forwarder runs on the last one, source and clients on the first."""
+"""Processor cores: the forwarder runs on the last one, source and clients on the first."""
 WEB = "WebSocket"
-"""The hub again, its clients at a WebSocket port."""
+"""Name of the hub with its clients at a WebSocket port."""
 PACKED = "packed"
-"""The hub again, its clients' frames packed."""
+"""Name of the hub with packed frames."""
 COMMANDED_S = 3.0
 
 PLAIN = """
@@ -97,7 +97,7 @@ with asyncio.Runner(loop_factory=importlib.import_module(event_loop).new_event_l
     runner.run(main(endpoints))
 """
 UVLOOP = "uvloop"
-"""The hub again, on the event loop of that name."""
+"""Name of the hub on the event loop uvloop."""
 
 REFERENCE = "mavlink-router"
 ROUTERS = {
@@ -108,7 +108,7 @@ ROUTERS = {
         "--streamrate=-1 --state-basedir=/tmp"
     ),
 }
-"""Arguments of the routers that are compared, as for `router`."""
+"""Arguments of the compared routers, in the form for `router`."""
 
 HANDSHAKE = (
     b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -127,7 +127,7 @@ Command = Callable[[int, list[int]], list[str]]
 
 @dataclass(frozen=True)
 class Throughput:
-    """One windowed run."""
+    """Results of a run with a window."""
 
     delivered_per_s: float
     cpu_us_per_message: float
@@ -136,7 +136,7 @@ class Throughput:
 
 @dataclass(frozen=True)
 class Latency:
-    """One run at a fixed rate."""
+    """Results of a run at a fixed rate."""
 
     p50_us: float
     p99_us: float
@@ -144,19 +144,19 @@ class Latency:
     cpu_percent: float
     lost: int
     gap_us: float
-    """The longest time in which a client received nothing."""
+    """The longest time without a frame at a client."""
 
 
 def plain(port: int, clients: list[int]) -> list[str]:
-    """Make the command line of the plain forwarder."""
+    """Return the command line of the plain forwarder."""
     return [sys.executable, "-c", PLAIN, str(port), *map(str, clients)]
 
 
 def router(command: str) -> Command:
-    """Make the command line of another router from one with placeholders.
+    """Return the command line of another router from one with placeholders.
 
-    `{in}` is the port that it receives at; each word with `{out}` is repeated for the port of each
-    client, and an option before it too.
+    `{in}` is its input port; each word with `{out}` is repeated for the port of each client, with
+    an option before it.
     """
 
     def build(port: int, clients: list[int]) -> list[str]:
@@ -174,7 +174,7 @@ def router(command: str) -> Command:
 
 
 def hub(options: str = "", event_loop: str = "asyncio") -> Command:
-    """Make the command line of our hub, its clients with some options of an endpoint."""
+    """Return the command line of our hub, with endpoint options for its clients."""
 
     def build(port: int, clients: list[int]) -> list[str]:
         urls = (f"udp:127.0.0.1:{client}{options}" for client in clients)
@@ -184,12 +184,12 @@ def hub(options: str = "", event_loop: str = "asyncio") -> Command:
 
 
 def hub_command(*endpoints: str, event_loop: str = "asyncio") -> list[str]:
-    """Make the command line of our hub with some endpoints."""
+    """Return the command line of our hub with some endpoints."""
     return [sys.executable, "-c", HUB, event_loop, *endpoints]
 
 
 def source_frames(systems: int = 1) -> list[bytes]:
-    """Encode the frames that the source sends, of so many vehicles in turns."""
+    """Encode the frames that the source sends, of some vehicles in turn."""
     links = [mavlink.MAVLink(None, SOURCE_SYSTEM + n, 1) for n in range(systems)]
     frames = []
     for number in range(FRAMES):
@@ -204,13 +204,13 @@ def source_frames(systems: int = 1) -> list[bytes]:
 
 
 def heartbeat() -> bytes:
-    """Encode a heartbeat: some forwarders pass nothing on before they have received one."""
+    """Encode a heartbeat, without which some forwarders do not forward."""
     message = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
     return bytes(message.pack(mavlink.MAVLink(None, SOURCE_SYSTEM, 1)))
 
 
 def udp_socket(port: int = 0) -> socket.socket:
-    """Open a socket on a loopback port, a free one if none is named."""
+    """Open a socket on a loopback port, by default a free one."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
     sock.bind(("127.0.0.1", port))
@@ -219,26 +219,26 @@ def udp_socket(port: int = 0) -> socket.socket:
 
 
 def cpu_ns(pid: int) -> int:
-    """Return how long a process has been on a processor."""
+    """Return the processor time of a process."""
     return sum(
         int(task.read_text().split()[0]) for task in Path(f"/proc/{pid}/task").glob("*/schedstat")
     )
 
 
 def resident_kib(pid: int) -> int:
-    """Return how much memory a process has in use."""
+    """Return the resident memory of a process."""
     status = Path(f"/proc/{pid}/status").read_text()
     return int(status.partition("VmRSS:")[2].split()[0])
 
 
 def stamp_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
-    """Return when the kernel took what a `recvmsg` gave."""
+    """Return the kernel's receive timestamp from the ancillary data of `recvmsg`."""
     seconds, nanoseconds = struct.unpack("=qq", ancillary[0][2])
     return int(seconds * 1_000_000_000 + nanoseconds)
 
 
 class Messages:
-    """Parts of a buffer as the kernel takes them: a `struct mmsghdr` each."""
+    """Parts of a buffer as an array of `struct mmsghdr`."""
 
     def __init__(self, buffer: Any, count: int) -> None:
         size = len(buffer) // count
@@ -252,7 +252,7 @@ class Messages:
         self._kept = buffer, parts
 
     def address_of(self, index: int) -> int:
-        """Return where a header is."""
+        """Return the address of a header."""
         return int(self._headers.ctypes.data) + index * self._headers.strides[0]
 
 
@@ -260,7 +260,7 @@ class Bench:
     """A running forwarder with its source and its clients."""
 
     source_port = 0
-    """Port that frames are sent from: the first free one, and from then on that one."""
+    """Port from which frames are sent: the first free one, then always the same."""
 
     def __init__(self, command: Command, clients: int, frames: list[bytes]) -> None:
         self._frames = frames
@@ -302,7 +302,7 @@ class Bench:
             sock.close()
 
     def throughput(self, seconds: float, window: int) -> Throughput:
-        """Keep a window of frames under way and see how fast it moves."""
+        """Keep a window of frames in transit and measure the rate."""
         self._counts = [0] * len(self._counts)
         sent, lost = 0, 0
         begin_ns, begin_cpu = time.perf_counter_ns(), cpu_ns(self.process.pid)
@@ -329,7 +329,7 @@ class Bench:
         return Throughput(delivered / elapsed_s, used_ns / max(1, delivered) / 1000, lost)
 
     def latency(self, seconds: float, rate_hz: int) -> Latency:
-        """Send at a fixed rate and compare the kernel's stamps with the times of sending."""
+        """Send at a fixed rate and compare the kernel's timestamps with the times of sending."""
         self._counts = [0] * len(self._counts)
         self._stamps = [[] for _ in self._sinks]
         sent_ns: list[int] = []
@@ -358,7 +358,7 @@ class Bench:
         )
 
     def commanded(self, systems: int) -> int:
-        """Send a command to each of so many vehicles; return how many arrived."""
+        """Send a command to each of some vehicles; return the number that arrived."""
         for number in range(2 * systems):
             self._send(self._frames[number])
         self._sinks[0].setblocking(True)
@@ -384,7 +384,7 @@ class Bench:
         return len(reached)
 
     def run_until(self, delivered: int) -> Iterator[tuple[int, int]]:
-        """Forward until so many messages were delivered; yield count and KiB now and then."""
+        """Forward until `delivered` messages are delivered; yield count and KiB repeatedly."""
         total = 0
         while total < delivered:
             self.throughput(2.0, WINDOWS[0])
@@ -412,7 +412,7 @@ class Bench:
             self._source.send(frame)
 
     def _send_some(self, first: int, most: int) -> int:
-        """Send frames from one on; return how many."""
+        """Send frames from `first` on; return their number."""
         count = min(most, BATCH, FRAMES - first)
         return max(0, send_many(self._source.fileno(), self._sent.address_of(first), count))
 
@@ -422,7 +422,7 @@ class Bench:
             pass
 
     def _drain(self, wait_ms: int) -> int:
-        """Read all that was received; return the number of frames."""
+        """Read all received datagrams; return the number of frames."""
         return sum(self._take(fd) for fd, _ in self._poll.poll(wait_ms))
 
     def _take(self, fd: int) -> int:
@@ -432,7 +432,7 @@ class Bench:
         return count
 
     def _read(self, index: int) -> int:
-        # Other frames, such as heartbeats, are shorter than ours; several of ours may be in one.
+        # Other frames, such as heartbeats, are shorter than ours; a datagram may have several.
         file, total, count = self._sinks[index].fileno(), 0, BATCH
         while count == BATCH:
             count = receive_many(file, self._arrived.address_of(0), BATCH)
@@ -451,7 +451,7 @@ class Bench:
 
 
 class WebBench(Bench):
-    """The hub with clients at its WebSocket port, which count frames in the messages."""
+    """The hub with clients at its WebSocket port that count frames in the messages."""
 
     def __init__(self, clients: int, frames: list[bytes]) -> None:
         with socket.socket() as probe:
@@ -512,7 +512,7 @@ class WebBench(Bench):
         return data, ancillary
 
     def _messages(self, index: int, chunk: bytes) -> int:
-        """Return how many messages of one frame of ours each are complete."""
+        """Return the number of complete messages, each with one frame of ours."""
         data = self._rests[index] + chunk
         count, at = 0, 0
         while at + 2 <= len(data) and at + 2 + data[at + 1] <= len(data):
@@ -523,11 +523,11 @@ class WebBench(Bench):
 
 
 Start = Callable[[int, list[bytes]], Bench]
-"""Starts a forwarder for so many clients and with these frames."""
+"""Starts a forwarder for a number of clients, with some frames."""
 
 
 def lossless(bench: Bench, seconds: float) -> Throughput:
-    """Return the fastest run without loss, or the last."""
+    """Return the fastest run without loss, or else the last one."""
     for window in WINDOWS:
         result = bench.throughput(seconds, window)
         if not result.lost:
@@ -536,7 +536,7 @@ def lossless(bench: Bench, seconds: float) -> Throughput:
 
 
 def summed_up(results: list[dict[str, float]]) -> dict[str, float]:
-    """Take the median of the rounds for each figure, and the sum of the losses."""
+    """Return the median of the rounds for each figure, and the sum of the losses."""
     return {
         key: (sum if key == "lost" else statistics.median)([result[key] for result in results])
         for key in results[0]
@@ -546,7 +546,7 @@ def summed_up(results: list[dict[str, float]]) -> dict[str, float]:
 def measure(
     forwarders: dict[str, Start], clients: int, rounds: int, seconds: float
 ) -> dict[str, dict[str, dict[str, float]]]:
-    """Run all forwarders with so many clients, in turns."""
+    """Run all forwarders with a number of clients, in turn."""
     frames = source_frames()
     found: dict[str, tuple[list[dict[str, float]], list[dict[str, float]]]] = {
         name: ([], []) for name in forwarders
@@ -589,7 +589,7 @@ def show(report: dict[str, dict[str, dict[str, dict[str, float]]]]) -> None:
 def measure_systems(
     forwarders: dict[str, Start], systems: int, clients: int, seconds: float
 ) -> dict[str, dict[str, float]]:
-    """Reach so many vehicles behind one link, and see what each of their frames costs."""
+    """Command some vehicles behind one link, and measure the cost of each of their frames."""
     found: dict[str, dict[str, float]] = {}
     table = Table(title=f"{systems} vehicles behind one link", box=box.SIMPLE_HEAD)
     for column in ("forwarder", "commanded", "CPU µs/msg", "of one vehicle"):
@@ -618,7 +618,7 @@ def measure_systems(
 
 
 def watch_memory(messages: int) -> dict[str, int]:
-    """Forward many messages through the hub to 16 clients and watch its memory."""
+    """Forward many messages through the hub to 16 clients and measure its memory."""
     bench = Bench(hub(), 16, source_frames())
     track: list[tuple[int, int]] = []
     try:
@@ -635,7 +635,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=2.0, help="of each single run")
+    parser.add_argument("--seconds", type=float, default=2.0, help="duration of each run")
     parser.add_argument("--clients", type=int, nargs="+", default=CLIENTS)
     parser.add_argument("--uvloop", action="store_true", help="compare the hub on uvloop")
     for name in ROUTERS:
@@ -644,9 +644,9 @@ def main() -> None:
         "--router", action="append", default=[], metavar="NAME=COMMAND",
         help="compare another router: its command with {in} and {out} for ports",
     )  # fmt: skip
-    parser.add_argument("--systems", type=int, help="only command so many vehicles behind one link")
+    parser.add_argument("--systems", type=int, help="only command this many vehicles of one link")
     parser.add_argument(
-        "--memory", type=int, metavar="MESSAGES", help="only watch memory over so many messages"
+        "--memory", type=int, metavar="MESSAGES", help="only measure memory over this many messages"
     )
     options = parser.parse_args()
     os.sched_setaffinity(0, CORES[:1])

@@ -1,16 +1,15 @@
-"""Measure the way from the serial byte to the datagram: latency and CPU share.
+"""Measure latency and CPU share from the serial byte to the datagram.
 
     python tools/bench_latency.py
 
-Several aircraft send all that their nodes send: IMU and barometer samples, fixes with their
-quality, the nodes' and the receiver's own reports. A frame with an IMU sample is written to a
-pseudo-terminal and the ATTITUDE_QUATERNION that it becomes is awaited on a UDP port, at several
-rates; of one aircraft the samples are lines of JSON. Programs take turns in short rounds, so that
-other load on the machine meets them alike: the median round counts. The baseline is a program that
-reads the same line and sends a datagram of the same size for every frame, without decoding, fusing
-or encoding anything; `--forwarder` names another such program, in any language. The greatest
-latency at the highest rate is the longest pause, the machine's own included: the baseline has those
-too.
+Several aircraft send all payloads of their nodes: IMU and barometer samples, fixes with their
+quality, the reports of nodes and receiver. A frame with an IMU sample is written to a
+pseudo-terminal and the resulting ATTITUDE_QUATERNION is awaited on a UDP port, at several rates;
+for one aircraft the samples are lines of JSON. Programs take turns in short rounds, so that other
+load on the machine affects them equally: the median round counts. The baseline is a program that
+reads the same line and sends a datagram of the same size for every frame, without decoding, fusion
+or encoding; `--forwarder` names another such program, in any language. The maximum latency at the
+highest rate is the longest pause, including pauses of the machine, which the baseline has as well.
 """
 
 import argparse
@@ -48,14 +47,14 @@ from gateway.wire.framing import encode_frame
 RATES_HZ = (100, 1000)
 VEHICLES = 3
 BARO_HZ, FIX_HZ, REPORT_HZ = 25, 5, 1
-"""Of each aircraft, in addition to its IMU samples; the receiver's report comes with its own."""
+"""Rates of each aircraft's other payloads; REPORT_HZ is that of the receiver's report too."""
 WARM_UP_S = 3.0
 START_LIMIT_S = 120.0
 CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
 GATEWAY = "mavgate"
 WITH_UVLOOP = "mavgate, uvloop"
 OF_LINES = "mavgate, JSON lines"
-"""One aircraft that prints as many samples as the boards send, each as a line of JSON."""
+"""Name of the run with one aircraft that sends each sample as a line of JSON."""
 
 BASELINE = """
 import os, socket, sys
@@ -76,23 +75,23 @@ event_loop = "{event_loop}"
 
 
 class Moment(NamedTuple):
-    """The frames that are written to the line together."""
+    """Frames that are written to the line together."""
 
     system: int
-    """Whose IMU sample it is."""
+    """System of the IMU sample."""
     sample: bytes
     others: list[bytes]
 
 
 class Nodes:
-    """Aircraft that lie level and turn slowly, and their receiver."""
+    """Level aircraft that turn slowly, and their receiver."""
 
     def __init__(self) -> None:
         self._sequences: dict[NodeId, Iterator[int]] = {}
         self._frames = itertools.count()
 
     def moments(self, rate_hz: int, vehicles: int) -> Iterator[Moment]:
-        """Yield without end, at so many IMU samples a second of all aircraft together."""
+        """Yield frames without end, at a total rate of IMU samples of all aircraft."""
         for number in itertools.count():
             system, tick = 1 + number % vehicles, number // vehicles
             node_us = round(number * 1e6 / rate_hz)
@@ -149,13 +148,13 @@ def fix_payload(itow_ms: int) -> payloads.GpsFixPayload:
 
 
 def quality_payload(itow_ms: int) -> payloads.GpsQualityPayload:
-    """Make the accuracies and the time of that fix."""
+    """Make the accuracies and the time of the fix."""
     utc = datetime(2026, 1, 1, tzinfo=UTC)
     return payloads.GpsQualityPayload(itow_ms, 150, 220, 30, 900, 140, 2500, utc)
 
 
 def line_moments(rate_hz: int) -> Iterator[Moment]:
-    """Yield lines of JSON without end, each with a sample of an IMU and every tenth a field."""
+    """Yield lines of JSON without end, each with an IMU sample, every tenth with a field."""
     for number in itertools.count():
         turn = math.sin(number / 500)
         sample: dict[str, object] = {
@@ -174,19 +173,19 @@ def frames(rate_hz: int) -> Iterator[bytes]:
 
 
 def cpu_seconds(pid: int) -> float:
-    """Return how much CPU time a process has used."""
+    """Return the CPU time of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / CLOCK_TICKS
 
 
 class Line:
-    """A pseudo-terminal with a program at its other end, and the UDP port of its answers."""
+    """A pseudo-terminal with a program at its other end, and the UDP port for its answers."""
 
     def __init__(self, name: str, command: list[str], moments: Iterator[Moment]) -> None:
         self._is_gateway = name in (GATEWAY, WITH_UVLOOP, OF_LINES)
         self._moments = moments
         self._waiting: dict[int, deque[float | None]] = {}
-        """Times of the frames not answered yet, by system; None for those that are not measured."""
+        """Times of unanswered frames, by system; None for frames that are not measured."""
         self._latencies_us: list[float] = []
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sock.bind(("127.0.0.1", 0))
@@ -209,7 +208,7 @@ class Line:
         os.close(self._slave)
 
     def await_answer(self, rate_hz: int) -> None:
-        """Feed the line until the program answers, then let it run dry."""
+        """Feed the line until the program answers, then read all answers."""
         deadline = time.monotonic() + START_LIMIT_S
         while time.monotonic() < deadline and self.process.poll() is None:
             self._send()
@@ -232,7 +231,7 @@ class Line:
                 self._send()
                 count += 1
                 continue
-            # Sleeping to the end would wake too late at 1000 frames/s: the last part is polled.
+            # A sleep to the end would end too late at 1000 frames/s, so the last part is polled.
             if select.select([self._sock], [], [], max(0.0, due - now - 2e-4))[0]:
                 self._receive()
         if missing := self._unanswered():
@@ -253,7 +252,7 @@ class Line:
             os.write(self._master, frame)
 
     def _receive(self) -> bool:
-        """Take one datagram; return whether it answers something."""
+        """Read one datagram; return whether it answers a frame."""
         arrival, datagram, system = time.perf_counter(), self._sock.recv(2048), 0
         if self._is_gateway:
             message_id = int.from_bytes(datagram[7:10], "little")
@@ -268,7 +267,7 @@ class Line:
 def measure(
     name: str, command: list[str], rate_hz: int, options: argparse.Namespace
 ) -> dict[str, float]:
-    """Run a program on a line of its own and measure it."""
+    """Run a program on a separate line and measure it."""
     of_nodes = Nodes().moments(rate_hz, options.vehicles)
     line = Line(name, command, line_moments(rate_hz) if name == OF_LINES else of_nodes)
     try:
@@ -305,7 +304,7 @@ def programs(folder: Path, options: argparse.Namespace) -> dict[str, list[str]]:
 
 
 def summed_up(rounds: list[dict[str, float]]) -> dict[str, float]:
-    """Take the median round of each figure, and the longest pause of all."""
+    """Return the median round of each figure, and the longest pause of all."""
     return {
         key: (max if key == "max_us" else statistics.median)([one[key] for one in rounds])
         for key in rounds[0]
@@ -353,7 +352,7 @@ def show(results: dict[tuple[int, str], dict[str, float]], options: argparse.Nam
         table.add_row(str(rate_hz), name, *latencies, f"{row['cpu_percent']:.1f}")
     console = Console()
     console.print(table)
-    # Where frames come fastest, a pause of the program meets one just as it begins.
+    # At the highest rate, a frame waits for almost all of a pause, so the maximum is the longest.
     fastest, lasted_s = max(RATES_HZ), options.rounds * options.seconds
     for (rate_hz, name), row in results.items():
         if rate_hz == fastest:

@@ -1,11 +1,11 @@
-"""Measure the panel: datagram in to drawn in the browser, CPU, memory, and what the gateway feels.
+"""Measure the panel: delay from datagram to drawing, CPU, memory, and the effect on the gateway.
 
-A vehicle of this tool's own sends attitude and position at 25 Hz to a `mavgate panel`; one message
-carries the time at which it was sent (as VFR_HUD's climb, which only passes through), and the page
-notes how late it is once the frame that shows it is drawn. Then the gateway's own latency from the
-serial byte to the datagram is measured without a panel, with one and a viewer that draws elsewhere,
-and with one whose browser draws on the gateway's own cores, in turns. An hour's memory is that of
-what the panel keeps, fed on a clock that is set by hand.
+A simulated vehicle sends attitude and position at 25 Hz to a `mavgate panel`; one message contains
+its time of sending (in the climb of VFR_HUD, which is not changed), and the page notes the delay
+once the frame that shows it is drawn. Then the gateway's latency from the serial byte to the
+datagram is measured, in turn without a panel, with a panel and a viewer that draws elsewhere, and
+with a browser that draws on the gateway's own cores. The memory of an hour is that of the panel's
+stored state, fed with simulated time.
 """
 
 import argparse
@@ -43,14 +43,14 @@ const socket = new WebSocket(`ws://${location.host}/telemetry`);
 socket.onmessage = () => socket.send("1");
 null;
 """
-"""Takes what a page takes and draws nothing: a viewer on another machine."""
+"""A client that receives like a page but draws nothing: a viewer on another machine."""
 RATE_HZ = 25
 VIEWERS = (1, 5)
 GATEWAY_HZ = 200
 TURNS = 3
 SETTLE_MS = 3000
 MINUTES = (10, 20, 40, 60, 80, 120)
-"""After so many the memory of the hours is looked at; the path is full after 67."""
+"""Minutes after which memory is measured; the path is full after 67."""
 GOAL_P99_MS = 100
 GOAL_RATIO = 1.1
 GOAL_CLICK_MS = 200
@@ -80,11 +80,11 @@ CLICK = """
 })
 """
 CLICKS = 5
-"""On each view."""
+"""Number of clicks on each view."""
 
 
 class Vehicle(threading.Thread):
-    """Sends what an aircraft sends, with the time in it."""
+    """Sends the messages of an aircraft, with the time in them."""
 
     def __init__(self, port: int) -> None:
         super().__init__(daemon=True)
@@ -111,7 +111,7 @@ class Vehicle(threading.Thread):
         self.join()
 
     def messages(self, count: int) -> Iterator[mavlink.MAVLink_message]:
-        """Make what is sent at one of its beats."""
+        """Make the messages of one step."""
         if count % RATE_HZ == 0:
             yield mavlink.MAVLink_heartbeat_message(1, 0, 128, 0, 4, 3)
         turn = count / 100
@@ -123,7 +123,7 @@ class Vehicle(threading.Thread):
 
 
 def memory_mb(pid: int) -> float:
-    """Return how much memory a process holds."""
+    """Return the memory of a process."""
     text = Path(f"/proc/{pid}/status").read_text()
     return int(re.findall(r"VmRSS:\s+(\d+)", text)[0]) / 1000
 
@@ -194,7 +194,7 @@ def measure_clicks(browser: Browser, folder: Path) -> dict[str, float]:
 
 
 def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict[str, Any]:
-    """Measure the gateway's own delay without a panel and with one that is looked at, in turns."""
+    """Measure the gateway's delay without a panel and with an open page, in turn."""
     config = folder / "gateway.toml"
     config.write_text(
         f'aircraft_folder = "{folder}/aircraft"\n'
@@ -211,7 +211,7 @@ def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict[str,
     ended = 0.0
 
     def turn(for_s: float) -> list[float]:
-        """Exchange frames after a pause in which the node went on unheard."""
+        """Exchange frames after a pause in which the node's frames were not read."""
         nonlocal ended
         for _ in range(round((time.perf_counter() - ended) * GATEWAY_HZ)):
             next(moments)
@@ -243,7 +243,7 @@ def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict[str,
 
 
 def measure_hours() -> list[dict[str, float]]:
-    """Measure what the panel's memory of one aircraft at 25 Hz takes, minute for minute."""
+    """Measure the memory of the panel for one aircraft at 25 Hz, after each of `MINUTES`."""
     parts = make_parts(PanelSettings(), Path(), None, None)
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     reader = mavlink.MAVLink(None)

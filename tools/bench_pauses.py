@@ -2,10 +2,10 @@
 
     python tools/bench_pauses.py --minutes 60
 
-The demo flies simulated aircraft, records all in files that are soon full, serves metrics, and has
+The demo simulates aircraft, records all data in files that are soon full, serves metrics, and has
 clients over UDP, TCP and WebSocket that send every request. Printed are the longest turns of its
-loop, without the time that the machine takes: first until all aircraft send, then while telemetry
-flows. The baseline, which runs at the same time, is a loop that does the same work in every turn.
+loop, without the time used by the machine: first until all aircraft send, then during telemetry.
+The baseline, which runs at the same time, is a loop that does the same work in every turn.
 """
 
 import argparse
@@ -35,7 +35,7 @@ from tools.turns import LONG_US, TurnWatch, even_turns
 
 GOAL_MS = LONG_US / 1e3
 ROTATE_MB = 1.0
-"""The smallest there is: some files a minute."""
+"""The smallest allowed value: some files a minute."""
 LOOK_S = 0.1
 
 
@@ -113,7 +113,7 @@ def main() -> None:
     parser.add_argument("--vehicles", type=int, default=2)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        # Its own control socket: a gateway that runs on this machine keeps its.
+        # A separate control socket, not that of a gateway that runs on this machine.
         os.environ["XDG_RUNTIME_DIR"] = name
         baseline = begin_copy(send_even_turns, 60.0 * options.minutes)
         begin_s = time.monotonic()

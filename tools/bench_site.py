@@ -4,10 +4,11 @@
 its own clients over UDP and TCP and, over Zenoh, a router and a `mavgate fleet`, to a third ground
 station. All three get the same frames in the same run, so that the first two are the baseline.
 Latency is from this process's clock before it writes the frame to the same clock when it reads the
-datagram. Then the same again while a recording of the site is fetched.
+datagram. The measurement is repeated while a recording of the site is fetched.
 
-`--outage S` kills the router in a third part, and starts it again S seconds later: what each client
-lost, got twice, or got late, and the memory of site and fleet before and in it.
+`--outage S` kills the router in a third part, and starts it again S seconds later; printed are the
+frames that each client lost, got twice or got late, and the memory of site and fleet before and
+during the outage.
 """
 
 import argparse
@@ -38,13 +39,13 @@ from tools.bench_latency import frames
 WAYS = ("UDP, plain hub", "TCP, plain hub", "fleet")
 DIRECT, FLEET = WAYS[0], WAYS[2]
 SETTLED = 100
-"""Frames in a row that all three get before anything is measured."""
+"""Successive frames that all three must receive before the measurement."""
 START_LIMIT_S = 120.0
 DRAIN_S = 1.0
 BEFORE_S, AFTER_S = 5.0, 10.0
-"""Around the outage."""
+"""Measured time before and after the outage."""
 LATE_US = 1e6
-"""A frame that arrives so late would be an old one taken for new."""
+"""Delay from which a frame counts as late."""
 RECORDING_BYTES = 2 << 30
 PIECES = ".bench_01.tlog.part"
 
@@ -65,7 +66,7 @@ attitude_quaternion_hz = 1000
 
 @dataclass(frozen=True)
 class WayFigures:
-    """What one ground station got in one part."""
+    """Frames that one ground station received in one part."""
 
     part: str
     way: str
@@ -118,7 +119,7 @@ class Field:
     def feed(
         self, part: str, seconds: float, events: list[tuple[float, Callable[[], None]]]
     ) -> list[WayFigures]:
-        """Write frames for some time, do what is due meanwhile, and say what each station got."""
+        """Write frames for some time, run what is due, and return the figures of each station."""
         for station in self.stations.values():
             station.got.clear()
         written: list[int] = []
@@ -139,7 +140,7 @@ class Field:
     def _read_until(self, when_s: float) -> None:
         sockets = [station.sock for station in self.stations.values()]
         while True:
-            # To sleep to the very end wakes too late.
+            # A sleep to the end would end too late.
             ready = select.select(sockets, [], [], max(0.0, when_s - time.monotonic() - 2e-4))[0]
             for station in self.stations.values():
                 if station.sock in ready:
@@ -152,7 +153,7 @@ class Field:
         while any(len(got[way].got) < SETTLED for way in ways):
             if time.monotonic() > limit or self.site.poll() is not None:
                 raise RuntimeError(f"nothing comes by {ways}")
-            # Until the site reads it the line is full.
+            # The line is full until the site reads it.
             with contextlib.suppress(BlockingIOError):
                 os.write(self._line, next(self._frames))
             self._read_until(time.monotonic() + 1 / self._rate_hz)
@@ -160,7 +161,7 @@ class Field:
 
 
 def figures(part: str, way: str, written: dict[int, int], got: list[tuple[int, int]]) -> WayFigures:
-    """Compare what one station got with what was written, by the vehicle's time in the frames."""
+    """Compare the received with the written frames, by the vehicle's time in them."""
     late_us = [(ns - written[key]) / 1000 for key, ns in got if key in written]
     return WayFigures(
         part=part,
@@ -175,7 +176,7 @@ def figures(part: str, way: str, written: dict[int, int], got: list[tuple[int, i
 
 
 def with_fetch(site: Field, seconds: float) -> tuple[list[WayFigures], float]:
-    """Measure while a recording is fetched; return its rate in bytes a second too."""
+    """Measure while a recording is fetched; also return the rate of the fetch, bytes a second."""
     words = ("fleet", "recordings", "get", "field", "bench", "-o", str(site.home / "fetched"))
     fetch = start("-m", "gateway.cli", *words, home=site.home)
     part = site.home / "fetched" / PIECES
@@ -191,7 +192,7 @@ def with_fetch(site: Field, seconds: float) -> tuple[list[WayFigures], float]:
 
 
 def through_an_outage(site: Field, outage_s: float) -> tuple[list[WayFigures], list[str]]:
-    """Kill the router, start it again, and watch memory."""
+    """Kill the router, start it again, and measure memory."""
     processes = {"site": site.site, "fleet": site.fleet}
     memory: dict[str, list[int]] = {name: [] for name in processes}
     returned: list[float] = []
@@ -224,7 +225,7 @@ def through_an_outage(site: Field, outage_s: float) -> tuple[list[WayFigures], l
 
 
 def show(rows: list[WayFigures], rate_hz: int) -> Iterator[Table]:
-    """Lay the figures out."""
+    """Yield the figures as tables."""
     table = Table(title=f"serial byte to ground station, {rate_hz} frames/s, loopback", box=None)
     for column in ("part", "way", "sent", "lost", "twice", "late", "p50 µs", "p99 µs"):
         table.add_column(column, justify="left" if column in ("part", "way") else "right")
@@ -238,7 +239,7 @@ def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rate", type=int, default=60, help="IMU frames a second")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each part")
+    parser.add_argument("--seconds", type=float, default=20.0, help="duration of each part")
     parser.add_argument("--outage", type=float, default=0.0, help="seconds without a router")
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     options = parser.parse_args()

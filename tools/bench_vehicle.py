@@ -1,4 +1,4 @@
-"""Measure what an IMU sample costs: processor time from serial bytes to MAVLink frames.
+"""Measure the processor time of an IMU sample from serial bytes to MAVLink frames.
 
     python tools/bench_vehicle.py
 
@@ -6,9 +6,9 @@ Feeds twenty seconds of samples at three rates, first to the whole pipeline (byt
 frames out, no sockets), then to the vehicle alone, and prints processor time. The baseline, in the
 same run, is pymavlink packing one ATTITUDE_QUATERNION.
 
-A running gateway sleeps between the samples, and a processor that has slept, or has run something
-else, is slow at first: its caches are cold. So both baseline and pipeline are measured once more
-with a sleep before each message and each sample.
+A running gateway sleeps between the samples, and a processor that has slept, or has run another
+program, is slow at first: its caches are cold. So both baseline and pipeline are also measured with
+a sleep before each message and each sample.
 """
 
 import sys
@@ -32,15 +32,15 @@ RATES_HZ = (60, 200, 1000)
 SECONDS = 20
 PACKS = 20_000
 LONGEST_WAIT_US = 100_000
-"""As the daemon: it polls at the latest so long after the last time."""
+"""Maximum interval of polls, as in the daemon."""
 SLEEP_S = 0.0007
-"""About the rest of a millisecond after a sample."""
+"""Sleep before each sample: about the rest of a millisecond."""
 SLEEPING_SECONDS = 3
-"""Of the runs with sleeps."""
+"""Duration of the runs with sleeps."""
 
 
 def pack_us(packs: int, sleep_s: float = 0.0) -> float:
-    """Time the bare encoding of one message."""
+    """Measure the encoding of one message."""
     mav = mavlink.MAVLink(None, 1, 1)
     used_s = 0.0
     for _ in range(packs):
@@ -54,7 +54,7 @@ def pack_us(packs: int, sleep_s: float = 0.0) -> float:
 
 
 def run_pipeline(rate_hz: int, seconds: int, sleep_s: float = 0.0) -> tuple[float, int]:
-    """Feed the receiver's bytes, and every message due; return the time used and the frames."""
+    """Feed the receiver's bytes and poll; return the processor time and the number of frames."""
     pipeline = Pipeline(PipelineSettings(AircraftSettings()))
     pipeline.connect("bench")
     line = list(islice(frames(rate_hz), (seconds + 1) * rate_hz))

@@ -46,16 +46,16 @@ KERNEL_MODULES: Final = (
     "gateway.recordings.tlog_scan",
     "gateway.geometry.quaternion",
 )
-"""The modules with entry points; to build a wheel, only numpy, msgspec and pygeomag are there."""
+"""Modules with entry points. A wheel is built with only numpy, msgspec and pygeomag installed."""
 ARCHITECTURES: Final = ("x86_64", "aarch64")
 OLDEST_GLIBC: Final = "2.17"
-"""The library of a wheel runs with this version of the C library and later ones."""
+"""Oldest version of the C library with which the library of a wheel runs."""
 NO_KERNELS: Final = ("gateway.compiled", "gateway.settings")
-"""Modules that all kernels import, but no constant from."""
+"""Modules that all kernels import, but from which they use no constant."""
 COMPILER: Final = Path(__file__).with_name("kernel_compiler.py")
 OTHERS_WRITE: Final = stat.S_IWGRP | stat.S_IWOTH
 MAX_CACHED: Final = 8
-"""Object files that are kept, of 0.2 MB each."""
+"""Maximum cached object files, of 0.2 MB each."""
 SHOW_S: Final = 0.2
 """Interval of the progress on a terminal."""
 
@@ -82,7 +82,7 @@ def is_current() -> bool:
 
 
 def build_installed(path: Path, architecture: str | None = None, *, afresh: bool = False) -> None:
-    """Build the library that the gateway loads; in a process that has imported nothing else.
+    """Build the library that the gateway loads, in a process without other imports.
 
     Parameters
     ----------
@@ -90,11 +90,11 @@ def build_installed(path: Path, architecture: str | None = None, *, afresh: bool
     architecture : str, optional
         See `build_library`.
     afresh : bool
-        Use no object file of the cache.
+        Do not use an object file of the cache.
     """
     for name in KERNEL_MODULES:
         importlib.import_module(name)
-    # All that was imported may define a constant or a type of a kernel.
+    # Any imported module may define a constant or a type of a kernel.
     names = [name for name in sys.modules if name.startswith("gateway.")]
     files = {sys.modules[name].__file__ for name in names if not name.startswith(NO_KERNELS)}
     stamp = "\n".join(sorted(stamp_of(Path(file)) for file in files if file))
@@ -105,7 +105,7 @@ def build_installed(path: Path, architecture: str | None = None, *, afresh: bool
 
 
 def cached_object(stamp: str) -> Path | None:
-    """Return where the cache has the object file of these sources and this compiler.
+    """Return the path in the cache of the object file of these sources and this compiler.
 
     None without a cache, for a user without a home folder.
     """
@@ -121,10 +121,10 @@ def cached_object(stamp: str) -> Path | None:
 
 @contextmanager
 def compiled_again(entry_points: Sequence[EntryPoint[...]]) -> Iterator[None]:
-    """Let entry points run as they are now, with patched constants and functions of their modules.
+    """Run entry points with the patched constants and functions of their modules.
 
-    For experiments: they are compiled when the context begins, and call the installed library
-    again when it ends.
+    For experiments: they are compiled when the context begins; after it, they call the installed
+    library again.
 
     Parameters
     ----------
@@ -156,14 +156,14 @@ def build_library(
     Parameters
     ----------
     path : Path
-        Of the library; replaced atomically, so that a running process keeps the old one.
+        Path of the library; replaced atomically, so that a running process keeps the old one.
     entry_points : sequence of EntryPoint
     stamp : str
         The value of `SOURCES_SYMBOL`.
     architecture : str, optional
-        For a wheel: `x86_64` or `aarch64`. By default the library is for this machine alone.
+        For a wheel: `x86_64` or `aarch64`. By default the library is for this machine only.
     cached : Path, optional
-        Of the object file, which is compiled and stored there unless it exists.
+        Path of the object file, which is compiled and stored there unless it exists.
     show : bool
         Print the progress.
 
@@ -213,7 +213,7 @@ def _kept(cached: Path) -> bytes:
     """Return an object file of the cache; empty if there is none, or it is damaged or foreign."""
     with suppress(OSError), cached.open("rb") as file:
         status, (digest, _, machine_code) = os.fstat(file.fileno()), file.read().partition(b"\n")
-        # In a shared folder another user could have put it there, and would have it run.
+        # In a shared folder, another user could have written a file that would then be run.
         is_own = status.st_uid == os.geteuid() and not status.st_mode & OTHERS_WRITE
         if is_own and digest == _digest(cached, machine_code):
             return machine_code
@@ -225,7 +225,7 @@ def _digest(cached: Path, machine_code: bytes) -> bytes:
 
 
 def _keep(cached: Path, machine_code: bytes) -> None:
-    """Store an object file, and remove the oldest others; a cache that fails does no harm."""
+    """Store an object file, and remove the oldest others; errors of the cache are ignored."""
     with suppress(OSError):
         cached.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = cached.parent.lstat()
@@ -255,7 +255,7 @@ def _link(relocatable: Path, library: Path, architecture: str | None) -> None:
 
 
 def _linker(architecture: str | None) -> list[str]:
-    """Choose the command that links: for a wheel the one that supports older systems."""
+    """Return the command that links; for a wheel, the one that supports older systems."""
     if architecture is None and (compiler := shutil.which("cc")):
         return [compiler]
     if find_spec("ziglang") is None:
@@ -267,7 +267,7 @@ def _linker(architecture: str | None) -> list[str]:
 
 
 class _Progress:
-    """Prints how many entry points are compiled."""
+    """Prints the number of compiled entry points."""
 
     def __init__(self, total: int) -> None:
         self._total = total
@@ -276,7 +276,7 @@ class _Progress:
         self._redraws = sys.stdout.isatty()
 
     def step(self, what: str) -> None:
-        """Take note of a function that was compiled, or of an entry point with all it calls."""
+        """Count a compiled function, or an entry point with all functions that it calls."""
         self._functions += what == "function"
         self._done += what == "entry point"
         now_s = time.monotonic()

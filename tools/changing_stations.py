@@ -2,8 +2,8 @@
 
     python tools/changing_stations.py UDP_PORT TCP_PORT WS_PORT METRICS_PORT
 
-For `bench_pauses.py`: they ask a gateway for parameters, missions, messages, rates and files, stay
-for some seconds and leave, until the process is ended. Its metrics are scraped meanwhile.
+For `bench_pauses.py`: they request parameters, missions, messages, rates and files from a gateway,
+stay for some seconds and leave, until the process is ended. The gateway's metrics are scraped too.
 """
 
 import asyncio
@@ -21,14 +21,14 @@ from tools.bench_hub import HANDSHAKE
 from tools.fault_traffic import ftp, heartbeat, packed, request_message
 
 AT_ONCE = 6
-"""Stations at a time."""
+"""Number of stations at a time."""
 LONGEST_STAY_S = 8.0
 SCRAPE_S = 5.0
 METADATA = b"/general.json"
 
 
 def questions() -> list[bytes]:
-    """Encode what a ground station asks at its start."""
+    """Encode the requests of a ground station at its start."""
     rate = (mavlink.MAVLINK_MSG_ID_ATTITUDE, 20_000, 0, 0, 0, 0, 0)
     return [
         heartbeat(200),
@@ -42,11 +42,11 @@ def questions() -> list[bytes]:
 
 
 class Datagrams(asyncio.DatagramProtocol):
-    """A client that reads nothing."""
+    """A client that ignores received data."""
 
 
 async def visit_udp(port: int, stay_s: float) -> None:
-    """Come by UDP."""
+    """Connect by UDP, send the requests, and leave."""
     loop = asyncio.get_running_loop()
     transport, _ = await loop.create_datagram_endpoint(Datagrams, remote_addr=("127.0.0.1", port))
     for question in questions():
@@ -58,7 +58,7 @@ async def visit_udp(port: int, stay_s: float) -> None:
 
 
 async def visit_stream(port: int, stay_s: float, *, web: bool) -> None:
-    """Come by TCP, or by WebSocket."""
+    """Do the same by TCP, or by WebSocket."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     if web:
         writer.write(HANDSHAKE)
@@ -73,13 +73,13 @@ async def visit_stream(port: int, stay_s: float, *, web: bool) -> None:
 
 
 def _masked(data: bytes) -> bytes:
-    """Put a frame into a WebSocket message of a client, under a mask that changes nothing."""
+    """Return a frame as a WebSocket message of a client, with a mask of zero."""
     size = bytes([0x80 | len(data)]) if len(data) < 126 else b"\xfe" + len(data).to_bytes(2)
     return b"\x82" + size + bytes(4) + data
 
 
 async def come_and_go(udp: int, tcp: int, web: int) -> None:
-    """Be one station after another."""
+    """Run one station after another."""
     while True:
         stay_s = random.uniform(0.5, LONGEST_STAY_S)
         try:
@@ -95,7 +95,7 @@ async def come_and_go(udp: int, tcp: int, web: int) -> None:
 
 
 async def scrape(port: int) -> None:
-    """Read the gateway's metrics now and then."""
+    """Read the gateway's metrics repeatedly."""
     url = f"http://127.0.0.1:{port}/metrics"
     while True:
         await asyncio.sleep(SCRAPE_S)

@@ -2,7 +2,7 @@
 
     make coverage
 
-Lines that other processes run, as the tests of whole programs do, are not in the data.
+Lines run in other processes, as by the tests of whole programs, are not in the data.
 """
 
 from collections import Counter

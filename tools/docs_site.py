@@ -1,7 +1,7 @@
-"""Hook of mkdocs: pages of the repository outside docs/ become pages of the site.
+"""Hook of mkdocs that adds pages of the repository outside docs/ to the site.
 
-Links keep working in both places: `../SECURITY.md` of a page in docs/ is `SECURITY.md` of the site,
-and so is `docs/fleet.md` of a page at the top of the repository.
+Links work both in the repository and on the site: `../SECURITY.md` in a page of docs/ becomes
+`SECURITY.md`, and `docs/fleet.md` in a page at the top of the repository becomes `fleet.md`.
 """
 
 import re
@@ -30,7 +30,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Adapt links of a page to its place in the site."""
+    """Adapt the links of a page to its location in the site."""
     name = page.file.src_uri
     if name in PAGES or name == "repository.md":
         depth = "../" if "/" in name else ""

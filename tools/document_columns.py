@@ -2,8 +2,8 @@
 
     python -m tools.document_columns
 
-Columns, types and units are those of `gateway.recordings.columns`, from which the head of a CSV
-and the schema of a Parquet file are made too.
+Columns, types and units are those of `gateway.recordings.columns`, which also define the head of a
+CSV and the schema of a Parquet file.
 """
 
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ GROUPS: Final = {
 
 
 def rows() -> Iterator[tuple[str, str, str, str]]:
-    """Yield the rows of the table, the head first."""
+    """Yield the rows of the table, beginning with the head."""
     yield "group", "columns", "type", "unit"
     for group, patterns in GROUPS.items():
         for pattern in patterns:

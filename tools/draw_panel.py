@@ -22,12 +22,12 @@ WebGLRenderingContext.prototype.getExtension = function (name) {
   return name === "WEBGL_debug_renderer_info" ? null : extension.call(this, name);
 };
 """
-"""Hides the renderer's name: the page draws 3D coarser where the processor renders it."""
+"""Hides the renderer's name, since the page draws 3D with less detail if the processor renders."""
 SIZE: ViewportSize = {"width": 1440, "height": 900}
 
 
 def draw_flight_page() -> None:
-    """Make a page of a recorded flight, and photograph it."""
+    """Make a page of a recorded flight, and take a screenshot."""
     target = PICTURES / "flight_page.png"
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         page_file = Path(folder, "flight.html")
@@ -48,7 +48,7 @@ def draw_flight_page() -> None:
 
 
 def draw_panel() -> None:
-    """Wait until an aircraft of the demo is airborne, and photograph the panel's flight view."""
+    """Wait until an aircraft of the demo is airborne, and take a screenshot of the flight view."""
     target = PICTURES / "panel_flight.png"
     with (
         tempfile.TemporaryDirectory() as folder,

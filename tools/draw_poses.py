@@ -3,8 +3,8 @@
     .venv/bin/python tools/draw_poses.py
 
 `gateway/panel/web/poses.svg` shows the six positions of the accelerometer's calibration, each also
-as a view of the file that is named by the side that lies below: `poses.svg#left`. `mounting.svg`
-shows the orientations of a board in the aircraft, with their angles.
+as a view of the file with the name of the lower side: `poses.svg#left`. `mounting.svg` shows the
+orientations of a board in the aircraft, with their angles.
 """
 
 import math
@@ -26,14 +26,14 @@ COLOURS: Final = {"accent": (40, 140, 210), "soft": (125, 140, 155)}
 EDGE: Final = "#33414e"
 SHADOW: Final = "#8c98a4"
 INK: Final = "#6f7d8a"
-"""Legible on light and on dark."""
+"""Colour that is legible on light and dark backgrounds."""
 
 WIDTH: Final = 140
 HEIGHT: Final = 112
 SCALE: Final = 28.0
 GROUND: Final = 96.0
 LIGHT: Final = np.array((-0.35, 0.3, -0.89))
-"""Towards the light, NED turned to the eye."""
+"""Direction of the light, in NED as seen by the viewer."""
 
 ATTITUDES: Final[dict[str, tuple[float, float]]] = {
     "down": (0.0, 0.0),
@@ -43,7 +43,7 @@ ATTITUDES: Final[dict[str, tuple[float, float]]] = {
     "front": (0.0, -90.0),
     "back": (0.0, 90.0),
 }
-"""Roll and pitch in deg, by the side that lies below."""
+"""Roll and pitch in deg, by the lower side."""
 CAPTION: Final = 22
 """Height of the line below a picture."""
 FROM_ABOVE: Final = (
@@ -54,21 +54,21 @@ FROM_ABOVE: Final = (
 
 _BODY: Final = ((1.5, 0, 0), (0.5, 0.24, -0.1), (0.5, -0.24, -0.1), (0.5, 0, 0.28), (-1.2, 0, 0))
 _FACES: Final = (
-    # The hull, its nose marked by a separate face.
+    # The hull, with a separate face for its nose.
     ((_BODY[0], _BODY[1], _BODY[2]), "accent"),
     ((_BODY[0], _BODY[3], _BODY[1]), "accent"),
     ((_BODY[0], _BODY[2], _BODY[3]), "accent"),
     ((_BODY[4], _BODY[2], _BODY[1]), "soft"),
     ((_BODY[4], _BODY[1], _BODY[3]), "soft"),
     ((_BODY[4], _BODY[3], _BODY[2]), "soft"),
-    # Wings, tailplane and fin are thin and seen from both sides.
+    # Wings, tailplane and fin are thin and visible from both sides.
     (((0.45, 0, -0.04), (0.15, 1.5, -0.08), (-0.15, 1.5, -0.08), (-0.2, 0, -0.04)), "soft"),
     (((0.45, 0, -0.04), (0.15, -1.5, -0.08), (-0.15, -1.5, -0.08), (-0.2, 0, -0.04)), "soft"),
     (((-0.85, 0, -0.02), (-1.05, 0.55, -0.02), (-1.25, 0.55, -0.02), (-1.25, 0, -0.02)), "soft"),
     (((-0.85, 0, -0.02), (-1.05, -0.55, -0.02), (-1.25, -0.55, -0.02), (-1.25, 0, -0.02)), "soft"),
     (((-0.8, 0, -0.05), (-1.15, 0, -0.62), (-1.32, 0, -0.62), (-1.25, 0, 0)), "accent"),
 )
-"""Corners in body FRD, metres of a toy, and the colour's name in the style sheet."""
+"""Corners in body FRD, m of a small model, and the name of the colour in the style sheet."""
 
 
 def poses_svg() -> str:
@@ -89,7 +89,7 @@ def mounting_svg() -> str:
         x, y = (number % 4 + 0.5) * 1.4 * WIDTH, 62 + number // 4 * 158
         is_up = roll_deg != 0.0
         look = 'fill="#2f7d5b"' if is_up else 'fill="#f4f1e6" stroke-dasharray="3 2"'
-        # The side with the chips is drawn with them.
+        # The side with the chips shows them.
         chips = '<path d="M-7-2h6v6h-6zM3 3h5v5h-5z" fill="#1c2329"/>' if is_up else ""
         ink = "#ffffff" if is_up else EDGE
         parts.append(

@@ -26,7 +26,7 @@ COLOURS: Final = (
     (r"IRQ|INTA|DIO0", "#e69f00"),
     (r"TX|RX", "#cc79a7"),
 )
-"""Colour of a wire by its pin, from a palette that people with colour blindness can distinguish."""
+"""Colour of a wire by its pin, from a palette for people with colour blindness."""
 
 WIDTH: Final = 980
 ROW: Final = 26

@@ -1,13 +1,14 @@
-"""Measure what trouble with one client costs the others.
+"""Measure the effect of a faulty client of the hub on the others.
 
-Four healthy clients of the hub are sent 500 messages a second while something happens to a fifth,
-or untrusted clients forge, ask too much and crowd in (`fault_traffic.py`). For each fault, runs
-with and without it take turns; the healthy clients must lose nothing, hear nothing for 100 ms at
-most, and their p99 latency must be within twice the undisturbed one. What makes the trouble takes
-processor time of its own, which on two cores is part of what is measured.
+Four healthy clients of the hub are sent 500 messages a second while a fifth one has a fault, or
+untrusted clients send forged frames, too many requests, or open too many connections
+(`fault_traffic.py`). For each fault, runs with and without it take turns; the healthy clients must
+lose no frame and have no gap above 100 ms, and their p99 latency must be within twice the
+undisturbed one. The source of the fault takes processor time too, which on two cores affects the
+result.
 
-Root, where network namespaces are allowed, runs all of it in a network of its own, with a virtual
-Ethernet cable that can be pulled out; otherwise that one fault is left out.
+As root, and if network namespaces are allowed, everything runs in a separate network with a virtual
+Ethernet cable that can be disconnected; otherwise that fault is omitted.
 """
 
 import argparse
@@ -36,7 +37,7 @@ from tools.bench_hub import HANDSHAKE, Bench, Latency, source_frames
 HEALTHY = 4
 RATE_HZ = 500
 LIMIT = 2.0
-"""Times the undisturbed p99."""
+"""Maximum p99 latency, in multiples of the undisturbed one."""
 GAP_LIMIT_US = 100_000
 UNTRUSTED_CLIENTS = {
     "untrusted clients forge heartbeats and copies": "forge",
@@ -48,10 +49,10 @@ UNTRUSTED_CLIENTS = {
     "one machine crowds a port": "crowd",
     "two stations with one id ask the same": "twins",
 }
-"""Kinds of `fault_traffic.py`."""
+"""Faults that are kinds of `fault_traffic.py`."""
 TRAFFIC = Path(__file__).with_name("fault_traffic.py")
 PART_S = 4.0
-"""A dead client is parted from after three seconds."""
+"""Pause after a fault: a dead client is removed after three seconds."""
 NEAR, FAR, FAR_PLACE, FAR_ADDRESS = "near0", "far0", "10.99.0.2", "02:00:00:00:00:02"
 
 HUB = """
@@ -139,7 +140,7 @@ while True:
 
 
 class FaultBench(Bench):
-    """The hub with a TCP and a WebSocket port too, and ways to trouble it."""
+    """The hub with a TCP and a WebSocket port, and faults of its clients."""
 
     def __init__(self, *, cable: bool) -> None:
         self._far = FAR_PLACE if cable else ""
@@ -152,7 +153,7 @@ class FaultBench(Bench):
 
     @contextmanager
     def refused(self) -> Iterator[None]:
-        """Have one more client configured whose port is closed."""
+        """Configure one more client, whose port is closed."""
         self.process.send_signal(signal.SIGHUP)
         time.sleep(0.2)
         yield
@@ -160,14 +161,14 @@ class FaultBench(Bench):
 
     @contextmanager
     def reloaded(self) -> Iterator[None]:
-        """Have the settings reloaded five times a second."""
+        """Reload the settings five times a second."""
         code = "import os,sys,time\nwhile True: os.kill(int(sys.argv[1]), 1); time.sleep(0.2)"
         with process(code, self.process.pid):
             yield
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
-        """Have a TCP client stopped with its connection open."""
+        """Stop a TCP client with its connection open."""
         code = (
             "import socket,sys\nlink = socket.create_connection(('127.0.0.1', int(sys.argv[1])))\n"
             "while link.recv(4096): pass"
@@ -179,7 +180,7 @@ class FaultBench(Bench):
 
     @contextmanager
     def stalled(self) -> Iterator[None]:
-        """Have a page opened that is stopped with its WebSocket open."""
+        """Stop a page with its WebSocket open."""
         code = (
             "import socket,sys\nlink = socket.create_connection(('127.0.0.1', int(sys.argv[1])))\n"
             f"link.sendall({HANDSHAKE!r})\nwhile link.recv(4096): pass"
@@ -191,14 +192,14 @@ class FaultBench(Bench):
 
     @contextmanager
     def visited(self) -> Iterator[None]:
-        """Have a thousand clients a second say one word and vanish."""
+        """Let a thousand clients a second send one frame and leave."""
         with process(SPEAK, self.port, "visit"):
             yield
         time.sleep(PART_S)
 
     @contextmanager
     def joined(self) -> Iterator[None]:
-        """Have another gateway joined by two cables."""
+        """Connect another gateway by two links."""
         code = (
             "import asyncio,sys\nfrom gateway.clock import GatewayClock\n"
             "from gateway.hub.hub import Hub\n"
@@ -220,19 +221,19 @@ class FaultBench(Bench):
             yield
 
     def spoken(self, what: str) -> Callable[[], AbstractContextManager[object]]:
-        """Have a client speak to the listening port in some odd way."""
+        """Return a context in which a client sends abnormal data to the listening port."""
         return lambda: process(SPEAK, self.port, what)
 
 
 @contextmanager
 def pulled() -> Iterator[None]:
-    """Have the cable to one more client pulled out and put in again every second."""
+    """Disconnect and connect the cable to one more client every second."""
     with process(PULL, NEAR, FAR_PLACE, FAR_ADDRESS):
         yield
 
 
 def lay_cable() -> bool:
-    """Lay a cable in a network of our own; return whether that succeeded."""
+    """Create a cable in a separate network; return whether that succeeded."""
     ip("link", "set", "lo", "up")
     try:
         ip("link", "add", NEAR, "type", "veth", "peer", FAR, "address", FAR_ADDRESS)
@@ -245,7 +246,7 @@ def lay_cable() -> bool:
 
 
 def ip(*words: str) -> None:
-    """Change the network."""
+    """Run the command `ip`."""
     subprocess.run(["ip", *words], check=True)
 
 
@@ -320,7 +321,7 @@ def main() -> None:
                 "gap_us": gaps[1],
             }
             good = lost == 0 and after <= LIMIT * before and gaps[1] <= GAP_LIMIT_US
-            # A quiet run that lost frames, on a busy machine, has no latency.
+            # An undisturbed run that lost frames, on a busy machine, has no latency.
             ratio = after / before if before else math.nan
             row = [f"{before:.0f}", f"{after:.0f}", f"{ratio:.2f}"]
             row += [*(f"{gap / 1000:.1f}" for gap in gaps), "yes" if good else "no"]

@@ -39,9 +39,9 @@ from tools.bench_panel import Vehicle, memory_mb
 MEMORY_MB = 50.0
 ANSWER_S = 1.0
 PAUSE_S = 0.4
-"""Between two requests of the operator."""
+"""Interval of the operator's requests."""
 SETTLE_S = 25.0
-"""After a fault: longer than any time limit of the panel for an incomplete request."""
+"""Pause after a fault: longer than any timeout of the panel for an incomplete request."""
 OPERATOR, VIEWER = "operator's", "viewer's"
 MB = bytes(1 << 20)
 OPERATE = """
@@ -57,7 +57,7 @@ while time.monotonic() < until:
     time.sleep(float(pause))
 print(json.dumps(times_ms))
 """
-"""The operator is a process of its own, as a browser is."""
+"""Program of the operator, which runs as a separate process like a browser."""
 Fault = Callable[[], Awaitable[None]]
 """Runs until it is cancelled."""
 CONFIG = """
@@ -93,7 +93,7 @@ class Figures:
 
 
 class PanelBench:
-    """A panel, by its process and the address of its page, its operator and misbehaving clients."""
+    """A panel with its process and address, its operator, and misbehaving clients."""
 
     def __init__(self, pid: int, link: str) -> None:
         self.pid = pid

@@ -1,9 +1,9 @@
-"""Hostile traffic for `fault_hub.py`: untrusted clients that forge, ask too much, or crowd in.
+"""Hostile traffic for `fault_hub.py`: forged frames, too many requests, too many clients.
 
     python fault_traffic.py PORT KIND
 
-The hub trusts clients of its address 127.0.0.1 and none of 127.0.0.2, both on this port; system 1
-behind it answers, and system 42 is the healthy source.
+The hub trusts clients at its address 127.0.0.1, and not those at 127.0.0.2, both on this port;
+system 1 answers, and system 42 is the healthy source.
 """
 
 import itertools
@@ -23,7 +23,7 @@ from tools.bench_hub import SOURCE_SYSTEM, source_frames
 TRUSTED, UNTRUSTED = "127.0.0.1", "127.0.0.2"
 PORTS = 31
 TURN_S = 0.005
-"""Between two batches; the rates below are kept on average."""
+"""Interval of batches, which have the rates below on average."""
 
 Batch = Iterator[Callable[[], object]]
 
@@ -45,14 +45,14 @@ def request_message(number: int, *, to_all: bool) -> bytes:
 
 
 def caller(host: str, port: int) -> socket.socket:
-    """Open a socket that sends to the hub and reads nothing."""
+    """Open a socket that only sends to the hub."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.connect((host, port))
     return sock
 
 
 def forge(port: int) -> Batch:
-    """Send heartbeats of the source as a station, of its components, and its frames in advance."""
+    """Send forged heartbeats of the source as a station and of its components, and its frames."""
     client = caller(UNTRUSTED, port)
     frames = itertools.cycle(source_frames())
     names = itertools.cycle(range(1, 250))
@@ -63,7 +63,7 @@ def forge(port: int) -> Batch:
 
 
 def asking(port: int, host: str, frame: bytes, ports: int = PORTS) -> Batch:
-    """Ask the same from many ports in turns."""
+    """Send the same request from many ports in turn."""
     callers = [caller(host, port) for _ in range(ports)]
     for sock in callers:
         sock.send(heartbeat(200))
@@ -72,7 +72,7 @@ def asking(port: int, host: str, frame: bytes, ports: int = PORTS) -> Batch:
 
 
 def bursts(port: int) -> Batch:
-    """Have a file sent byte by byte, again and again, from many ports."""
+    """Request a file byte by byte, repeatedly, from many ports."""
     callers = [(sock, ftp_session(sock)) for sock in (caller(UNTRUSTED, port) for _ in range(16))]
     for sock, session in itertools.cycle(callers):
         yield partial(sock.send, ftp(Opcode.BURST_READ_FILE, session, size=1))
@@ -109,7 +109,7 @@ def crowd(port: int) -> Batch:
 
 
 def twins(port: int) -> Batch:
-    """Be two stations with one id that ask the same at the same moments."""
+    """Send the same requests at the same times as two stations with one id."""
     callers = [caller(TRUSTED, port) for _ in range(2)]
     link = mavlink.MAVLink(None, 254, 190)
     while True:

@@ -1,4 +1,4 @@
-"""Logs with a reference, read for scoring: samples for the estimators, truth for the judge."""
+"""Logs with a reference for scoring: samples for the estimators, and the truth."""
 
 import math
 import re
@@ -34,13 +34,13 @@ from tools.simulated_flight import fly
 IMU_NAMES = ["ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz"]
 QUAT_NAMES = ["ref_qw", "ref_qx", "ref_qy", "ref_qz"]
 SETTLED_S = 20.0
-"""A simulated flight counts from here on: the estimators have met their first fixes."""
+"""Time from which a simulated flight is scored: the estimators have used their first fixes."""
 GPS_NAMES = ["gps_lat", "gps_lon", "gps_alt_m", "gps_vn", "gps_ve", "gps_vd"]
 
 
 @dataclass(frozen=True)
 class Flight:
-    """One log and what is known to be true of it."""
+    """One log and its reference."""
 
     name: str
     log: SampleLog
@@ -53,7 +53,7 @@ class Flight:
     counts: np.ndarray
     """(n,) whether the sample is scored."""
     free_heading: bool = False
-    """The reference's heading holds only up to a constant."""
+    """Whether the reference's heading has an unknown constant offset."""
 
     def with_gps(self, keep: np.ndarray) -> "Flight":
         """Leave out fixes."""
@@ -62,10 +62,10 @@ class Flight:
 
 
 def as_increments(flight: Flight, rate_hz: float) -> Flight:
-    """Reduce the IMU samples of a flight as a node does for a slow link.
+    """Reduce the rate of the IMU samples of a flight as a node does for a slow link.
 
-    Each new sample has the constant rate that leads to the rotation of its interval, the constant
-    force that leads to the gained velocity in the axes half way, and the newest field.
+    Each new sample has the constant rate that gives the rotation of its interval, the constant
+    force that gives the change of velocity in the axes at half of it, and the newest field.
     """
     log, size = flight.log, len(IMU_NAMES)
     step_s = np.diff(log.imu_time_us, prepend=2 * log.imu_time_us[0] - log.imu_time_us[1]) * 1e-6
@@ -96,7 +96,7 @@ def as_increments(flight: Flight, rate_hz: float) -> Flight:
 
 
 def read_flight(path: Path) -> Flight:
-    """Read one gzipped CSV of the shared form."""
+    """Read one gzipped CSV in the common format."""
     header = pd.read_csv(path, nrows=0, sep="\x00").columns[0]
     meta = {k: float(v) for k, v in re.findall(r"(\w+)=(-?[\d.]+)", header)}
     table = pd.read_csv(path, comment="#")
@@ -129,7 +129,7 @@ def read_flight(path: Path) -> Flight:
 
 
 def _samples(table: pd.DataFrame, settings: ReferenceSettings) -> SampleLog:
-    """Lay out the estimators' input; the declination stands in each fix."""
+    """Return the input of the estimators, with the declination in each fix."""
     time_us = np.round(table.time_s.to_numpy() * 1e6).astype(np.int64)
     baro = table.baro_alt_m.notna().to_numpy()
     fixes = table[table.gps_lat.notna()]
@@ -155,7 +155,7 @@ def _samples(table: pd.DataFrame, settings: ReferenceSettings) -> SampleLog:
 
 
 def north_east_m(flight: Flight, lat_deg: np.ndarray, lon_deg: np.ndarray) -> np.ndarray:
-    """Turn degrees into metres from the flight's origin, shape (n, 2)."""
+    """Convert degrees to metres from the flight's origin, shape (n, 2)."""
     lat0, lon0 = flight.origin_deg
     meridian_m, parallel_m = radii_m(lat0, 0.0)
     north = np.radians(lat_deg - lat0) * meridian_m
@@ -163,9 +163,9 @@ def north_east_m(flight: Flight, lat_deg: np.ndarray, lon_deg: np.ndarray) -> np
 
 
 def simulated_flight(seed: int, *, calibrated: bool) -> Flight:
-    """Fly the simulator's flight; its truth is exact.
+    """Simulate the simulator's flight; its truth is exact.
 
-    The magnetometer is always calibrated; `calibrated` says whether the inertial sensors are too.
+    The magnetometer is always calibrated, the inertial sensors if `calibrated`.
     """
     flown = fly(SimulatorSettings(seed=seed))
     ideal = asdict(flown.errors)

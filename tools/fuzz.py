@@ -3,9 +3,9 @@
     python -m tools.fuzz                     # five minutes, all targets in turn
     python -m tools.fuzz --minutes 30 table  # one of them for longer
 
-Each target is a property: a function that Hypothesis calls with values of its own making. The tests
-run the same for a moment, always with the same values; here they are new each time. What fails is
-shrunk, shown and kept in `.hypothesis`, so that the next run begins with it.
+Each target is a property: a function that Hypothesis calls with generated values. The tests run
+them shortly, always with the same values; here the values are new each time. A failing value is
+shrunk, printed and stored in `.hypothesis`, so that the next run begins with it.
 """
 
 import argparse
@@ -84,7 +84,7 @@ Property = Callable[[], None]
 
 
 def chunks_of(data: bytes, cuts: list[int]) -> list[bytes]:
-    """Cut bytes at some places."""
+    """Cut bytes at some positions."""
     places = [0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]
     return [data[a:b] for a, b in itertools.pairwise(places)]
 
@@ -109,7 +109,7 @@ def messages(draw: st.DrawFn) -> bytes:
 
 @st.composite
 def damaged(draw: st.DrawFn, whole: st.SearchStrategy[bytes]) -> bytes:
-    """Whole pieces, with some bytes changed, left out, doubled or put between."""
+    """Make complete pieces, with some bytes changed, omitted, doubled or inserted."""
     data = bytearray(b"".join(draw(st.lists(whole | st.binary(max_size=40), max_size=12))))
     for _ in range(draw(st.integers(0, 4))):
         place = draw(st.integers(0, len(data)))
@@ -119,7 +119,7 @@ def damaged(draw: st.DrawFn, whole: st.SearchStrategy[bytes]) -> bytes:
 
 @st.composite
 def radio_frames(draw: st.DrawFn) -> bytes:
-    """Make a frame of the receiver with a payload, whole or with a byte changed."""
+    """Make a frame of the receiver with a payload, intact or with a changed byte."""
     node = NodeId(draw(st.integers(1, 31)), draw(st.integers(0, 1)))
     header = payloads.Header(node, draw(st.integers(0, 65535)), draw(st.integers(0, 2**32 - 1)))
     baro = payloads.BaroPayload(draw(st.integers(0, 2**32 - 1)), draw(st.integers(-999, 999)))
@@ -134,10 +134,10 @@ def radio_frames(draw: st.DrawFn) -> bytes:
 
 @given(damaged(messages()), CUTS)
 def splitter(data: bytes, cuts: list[int]) -> None:
-    """Any bytes in any chunks: the same frames, each whole, and nothing raised.
+    """Check any bytes in any chunks: the same complete frames, and no error.
 
-    Where a message is unknown its checksum proves nothing: it passes if it ends where another frame
-    or the chunk does, so chunks may differ about that.
+    The checksum of an unknown message cannot be checked: it passes if another frame begins at its
+    end or the chunk ends there, so the result may depend on the chunks.
     """
     whole = [event.data for event in MavlinkSplitter().feed(data) if isinstance(event, MavFrame)]
     split = MavlinkSplitter()
@@ -150,7 +150,7 @@ def splitter(data: bytes, cuts: list[int]) -> None:
 
 @given(st.lists(messages(), min_size=1, max_size=8), CUTS)
 def whole_frames(frames: list[bytes], cuts: list[int]) -> None:
-    """Every good frame comes out, whatever the chunks."""
+    """Check that every good frame is found with any chunks."""
     split = MavlinkSplitter()
     data = b"".join(frames)
     events = [event for chunk in chunks_of(data, cuts) for event in split.feed(chunk)]
@@ -159,7 +159,7 @@ def whole_frames(frames: list[bytes], cuts: list[int]) -> None:
 
 @given(damaged(radio_frames()), CUTS, st.integers(-1, 10_000_000))
 def receiver(data: bytes, cuts: list[int], step_us: int) -> None:
-    """Any bytes of the serial line: records whose times never come from the future."""
+    """Check any bytes of the serial line: no record may have a time in the future."""
     link, now_us = Link(), 0
     for chunk in chunks_of(data, cuts):
         now_us += max(step_us, 0)
@@ -177,7 +177,7 @@ def _vehicles() -> Pipeline:
 
 @given(messages(), st.booleans(), st.integers(0, 1 << 50))
 def vehicle(frame: bytes, trusted: bool, now_us: int) -> None:
-    """Any message to a vehicle: answers or none."""
+    """Check any message to a vehicle: answers or none."""
     _vehicles().handle(Incoming(7, frame, trusted), now_us)
     _vehicles().poll(now_us)
     _vehicles().remove_client(7)
@@ -224,7 +224,7 @@ def _run(awaitable: Any) -> Any:
     )
 )
 def control(line: bytes) -> None:
-    """Any line to the control socket: one line of JSON that says whether it went well."""
+    """Check any line to the control socket: the answer is one line of JSON with the outcome."""
     answer = _run(_control().answer(line))
     assert answer.endswith(b"\n")
     assert answer.count(b"\n") == 1
@@ -232,7 +232,7 @@ def control(line: bytes) -> None:
 
 
 def values_of(field: Field) -> st.SearchStrategy[Any]:
-    """Values that a person could write for a setting, right and wrong."""
+    """Return values that a user could write for a setting, valid and invalid."""
     if field.section is not None:
         return trees_of(field.section)
     odd = st.sampled_from(["", "x", "~nobody-here/x", -1, 0, 1, 2**62, 1e308, 5e-324, True, []])
@@ -244,7 +244,7 @@ def values_of(field: Field) -> st.SearchStrategy[Any]:
 
 
 def trees_of(kind: type[Settings]) -> st.SearchStrategy[dict[str, Any]]:
-    """Sections with some of their keys, and now and then one that there is not."""
+    """Return sections with some of their keys, and sometimes an unknown one."""
     known = {field.name: values_of(field) for field in fields_of(kind)}
     return st.fixed_dictionaries({}, optional={**known, "no_such_key": st.just(1)})
 
@@ -256,7 +256,7 @@ def _folder() -> Path:
 
 @given(trees_of(GatewaySettings) | st.binary(max_size=60))
 def settings_file(tree: dict[str, Any] | bytes) -> None:
-    """Any settings file: settings, or an error that names it."""
+    """Check any settings file: settings, or an error that names the file."""
     file = _folder() / "gateway.toml"
     text = tree if isinstance(tree, bytes) else tomlkit.dumps(_writable(tree)).encode()
     file.write_bytes(text)
@@ -276,7 +276,7 @@ def _writable(tree: Any) -> Any:
 
 @st.composite
 def tables(draw: st.DrawFn) -> bytes:
-    """Make a table whose lines have odd cells, lines of comments, and damage."""
+    """Make a table with unusual cells, comment lines, and damage."""
     lines = [HEAD] if draw(st.booleans()) else [",".join(COLUMNS) + "\n"]
     for number in range(draw(st.integers(0, 6))):
         cells = [""] * len(COLUMNS)
@@ -291,7 +291,7 @@ def tables(draw: st.DrawFn) -> bytes:
 
 @given(tables() | st.binary(max_size=200), CUTS)
 def table(data: bytes, cuts: list[int]) -> None:
-    """Any table: the same events in any chunks, and rows that can be written and read again."""
+    """Check any table: the same events in any chunks, and rows that can be written and read."""
     whole = TableReader().feed(data, final=True)
     reader = TableReader()
     found = [event for chunk in chunks_of(data, cuts) for event in reader.feed(chunk)]
@@ -306,12 +306,12 @@ def table(data: bytes, cuts: list[int]) -> None:
     damaged(st.builds(encode_record, st.integers(0, 2**64 - 1), messages())), CUTS, st.booleans()
 )
 def tlog(data: bytes, cuts: list[int], strict: bool) -> None:
-    """Any tlog: no record is made up, and of a sound one all come out in any chunks."""
+    """Check any tlog: no invented record, and all records of an intact one in any chunks."""
     whole = TlogScanner(strict=strict).feed(data, final=True)
     scanner = TlogScanner(strict=strict)
     found = [r for chunk in chunks_of(data, cuts) for r in scanner.feed(chunk).records()]
     found += scanner.feed(b"", final=True).records()
-    # Which times are damaged is judged by the neighbouring records, also in the chunk before.
+    # Damaged times are detected from neighbouring records, also of the previous chunk.
     assert [record.frame for record in found] == [record.frame for record in whole.records()]
     assert whole.damage or found == list(whole.records())
     assert all(record.frame in data for record in found)
@@ -338,7 +338,7 @@ def vehicle_records(draw: st.DrawFn) -> bytes:
 
 @given(st.lists(vehicle_records(), max_size=30))
 def vehicles(records: list[bytes]) -> None:
-    """Any messages of vehicles: the same in batches, on the earth, and maps that others read."""
+    """Check any messages of vehicles: same result in batches, valid positions and maps."""
     batch, senders = TlogScanner().feed(b"".join(records), final=True), Senders()
     senders.add(batch)
     reader = VehicleReader(senders, DRAWN_IDS)
@@ -401,7 +401,7 @@ def dataflash_messages(draw: st.DrawFn) -> bytes:
 
 @st.composite
 def files(draw: st.DrawFn) -> tuple[str, bytes]:
-    """Make a file such as people hand over, and the ending of its name."""
+    """Make a file as users may have, and the ending of its name."""
     rows = [HEADING]
     for number in range(draw(st.integers(0, 30))):
         cells = [f"{number / 100}", "0", "0", "-9.8", "0", "0", "0", "20", "0", "40", "100"]
@@ -439,7 +439,7 @@ COMMANDS: Final = (
 
 @given(files(), st.sampled_from(COMMANDS))
 def command(file: tuple[str, bytes], words: tuple[str, ...]) -> None:
-    """Any file to any command: it does its work, or says in words why it cannot."""
+    """Check any file with any command: it succeeds, or prints the reason."""
     from gateway.cli.app import app
 
     ending, data = file
@@ -467,12 +467,12 @@ READING: Final = st.fixed_dictionaries(
         ),
     }
 )
-"""A reading as Sensor Logger posts it."""
+"""A reading in the format of Sensor Logger's posts."""
 ANSWER: Final = st.dictionaries(
     st.sampled_from([name for names in BUFFERS.values() for name in names]),
     st.builds(lambda values: {"buffer": values}, st.lists(st.floats() | st.none(), max_size=3)),
 )
-"""Buffers as phyphox answers."""
+"""Buffers in the format of phyphox' answers."""
 PHONE: Final = st.one_of(
     st.builds(lambda readings: {"payload": readings}, st.lists(READING, max_size=4)),
     st.builds(lambda buffers: {"buffer": buffers, "status": {}}, ANSWER),
@@ -491,12 +491,12 @@ SOURCE_TEXT: Final = st.one_of(
         st.lists(st.sampled_from(["", "1", "A", "N", "9999.9", "inf", "nan", "-1", "230326"])),
     ).map(lambda parts: f"$GP{parts[0]},{','.join(parts[1])}\n".encode()),
 )
-"""Pieces that a decoder reads further than noise."""
+"""Pieces of valid input, of which a decoder reads more than of noise."""
 
 
 @given(st.sampled_from([*SOURCE_KINDS]), st.lists(st.binary(max_size=80) | SOURCE_TEXT, max_size=8))
 def source(kind: str, chunks: list[bytes]) -> None:
-    """Any bytes of any source: records, faults, and frames of a vehicle."""
+    """Check any bytes of any source: records, faults, and frames of a vehicle."""
     (found,) = make_sources((SourceSettings(url=f"{kind}:stdin"),), str)
     pipeline = Pipeline(PipelineSettings(AircraftSettings(), sources=[found]))
     for number, chunk in enumerate(chunks):
@@ -509,7 +509,7 @@ def source(kind: str, chunks: list[bytes]) -> None:
     | st.tuples(st.just("bin"), damaged(dataflash_messages()))
 )
 def record(file: tuple[str, bytes]) -> None:
-    """Any log of an autopilot: frames whose times grow, or an error in words."""
+    """Check any log of an autopilot: frames with growing times, or an error text."""
     ending, data = file
     path = _folder() / f"record.{ending}"
     path.write_bytes(data)
@@ -531,11 +531,11 @@ TARGETS: Final[dict[str, Any]] = {
         *(settings_file, table, tlog, vehicles, record, command),
     )
 }
-"""By name."""
+"""Targets by name."""
 
 
 def bounded(name: str, examples: int, *, always_the_same: bool) -> Property:
-    """Make a property ready to be called with so many values."""
+    """Return a property that runs with a number of values."""
     checks = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
     chosen = settings(
         max_examples=examples,
@@ -549,7 +549,7 @@ def bounded(name: str, examples: int, *, always_the_same: bool) -> Property:
 
 
 def main() -> int:
-    """Run the targets in turn until the time is up; print which failed at the end."""
+    """Run the targets in turn until the time has elapsed; print those that failed at the end."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"of {', '.join(TARGETS)}")
     parser.add_argument("--minutes", type=float, default=5.0, help="in all (5)")
@@ -559,7 +559,7 @@ def main() -> int:
     if unknown := set(wanted) - set(TARGETS):
         parser.error(f"no such target: {', '.join(sorted(unknown))}")
     failed: set[str] = set()
-    # A property may be made ready only once.
+    # A property may be prepared only once.
     ready = {name: bounded(name, options.examples, always_the_same=False) for name in wanted}
     end_s, runs = time.monotonic() + 60.0 * options.minutes, dict.fromkeys(wanted, 0)
     for name in itertools.cycle(wanted):

@@ -2,8 +2,8 @@
 
 Numba translates each function to LLVM's language once. Its own code generator would then optimise
 and load every function with copies of all that it calls, which takes four times as long; here all
-functions are linked into one module, which is optimised as a whole. The code uses no instruction
-that a processor of its architecture may lack, and contracts no multiplication with an addition.
+functions are linked into one module, which is optimised as a whole. The code uses only instructions
+that every processor of its architecture has, and no fused multiply-add.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -25,15 +25,16 @@ from gateway.compiled.entry_point import SOURCES_SYMBOL, EntryPoint
 Step = Callable[[str], None]
 
 STRICT: Final[dict[str, Any]] = {"fastmath": False, "error_model": "numpy"}
-"""Offline fusion of a log must give exactly the result of the live fusion."""
+"""Options of numba, because offline fusion of a log must give exactly the result of live fusion."""
 TYPES: Final[dict[Any, Any]] = {int: types.int64, float: types.float64}
 RUN_TIME_PREFIXES: Final = ("NRT_", "Py", "numba_", "_Py")
-"""Of the symbols of Python and numba, with which code allocates and raises."""
+"""Prefixes of the symbols of Python and numba that allocate and raise."""
 NO_REFERENCES: Final = "\n".join(
     f"define void @NRT_{name}(ptr %meminfo) alwaysinline {{ ret void }}"
     for name in ("incref", "decref")
 )
-"""Nothing is allocated, so no reference is counted: the calls would prevent most optimisations."""
+"""Calls that count references, which are removed: nothing is allocated, and they would prevent most
+optimisations."""
 
 
 def compile_object(
@@ -52,12 +53,13 @@ def compile_object(
     architecture : str, optional
         By default that of this machine.
     step : callable, optional
-        Called with "function" and "entry point" whenever one is compiled.
+        Called with "function" or "entry point" whenever one is compiled.
 
     Returns
     -------
     bytes
-        With a C function of the name and the parameters of each entry point: `int64_t`, `double`.
+        It has a C function with the name and the parameters (`int64_t`, `double`) of each entry
+        point.
 
     Raises
     ------
@@ -65,7 +67,8 @@ def compile_object(
         If a function allocates or uses Python objects.
     """
     cpu_target.target_context._internal_codegen = _Codegen("kernels", step)  # noqa: SLF001
-    # Numba binds global constants when it compiles: those of an earlier call may be patched now.
+    # Numba binds global constants when it compiles; they may have been patched since an earlier
+    # call.
     _called.cache_clear()
     symbols, libraries = {}, []
     for entry_point in entry_points:
@@ -91,7 +94,7 @@ class _Library(codegen.AOTCodeLibrary):
         pass
 
     def finalize(self) -> None:
-        """Take note that the function is translated."""
+        """Note that the function is translated."""
         self._finalized = True
         if (step := getattr(self._codegen, "step", None)) is not None:
             step("function")
@@ -102,7 +105,7 @@ class _Library(codegen.AOTCodeLibrary):
 
 
 class _Codegen(codegen.AOTCPUCodegen):
-    """Makes the libraries above."""
+    """Creates the libraries above."""
 
     _library_class = _Library
 
@@ -111,11 +114,11 @@ class _Codegen(codegen.AOTCPUCodegen):
         super().__init__(name)  # type: ignore[no-untyped-call]
 
     def set_env(self, env_name: str, env: object) -> None:
-        """Ignore what only code that uses Python objects needs."""
+        """Ignore the environment, which only code with Python objects needs."""
 
 
 def _linked(libraries: Iterable[Any]) -> Any:
-    """Link the modules of libraries, and of all those whose functions they call."""
+    """Link the modules of libraries, and of all libraries whose functions they call."""
     found = dict.fromkeys(libraries)
     for library in (queue := [*found]):
         for other in library._linking_libraries:  # noqa: SLF001
@@ -142,7 +145,7 @@ def _run_time_symbols(values: Iterable[Any]) -> list[str]:
 
 
 def _isolate(module: Any, symbols: dict[str, str], stamp: str) -> None:
-    """Make the code need only the C library; an exception stops the process."""
+    """Remove all dependencies except the C library; an exception stops the process."""
     text = stamp.encode()
     escaped = "".join(f"\\{byte:02x}" for byte in (*text, 0))
     stubs = [
@@ -166,7 +169,7 @@ def _isolate(module: Any, symbols: dict[str, str], stamp: str) -> None:
 
 
 def _target_machine(architecture: str | None) -> Any:
-    """Return LLVM's description of any processor of an architecture."""
+    """Return LLVM's description of a generic processor of an architecture."""
     if architecture is None:
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
@@ -180,7 +183,7 @@ def _target_machine(architecture: str | None) -> Any:
 
 @cache
 def _called(function: FunctionType) -> Any:
-    """Return the form of a function that compiled code can call."""
+    """Return the compiled form of a function."""
     njit: Any = numba.njit
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **STRICT)(function)
 

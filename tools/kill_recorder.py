@@ -1,13 +1,13 @@
-"""Kill a recorder at random moments, and cut recordings at every byte: what is left must open.
+"""Kill a recorder at random times, and cut recordings at every byte: the rest must be readable.
 
 A child process records frames and fused samples at a true rate until it is killed (SIGKILL). Then
-its files are read: every record must be there in its order from the first one on, nothing may be
-damaged but the cut tail, and no more than the last second may be missing. Then one small recording
-is cut after each of its bytes, and every prefix must open and hold all of its whole records.
+its files are read: all records must be present in order from the first one on, only the truncated
+end may be damaged, and at most the last second may be missing. Then one small recording is cut
+after each of its bytes, and every prefix must be readable and contain all of its complete records.
 
-A second is what the child records in one, however long a busy machine makes that last. No sync of
-its disk ever ends: a kill costs only what the kernel was not given. Where the disk keeps even the
-kernel waiting more may be lost, so `--any-loss` judges only that what was written is there.
+A second means the data that the child records in one, which may take longer on a busy machine.
+Syncs to its disk never end: a kill loses only data that was not yet passed to the kernel. If even
+that waits for the disk, more may be lost, so `--any-loss` checks only the written data.
 
     python tools/kill_recorder.py [--kills 200] [--seed 1]
 """
@@ -37,13 +37,13 @@ from gateway.recordings.tlog import Batch, TlogScanner
 from gateway.records import FusedSample, ImuFlags, ImuRaw, ImuSample, NavFlags, NavState, NodeId
 
 RATE_HZ = 200
-"""Fused samples a second; each goes with two frames."""
+"""Fused samples a second, each with two frames."""
 LONGEST_S = 3.0
 SHORTEST_S = 0.3
 MAX_LOST_S = 1.0
 CUT_BYTES = 6000
 NUMBERS = struct.Struct("QQ")
-"""Shared with a child: its samples, and the bytes of its larger file as the recorder knows it."""
+"""Data shared with a child: its samples, and the recorder's size of its larger file."""
 PATIENCE_S = 240.0
 LOOK_S = 0.001
 
@@ -69,7 +69,7 @@ def make_sample(number: int) -> FusedSample:
 
 
 def never_sync(_: int) -> None:
-    """Sync a file on a disk that takes for ever."""
+    """Simulate a sync to a disk that never ends."""
     threading.Event().wait()
 
 
@@ -92,7 +92,7 @@ async def record_for_ever(folder: Path, shared: mmap.mmap) -> None:
 
 
 def kill_one(folder: Path, life_s: float) -> float:
-    """Kill a recorder after so long, and return how many seconds of its work are lost.
+    """Kill a recorder after some time, and return the lost time in seconds.
 
     Raises AssertionError if its files are damaged.
     """
@@ -117,7 +117,7 @@ def kill_one(folder: Path, life_s: float) -> float:
 
 
 def check_tlog(data: bytes) -> int:
-    """Check that a tlog holds all its frames from the first on; return how many."""
+    """Check that a tlog contains all its frames from the first on; return their number."""
     batch = TlogScanner(strict=True).feed(data, final=True)
     check_tail(batch, len(data))
     for number, record in enumerate(batch.records()):
@@ -126,13 +126,13 @@ def check_tlog(data: bytes) -> int:
 
 
 def check_tail(batch: Batch, size: int) -> None:
-    """Check that nothing but the end is damaged."""
+    """Check that only the end is damaged."""
     assert len(batch.damage) <= 1, batch.damage
     assert all(run.offset + run.size == size for run in batch.damage), batch.damage
 
 
 def check_table(data: bytes) -> None:
-    """Check that a table holds all its rows from the first on, and only its end is damaged."""
+    """Check that a table contains all its rows from the first on, and only its end is damaged."""
     events = TableReader().feed(data, final=True)
     faults = [event for event in events if isinstance(event, TableFault)]
     assert faults in ([], events[-1:]), faults
@@ -141,7 +141,7 @@ def check_table(data: bytes) -> None:
 
 
 def cut_everywhere(folder: Path) -> tuple[int, int]:
-    """Cut the longest of what the killed recorders left after every byte of its first ones."""
+    """Cut the longest recording of the killed recorders after each of its first bytes."""
     longest = [
         max(folder.rglob(pattern), key=lambda path: path.stat().st_size)
         for pattern in ("*.tlog", "*.csv")
@@ -159,11 +159,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--any-loss", action="store_true", help="however much is lost")
+    parser.add_argument("--any-loss", action="store_true", help="accept any loss")
     args = parser.parse_args()
     lives_s = np.random.default_rng(args.seed).uniform(SHORTEST_S, LONGEST_S, args.kills)
     lost_s = []
-    # The kernels are loaded here once, so that no child spends its short life on it.
+    # The kernels are loaded here once, so that no child spends its time on it.
     check_tlog(b"")
     with tempfile.TemporaryDirectory(prefix="mavgate-kill-") as name:
         for number, life_s in enumerate(lives_s.tolist()):

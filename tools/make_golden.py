@@ -1,9 +1,9 @@
-"""Write the golden flights of `tests/golden`: a short simulated log, and what it is fused to.
+"""Write the golden flights of `tests/golden`: a short simulated log, and its fused states.
 
     python tools/make_golden.py [--expected-only]
 
-The expected files are a change indicator: whoever changes an estimator runs this, commits the
-difference and says why it is right.
+The expected files are a change indicator: run this after a change of an estimator, commit the
+difference, and explain it in the commit.
 """
 
 import argparse
@@ -30,7 +30,7 @@ SEED = 77
 SECONDS = 75.0
 RATE_HZ = 25
 EVERY = 50
-"""Of the fused rows, those that are kept."""
+"""Interval of the stored fused rows."""
 ESTIMATORS = ("eskf", "paper")
 NAMES = (
     *("time_s", "ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "baro_alt_m"),

@@ -28,13 +28,13 @@ TEXT_CALLS: Final = {
     "MAVLink_statustext_message": (1,),
     "ClientAlert": (1,),
 }
-"""Functions that make texts for ground stations, and the positions of the texts."""
+"""Functions that create texts for ground stations, with the position of the text argument."""
 HOLE: Final = "…"
-"""Stands for a value that is known only at run time."""
+"""Placeholder for a value that is known only at run time."""
 MAX_DEPTH: Final = 4
-"""Calls that are followed back from a parameter to its value."""
+"""Maximum number of calls followed back from a parameter to its value."""
 LEAST_LETTERS: Final = 4
-"""A pattern with fewer letters is not a message of its own: its values are looked for."""
+"""Least letters of a message; for a shorter pattern the values are searched."""
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -46,7 +46,7 @@ class Message:
     kind: str
     """`text` for ground stations, or `log`."""
     pattern: str
-    """Its wording, with `…` for values."""
+    """Its text, with `…` for values."""
     source: str
     """File and line."""
 
@@ -67,7 +67,7 @@ class Sources:
         self._calls = {path: list(_calls(tree)) for path, tree in self._trees.items()}
 
     def messages(self) -> list[Message]:
-        """Return all messages, in the order of their wording."""
+        """Return all messages, in the order of their texts."""
         found: set[Message] = set()
         for path, calls in self._calls.items():
             package = self._package_of(path)
@@ -77,7 +77,7 @@ class Sources:
                 for expression in expressions:
                     for pattern in self._patterns(expression, function, package, 0):
                         found.add(Message(kind, _tidied(pattern), source))
-        # "Receiver: bus OK again" is one of "…: bus OK again".
+        # "Receiver: bus OK again" is covered by "…: bus OK again".
         general = {each.pattern for each in found if not _is_dynamic(each)}
         return sorted(
             each
@@ -91,7 +91,7 @@ class Sources:
 
     @cached_property
     def _calls_by_name(self) -> dict[tuple[str, str], list["_Call"]]:
-        """Calls by package and name of the called function."""
+        """Return calls by package and name of the called function."""
         found: dict[tuple[str, str], list[_Call]] = {}
         for path, calls in self._calls.items():
             package = self._package_of(path)
@@ -102,7 +102,7 @@ class Sources:
 
     @cached_property
     def _values(self) -> dict[str, ast.expr]:
-        """Annotated values of module level, by name."""
+        """Return annotated values at module level by name."""
         return {
             node.target.id: node.value
             for tree in self._trees.values()
@@ -112,7 +112,7 @@ class Sources:
 
     @cached_property
     def _constants(self) -> dict[str, str]:
-        """Texts of module level, by name."""
+        """Return texts at module level by name."""
         return {
             name: value.value
             for name, value in self._values.items()
@@ -122,7 +122,7 @@ class Sources:
     def _patterns(
         self, node: ast.expr, function: Function | None, package: str, depth: int
     ) -> list[str]:
-        """Return the wordings that an expression may have."""
+        """Return the texts that an expression may have."""
         match node:
             case ast.Constant(value=str(text)):
                 return [text]
@@ -181,7 +181,7 @@ class Sources:
     def _assigned(
         self, node: ast.AST, name: str, function: Function, package: str
     ) -> list[ast.expr]:
-        """Return the values that a statement gives to a name: by assignment, or row by row."""
+        """Return the values that a statement assigns to a name, directly or in a loop over rows."""
         match node:
             case ast.Assign(targets=[target], value=ast.expr() as value):
                 rows = [value]
@@ -207,7 +207,7 @@ class Sources:
     def _arguments(
         self, name: str, function: Function, package: str
     ) -> Iterator[tuple[ast.expr, Function | None]]:
-        """Yield the argument of each call for a parameter, with the caller; none of recursion."""
+        """Yield the argument of each call for a parameter, with the caller, without recursion."""
         parameters = [argument.arg for argument in function.args.args]
         if name not in parameters:
             return
@@ -232,7 +232,7 @@ def _calls(tree: ast.AST) -> Iterator[tuple[ast.Call, Function | None]]:
 
 
 def _unpacked(target: ast.expr, value: ast.expr, name: str) -> list[ast.expr]:
-    """Return the parts of a value that unpacking gives to a name."""
+    """Return the parts of a value that unpacking assigns to a name."""
     if isinstance(target, ast.Name):
         return [value] if target.id == name else []
     if isinstance(value, ast.IfExp):
@@ -248,7 +248,7 @@ def _name_of(function: ast.expr) -> str:
 
 
 def _texts_of(call: ast.Call) -> tuple[str, list[ast.expr]]:
-    """Return the kind and the wordings of a call that emits a message."""
+    """Return the kind and the text expressions of a call that emits a message."""
     name = _name_of(call.func)
     owner = getattr(call.func, "value", None)
     if name in LOG_LEVELS and isinstance(owner, ast.Name) and owner.id == "log" and call.args:
@@ -265,12 +265,12 @@ def _tidied(pattern: str) -> str:
 
 
 def _is_dynamic(message: Message) -> bool:
-    """Return whether the wording of a message is not in the call that emits it."""
+    """Return whether the text of a message is not in the call that emits it."""
     return len(re.findall(r"[A-Za-z]", message.pattern)) < LEAST_LETTERS
 
 
 def with_dynamic(messages: list[Message], dynamic: list[dict[str, str]]) -> list[Message]:
-    """Replace messages without a wording in their call by those that are listed."""
+    """Replace messages without a text in their call by the listed ones."""
     found = [message for message in messages if not _is_dynamic(message)]
     listed = [Message(entry["kind"], entry["text"], "several") for entry in dynamic]
     return sorted(found + listed)

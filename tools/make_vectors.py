@@ -1,7 +1,7 @@
 """Write tests/vectors/frames.json: the exact bytes of every payload and frame kind.
 
 The Python tests and the firmware's host tests both read the table, so the two implementations of
-firmware/PROTOCOL.md cannot drift apart. Run it only when the protocol itself changes.
+firmware/PROTOCOL.md stay equal. Run it only when the protocol itself changes.
 """
 
 import json
@@ -151,7 +151,7 @@ RADIO: dict[str, tuple[payloads.Header, payloads.Payload]] = {
         ),
     ),
 }
-"""Append new ones: the position of a vector is its frame's sequence number, and sets its pipe."""
+"""Vectors; append new ones, since the position is the sequence number and sets the pipe."""
 
 RECEIVER_STATUS = {
     "receiver_status": payloads.ReceiverStatusFrame(

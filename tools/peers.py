@@ -64,10 +64,10 @@ def run_vqf(flight: Flight) -> np.ndarray:
 
 
 class Textbook:
-    """Fifteen states with the attitude error in NED, after Sola (2017), and nothing else.
+    """A plain filter of fifteen states with the attitude error in NED, after Sola (2017).
 
-    Noises are those of the filter's defaults. Late fixes are moved on by their velocity; without
-    GPS the specific force is taken for gravity at every sample, with a large noise.
+    Noises are those of the filter's defaults. Late fixes are extrapolated by their velocity;
+    without GPS the specific force counts as gravity at every sample, with a large noise.
     """
 
     def __init__(self, flight: Flight) -> None:
@@ -127,7 +127,7 @@ class Textbook:
         self.update(H, np.array([heading]), np.array([0.3]))
 
     def take_gravity(self, accel: np.ndarray) -> None:
-        """Update by gravity, and hold the velocity, where there is no GPS."""
+        """Update by gravity without GPS, and keep the velocity."""
         f = self.q.apply(accel - self.ba)
         H = np.zeros((2, 15))
         H[0, 1], H[1, 0] = f[2], -f[2]

@@ -2,11 +2,11 @@
 
     python -m tools.score_estimators --data DIR [--only FLIGHT] [--json FILE] [--no-peers]
 
-One row a flight and estimator. Attitude is compared with the reference where it counts (in flight,
-in motion), in degrees RMS; position in metres RMS at the native fix rate, with one fix a second,
-and in outages of 10 and 30 s that are cut out of the log again and again. Then the share of the
-time within two standard deviations, the samples processed in a second, in millions, and the largest
-error 20 s after each disturbance of `tools.spoil_flight` (--spoilt).
+There is one row for each flight and estimator. Attitude is compared with the reference in flight or
+motion, in degrees RMS; position in metres RMS at the native fix rate, with one fix a second, and in
+repeated artificial outages of 10 and 30 s. The other columns are the share of the time within two
+standard deviations, millions of samples processed in a second, and the largest error 20 s after
+each disturbance of `tools.spoil_flight` (--spoilt).
 """
 
 import argparse
@@ -73,7 +73,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def heading_rad(off: Rotation) -> np.ndarray:
-    """Return the part about down of rotations in NED."""
+    """Return the rotation about down of rotations in NED."""
     w, z = off.as_quat(scalar_first=True)[:, [0, 3]].T
     return wrap_pi(2.0 * np.arctan2(z, w))
 
@@ -187,7 +187,7 @@ def share_scores(flight: Flight, out: np.ndarray, since_s: float = -math.inf) ->
 
 
 def spoilt_scores(flight: Flight, run: Run) -> dict[str, Scores]:
-    """Return the errors from 20 s after each disturbance on, and the shares since its end."""
+    """Return the errors 20 s after each disturbance and later, and the shares since its end."""
     found = {}
     for how, spoil in SPOILS.items():
         if not applies(how, flight):
@@ -224,7 +224,7 @@ def score(flight: Flight, run: Run, *, whole: bool = True) -> Scores:
 
 
 def flights_to_score(folder: Path, only: Sequence[str] | None) -> Iterator[Flight]:
-    """Read and simulate the flights whose names contain one of some words, or all."""
+    """Read and simulate the flights whose names contain one of the words, or all flights."""
     makers: dict[str, Callable[[], Flight]] = {
         path.name.split(".")[0]: partial(read_flight, path)
         for path in sorted(folder.glob("*.csv*"))

@@ -1,7 +1,7 @@
 """A whole simulated flight as arrays and as records, with exact truth, for scoring and tests.
 
-`fly` gives the numbers that the simulated nodes send; `SimulatedFlight.records` gives them as the
-raw records that the wire stage returns, without clock errors and losses.
+`fly` returns the numbers that the simulated nodes send; `SimulatedFlight.records` yields them as
+the raw records that the wire stage returns, without clock errors and losses.
 """
 
 import heapq
@@ -39,9 +39,9 @@ class SimulatedFlight:
     settings: SimulatorSettings
     vehicle_id: int
     trajectory: Trajectory
-    """`trajectory.truth_at(times)` is exact anywhere; `imu.truth` and `baro.truth` are it."""
+    """`trajectory.truth_at(times)` is exact at any time, and gives `imu.truth` and `baro.truth`."""
     errors: SensorErrors
-    """Its fields are those of a node's calibration."""
+    """Sensor errors, with the fields of a node's calibration."""
     imu: ImuSamples
     baro: BaroSamples
     gps: GpsSamples
@@ -49,8 +49,8 @@ class SimulatedFlight:
     def records(self) -> Iterator[SampleRecord]:
         """Yield the samples as raw records in the order of time.
 
-        The gateway clock is true time here; node clocks are as the nodes have them. A record's time
-        is that of sampling, for a fix that of its arrival.
+        The gateway clock is true time here; node times are those of the nodes' clocks. The time of
+        a record is that of sampling, for a fix that of its arrival.
         """
         sources: tuple[Iterator[SampleRecord], ...] = (
             self._imu_records(),

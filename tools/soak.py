@@ -1,12 +1,12 @@
-"""Run `mavgate run` for long while its computer misbehaves, and report the gaps of every stream.
+"""Run `mavgate run` for long with disturbances of its computer, and report gaps of every stream.
 
 A simulated receiver feeds the gateway over a pseudo-terminal. At random times, which may coincide,
-the process is stopped, the port is pulled, the disk of the recordings is full, or the civil clock
-steps. The longest gap of each message is printed with the disturbances during it. A gap of more
-than 7 s that exceeds its disturbances by more than 2 s ends the program with status 1.
+the process is stopped, the port is disconnected, the disk of the recordings is full, or the civil
+clock steps. The longest gap of each message is printed with the disturbances during it. A gap of
+more than 7 s that exceeds its disturbances by more than 2 s ends the program with status 1.
 
-The full disk needs root (it is a small tmpfs), the clock steps need a C compiler; without them
-these disturbances are left out.
+The full disk, a small tmpfs, needs root; the clock steps need a C compiler. Without these, the
+disturbances are omitted.
 """
 
 import argparse
@@ -40,7 +40,7 @@ MAX_GAP_S = 7.0
 MAX_UNEXPLAINED_S = 2.0
 MAX_DISTURBANCE_S = 5.0
 REOPENING_S = 1.5
-"""The gateway looks for a lost port at least every second."""
+"""Longest time to find a lost port, which the gateway searches at least every second."""
 DISK = "8m"
 STREAMS = (
     "HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "VFR_HUD", "HIGHRES_IMU",
@@ -72,7 +72,7 @@ class Disturbance:
     end_s: float
 
     def overlaps(self, gap: "Gap") -> bool:
-        """Return whether it, or the search for the port after it, falls into a gap."""
+        """Return whether the disturbance, or the search for the port after it, overlaps a gap."""
         return self.begin_s < gap.end_s and self.end_s + REOPENING_S > gap.begin_s
 
 
@@ -85,11 +85,11 @@ class Gap:
 
     @property
     def length_s(self) -> float:
-        """Its duration."""
+        """Duration of the gap."""
         return self.end_s - self.begin_s
 
     def unexplained_s(self, during: list[Disturbance]) -> float:
-        """Return the part of it that no disturbance covers."""
+        """Return the part of the gap that no disturbance covers."""
         left_s, now_s = 0.0, self.begin_s
         for disturbance in sorted(during, key=lambda d: d.begin_s):
             left_s += max(0.0, disturbance.begin_s - now_s)
@@ -100,7 +100,7 @@ class Gap:
 
 @dataclass
 class Listener(asyncio.DatagramProtocol):
-    """A client that notes when each message arrives, and texts."""
+    """A client that notes the arrival of each message, and texts."""
 
     begin_s: float
     last_s: dict[int, float] = field(default_factory=dict)
@@ -120,13 +120,13 @@ class Listener(asyncio.DatagramProtocol):
             data = data[12 + data[1] :]
 
     def note(self, message_id: int, now_s: float) -> None:
-        """Count a message and keep a gap before it."""
+        """Count a message and store a gap before it."""
         self.counts[message_id] = self.counts.get(message_id, 0) + 1
         self._keep_gap(message_id, now_s)
         self.last_s[message_id] = now_s
 
     def finish(self) -> None:
-        """Keep the gap of each message that has not come again."""
+        """Store the gap of each message that has not been received again."""
         now_s = time.monotonic() - self.begin_s
         for message_id in self.last_s:
             self._keep_gap(message_id, now_s)
@@ -138,7 +138,7 @@ class Listener(asyncio.DatagramProtocol):
 
 
 class Receiver:
-    """The simulated receiver on a device that comes and goes under one name."""
+    """The simulated receiver on a device that is connected repeatedly under one name."""
 
     def __init__(self, link: Path) -> None:
         self._link = link
@@ -147,7 +147,7 @@ class Receiver:
         self._port: PtyPort | None = None
 
     def plug(self) -> None:
-        """Appear; the nodes' clocks went on meanwhile."""
+        """Connect the device; the nodes' clocks have continued."""
         elapsed_s = time.monotonic() - self._begin_s
         self._port = PtyPort(self._from(elapsed_s))
         self._link.unlink(missing_ok=True)
@@ -160,14 +160,14 @@ class Receiver:
                 yield replace(frame, time_s=frame.time_s - begin_s)
 
     def pull(self) -> None:
-        """Disappear."""
+        """Disconnect the device."""
         assert self._port is not None
         self._port.close()
         self._link.unlink(missing_ok=True)
 
 
 class Gateway:
-    """The process under test, with what is needed to disturb it."""
+    """The process under test, with the means to disturb it."""
 
     def __init__(self, folder: Path, client_port: int) -> None:
         self.folder = folder
@@ -275,7 +275,7 @@ async def soak(options: argparse.Namespace) -> int:
 
 
 def judge(listener: Listener, found: list[Disturbance], folder: Path) -> int:
-    """Print the longest gap of every stream with its cause, and every gap above the limit."""
+    """Print the longest gap of every stream with its causes, and every gap above the limit."""
     status = 0
     print(f"{len(found)} disturbances; files in {folder}; its log has the stepped clock")
     print(f"{'message':22} {'count':>8} {'gap s':>7} {'at s':>8} {'unexplained s':>14}  cause")

@@ -1,8 +1,8 @@
-"""Spoil a flight with a disturbance that occurs in the field.
+"""Add a disturbance that occurs in the field to the log of a flight.
 
     python tools/spoil_flight.py FLIGHT.csv.gz --how imu_gap -o SPOILT.csv.gz
 
-The spoilt log has the form of the tracker logs that `mavgate fuse` reads.
+The disturbed log has the format of the tracker logs that `mavgate fuse` reads.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from tools.flights import GPS_NAMES, IMU_NAMES, Flight, read_flight
 IMU_GAP_S = 4.0
 HANG_S = 1.5
 RECOVERY_S = 20.0
-"""Time after a disturbance within which an estimator has to recover."""
+"""Time after a disturbance in which an estimator must recover."""
 GYRO_OFF_RADPS = math.radians(1.0)
 UNCALIBRATED_RADPS = np.radians([9.0, -8.0, 12.0])
 UNCALIBRATED_MPS2 = (0.4, -0.35, 0.5)
@@ -52,16 +52,16 @@ BLANK_SHARE = 0.01
 ODD_RADPS = 35.0
 ODD_MPS2 = 160.0
 ODD_SEED = 5
-"""Of the samples that are whatever the bus made of them, anything that the sensors can read."""
+"""Random seed of the samples that a bus error replaces by any values of the sensors' range."""
 
 
 @dataclass(frozen=True)
 class Spoilt:
-    """A flight with its disturbance."""
+    """A flight with a disturbance."""
 
     flight: Flight
     ends_s: float
-    """When the disturbance is over; where it lasts, when the flight begins in earnest."""
+    """End of the disturbance; for a lasting one, the begin of the actual flight."""
 
 
 def first_fix_s(flight: Flight) -> float:
@@ -77,7 +77,7 @@ def middle_s(flight: Flight) -> float:
 
 
 def turn_s(flight: Flight) -> float:
-    """Return the begin of the `IMU_GAP_S` that turn most, with time to recover after them."""
+    """Return the begin of the `IMU_GAP_S` with the largest turn, with time to recover after it."""
     time_s, log = flight.log.imu_time_us * 1e-6, flight.log
     dt = np.diff(time_s, prepend=time_s[0]).clip(0.0, 0.1)
     turned = np.cumsum(np.abs(np.linalg.norm(log.imu[:, GYRO : GYRO + 3], axis=1)) * dt)
@@ -93,7 +93,7 @@ def with_imu(flight: Flight, imu: np.ndarray, ends_s: float) -> Spoilt:
 
 
 def zero_rows(flight: Flight) -> Spoilt:
-    """Send all-zero samples first, as an MPU6050 may that has just been woken."""
+    """Send all-zero samples first, as an MPU6050 may after waking up."""
     imu = flight.log.imu.copy()
     imu[:ZERO_ROWS, : len(IMU_NAMES)] = 0.0
     spoilt = replace(flight, log=replace(flight.log, imu=imu))
@@ -101,38 +101,38 @@ def zero_rows(flight: Flight) -> Spoilt:
 
 
 def late_gps(flight: Flight) -> Spoilt:
-    """Let GPS come in the middle of the flight."""
+    """Start GPS in the middle of the flight."""
     keep = flight.log.gps_time_us * 1e-6 > middle_s(flight)
     spoilt = flight.with_gps(keep)
     return Spoilt(spoilt, first_fix_s(spoilt))
 
 
 def without(flight: Flight, columns: slice) -> Spoilt:
-    """Take columns from the fixes."""
+    """Remove columns from the fixes."""
     gps = flight.log.gps.copy()
     gps[:, columns] = math.nan
     return Spoilt(replace(flight, log=replace(flight.log, gps=gps)), first_fix_s(flight))
 
 
 def no_velocity(flight: Flight) -> Spoilt:
-    """Take the velocity from the fixes."""
+    """Remove the velocity from the fixes."""
     return without(flight, slice(GPS_VEL, GPS_VEL + 3))
 
 
 def no_height(flight: Flight) -> Spoilt:
-    """Take the height from the fixes."""
+    """Remove the height from the fixes."""
     return without(flight, slice(GPS_ALT, GPS_ALT + 1))
 
 
 def no_mag(flight: Flight) -> Spoilt:
-    """Take the magnetometer."""
+    """Remove the magnetometer."""
     imu = flight.log.imu.copy()
     imu[:, MAG : MAG + 3] = math.nan
     return with_imu(flight, imu, first_fix_s(flight))
 
 
 def no_baro(flight: Flight) -> Spoilt:
-    """Take the barometer."""
+    """Remove the barometer."""
     log = replace(flight.log, baro_time_us=np.empty(0, np.int64), baro_alt_m=np.empty(0))
     return Spoilt(replace(flight, log=log), first_fix_s(flight))
 
@@ -157,7 +157,7 @@ def imu_gap(flight: Flight) -> Spoilt:
 
 
 def mid_air(flight: Flight) -> Spoilt:
-    """Begin in the middle of the flight, as a gateway does that is restarted."""
+    """Begin in the middle of the flight, like a restarted gateway."""
     begin_s = middle_s(flight)
     spoilt = cut(flight, flight.log.imu_time_us * 1e-6 > begin_s)
     log, baro = spoilt.log, flight.log.baro_time_us * 1e-6 > begin_s
@@ -167,14 +167,14 @@ def mid_air(flight: Flight) -> Spoilt:
 
 
 def gyro_off(flight: Flight) -> Spoilt:
-    """Let every axis of the gyroscope read too much throughout."""
+    """Add a constant bias to every axis of the gyroscope."""
     imu = flight.log.imu.copy()
     imu[:, GYRO : GYRO + 3] += GYRO_OFF_RADPS
     return with_imu(flight, imu, first_fix_s(flight))
 
 
 def uncalibrated(flight: Flight) -> Spoilt:
-    """Let the inertial sensors be off as those of an MPU6050 that nobody has calibrated."""
+    """Add the errors of an uncalibrated MPU6050 to the inertial sensors."""
     imu = flight.log.imu.copy()
     imu[:, GYRO : GYRO + 3] += UNCALIBRATED_RADPS
     imu[:, ACCEL : ACCEL + 3] += UNCALIBRATED_MPS2
@@ -183,7 +183,7 @@ def uncalibrated(flight: Flight) -> Spoilt:
 
 
 def half_rate(flight: Flight) -> Spoilt:
-    """Lose every other sample of the IMU; what was new in it comes with the next."""
+    """Lose every other IMU sample; new values in it are sent with the next one."""
     imu, odd = flight.log.imu.copy(), np.arange(len(flight.log.imu)) % 2 == 1
     known = np.isfinite(imu[:, MAG])
     late = np.flatnonzero(odd & known & ~np.roll(known, -1))
@@ -194,7 +194,7 @@ def half_rate(flight: Flight) -> Spoilt:
 
 
 def odd_samples(flight: Flight) -> Spoilt:
-    """Put noise from the sensors' bus, or nothing at all, in the place of single samples."""
+    """Replace single samples by noise of the sensor bus, or by zeros."""
     rng, imu = np.random.default_rng(ODD_SEED), flight.log.imu.copy()
     luck = rng.random(len(imu))
     odd, blank = luck < ODD_SHARE, luck > 1.0 - BLANK_SHARE
@@ -205,7 +205,7 @@ def odd_samples(flight: Flight) -> Spoilt:
 
 
 def imu_hangs(flight: Flight) -> Spoilt:
-    """Let gyroscope and accelerometer repeat one sample in the sharpest turn."""
+    """Repeat one sample of gyroscope and accelerometer in the sharpest turn."""
     imu, time_s, begin_s = flight.log.imu.copy(), flight.log.imu_time_us * 1e-6, turn_s(flight)
     hung = np.flatnonzero((time_s > begin_s) & (time_s <= begin_s + HANG_S))
     imu[hung, : GYRO + 3] = imu[hung[0], : GYRO + 3]
@@ -213,7 +213,7 @@ def imu_hangs(flight: Flight) -> Spoilt:
 
 
 def mag_hangs(flight: Flight) -> Spoilt:
-    """Let the magnetometer repeat one field from the middle of the flight on."""
+    """Repeat one field of the magnetometer from the middle of the flight on."""
     imu, begin_s = flight.log.imu.copy(), middle_s(flight)
     hung = np.flatnonzero((flight.log.imu_time_us * 1e-6 > begin_s) & np.isfinite(imu[:, MAG]))
     imu[hung, MAG : MAG + 3] = imu[hung[0], MAG : MAG + 3]
@@ -221,14 +221,14 @@ def mag_hangs(flight: Flight) -> Spoilt:
 
 
 def bias_step(flight: Flight) -> Spoilt:
-    """Let the bias of the gyroscope change at once in the middle of the flight."""
+    """Change the bias of the gyroscope abruptly in the middle of the flight."""
     imu, begin_s = flight.log.imu.copy(), middle_s(flight)
     imu[flight.log.imu_time_us * 1e-6 > begin_s, GYRO : GYRO + 3] += BIAS_STEP_RADPS
     return with_imu(flight, imu, begin_s + RECOVERY_S)
 
 
 def blow(flight: Flight) -> Spoilt:
-    """Let the gyroscope measure a turn of 80 degrees that did not occur, as after a blow."""
+    """Add a false turn of 80 degrees to the gyroscope, as by a shock."""
     imu, begin_s = flight.log.imu.copy(), middle_s(flight)
     time_s = flight.log.imu_time_us * 1e-6
     imu[(time_s > begin_s) & (time_s <= begin_s + BLOW_S), GYRO : GYRO + 3] += BLOW_RADPS
@@ -236,7 +236,7 @@ def blow(flight: Flight) -> Spoilt:
 
 
 def field_jump(flight: Flight) -> Spoilt:
-    """Switch on a current for a while in the middle of the flight, which changes the field."""
+    """Change the field for a while in the middle of the flight, like a current."""
     imu, begin_s = flight.log.imu.copy(), middle_s(flight)
     time_s = flight.log.imu_time_us * 1e-6
     imu[(time_s > begin_s) & (time_s <= begin_s + CURRENT_S), MAG : MAG + 3] += CURRENT_UT
@@ -255,7 +255,7 @@ def gps_jump(flight: Flight, begin_s: float | None = None) -> Spoilt:
 
 
 def wrong_latency(flight: Flight, known_s: float | None = None) -> Spoilt:
-    """Set the latency of the fixes too long; manoeuvres show it, by default until the middle."""
+    """Set too long a latency of the fixes, which manoeuvres (by default up to the middle) show."""
     latency_s = flight.reference.gps_latency_s + LATENCY_S
     spoilt = replace(flight, reference=replace_struct(flight.reference, gps_latency_s=latency_s))
     return Spoilt(spoilt, middle_s(flight) if known_s is None else known_s)
@@ -287,7 +287,7 @@ MAG_SPOILS = ("no_mag", "mag_hangs", "field_jump")
 
 
 def applies(how: str, flight: Flight) -> bool:
-    """Return whether a flight has the sensor that a way of spoiling changes."""
+    """Return whether a flight has the sensor that a disturbance changes."""
     log = flight.log
     if how in GPS_SPOILS:
         return len(log.gps) > 0
@@ -317,7 +317,7 @@ def write_flight(flight: Flight, path: Path) -> None:
 
 
 def main() -> None:
-    """Read, spoil, write."""
+    """Read a log, add the disturbance, and write it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("flight", type=Path, help="a tracker log")
     parser.add_argument("--how", choices=SPOILS, required=True)

@@ -1,4 +1,4 @@
-"""List the packages that mavgate needs, with their licences.
+"""List the packages that mavgate requires, with their licences.
 
     python -m tools.third_party
     python -m tools.third_party --copyright FILE LIBRARY
@@ -34,12 +34,12 @@ STATED: Final = {
     "scipy": "BSD-3-Clause AND others of bundled libraries",
     "ziglang": "MIT",
 }
-"""Where the metadata contain a text instead of a name, or none."""
+"""Licences of packages whose metadata contain a text instead of a name, or none."""
 NO_TEXT: Final = {
     "pmtiles": "Copyright 2021 and later Protomaps LLC",
     "pyserial": "Copyright (c) 2001-2020 Chris Liechti <cliechti@gmx.net>",
 }
-"""The copyright of packages under BSD-3-Clause that contain no text of a licence."""
+"""Copyright of packages under BSD-3-Clause that do not contain the text of the licence."""
 BSD_3_CLAUSE: Final = """\
 Redistribution and use in source and binary forms, with or without modification, are permitted
 provided that the following conditions are met:
@@ -147,11 +147,11 @@ def locked_in(lock: Path) -> list[str]:
 
 
 def licence_of(name: str) -> str:
-    """Return the licence of a package; exits if it is not installed, and its licence not known."""
+    """Return the licence of a package; exits if it is neither installed nor listed here."""
     try:
         return _licence(distribution(name))
     except PackageNotFoundError:
-        # The linker is installed only where it is needed.
+        # The linker is installed only if it is needed.
         if name in STATED:
             return STATED[name]
         sys.exit(f"{name} is not installed: run this in the environment of `make test`")

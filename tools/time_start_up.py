@@ -1,21 +1,21 @@
-"""Time how soon the gateway starts, and how soon ground stations are through theirs with it.
+"""Measure the start-up time of the gateway, and of ground stations with it.
 
     python tools/time_start_up.py
     python tools/time_start_up.py --gateway
     python tools/time_start_up.py --radio
 
-Prints the CPU of `mavgate --help` and `status`, the best of five; then of `mavgate run` on a
-simulated receiver the seconds, the CPU and the memory from its call to its first datagram and to
-its first attitude. The baselines are a Python that does nothing, and `mavlogdump.py --help`.
+Prints the CPU time of `mavgate --help` and `status`, the best of five; then, for `mavgate run` on a
+simulated receiver, the time, CPU time and memory from its call to its first datagram and to its
+first attitude. The baselines are an empty Python program, and `mavlogdump.py --help`.
 
-Then it starts the demo and prints seconds of wall clock: the scripted QGroundControl over UDP and
-TCP, as MAVLink 1 and 2, the best of five each; and MAVProxy from its heartbeat to the last
-parameter. The baseline is the round trip of one PING.
+Then it starts the demo and prints elapsed times, s: the scripted QGroundControl over UDP and TCP,
+with MAVLink 1 and 2, the best of five each; and MAVProxy from its heartbeat to the last parameter.
+The baseline is the round trip of one PING.
 
 With `--radio` the station is on a serial radio instead: a pseudo-terminal that carries 57,600 Bd
-each way, with the telemetry of the demo on it. It reads the description of the parameters by
-MAVLink FTP as QGroundControl does, both files by bursts, and asks all its questions. The baseline
-is the same with the description as plain JSON, computed from its size at the measured rate.
+each way, with the telemetry of the demo. It reads the description of the parameters by MAVLink FTP
+like QGroundControl, both files by bursts, and sends all its requests. The baseline is the same with
+the description as plain JSON, computed from its size at the measured rate.
 """
 
 import argparse
@@ -67,7 +67,7 @@ gps_first_fix_s = 0.5
 
 
 def cpu_of(*arguments: str) -> float:
-    """Measure the processor seconds of a program of Python; the best of some runs."""
+    """Measure the processor time of a Python program; the best of some runs."""
     found = []
     for _ in range(REPEATS):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -78,7 +78,7 @@ def cpu_of(*arguments: str) -> float:
 
 
 def process_figures(pid: int) -> str:
-    """Return the processor time and the memory of a process and of those that it waited for."""
+    """Return the processor time and the memory of a process and its ended children."""
     text = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     own, waited = (sum(map(int, text[k : k + 2])) / os.sysconf("SC_CLK_TCK") for k in (11, 13))
     status = Path(f"/proc/{pid}/status").read_text()
@@ -89,7 +89,7 @@ def process_figures(pid: int) -> str:
 def feed(master: int, frames: Iterable[TimedFrame], began_s: float) -> Iterator[float]:
     """Write the receiver's frames at their own time, and yield the seconds until each.
 
-    What nobody has read yet is not waited for.
+    Frames that do not fit because earlier ones are unread are dropped.
     """
     for frame in frames:
         while (early_s := began_s + frame.time_s - time.monotonic()) > 0.0:
@@ -99,7 +99,7 @@ def feed(master: int, frames: Iterable[TimedFrame], began_s: float) -> Iterator[
 
 
 def time_run(folder: Path) -> None:
-    """Print how soon a gateway on a receiver that is there already sends, and what that took."""
+    """Print the time and cost of a gateway's start with a connected receiver."""
     master, slave = os.openpty()
     tty.setraw(slave)
     frames = simulate(SimulatorSettings(gps_first_fix_s=0.5), START_UNIX_US).frames()
@@ -127,7 +127,7 @@ def time_run(folder: Path) -> None:
 
 
 def time_gateway(folder: Path) -> None:
-    """Print the costs of small commands and starts, and those of programs that do less."""
+    """Print the costs of small commands and starts, and of the baselines."""
     mavgate, dump = ("-m", "gateway.cli"), str(Path(sys.executable).with_name("mavlogdump.py"))
     print(f"python -c pass: CPU {cpu_of('-c', 'pass'):.2f} s")
     print(f"mavlogdump.py --help: CPU {cpu_of(dump, '--help'):.2f} s")
@@ -160,7 +160,7 @@ def connect(kind: int, port: int, version: int) -> Station:
 
 
 def timed(work: Callable[[], object]) -> float:
-    """Measure seconds of wall clock."""
+    """Measure the elapsed time of a function, s."""
     began_s = time.perf_counter()
     work()
     return time.perf_counter() - began_s
@@ -188,7 +188,7 @@ def time_stations(port: int) -> None:
 
 
 def time_mavproxy(port: int, folder: Path) -> None:
-    """Print how long MAVProxy takes to load all parameters."""
+    """Print the time in which MAVProxy loads all parameters."""
     mavproxy = MavProxy(port, folder)
     try:
         mavproxy.until(r"online system 1")
@@ -202,7 +202,7 @@ def time_mavproxy(port: int, folder: Path) -> None:
 
 
 class Radio:
-    """A pseudo-terminal and a socket, with a line between them that carries some bytes a second."""
+    """A pseudo-terminal and a socket, with a line of limited bandwidth between them."""
 
     def __init__(self, baud: int) -> None:
         self.master, self.slave = os.openpty()
@@ -243,7 +243,7 @@ def ftp_packets(messages: list[Any]) -> list[Packet]:
 
 
 def read_file(station: Station, path: bytes) -> bytes:
-    """Read a file by MAVLink FTP in bursts, and ask again where one ends or loses something."""
+    """Read a file by MAVLink FTP in bursts, with a new request after the end or loss of a burst."""
     sequence = 0
 
     def ask(opcode: int, session: int, data: bytes = b"", **fields: int) -> list[Packet]:
@@ -276,7 +276,7 @@ def read_file(station: Station, path: bytes) -> bytes:
 
 
 def time_radio(folder: Path) -> None:
-    """Print how soon a station on a serial radio has the parameters and their description."""
+    """Print the time in which a station on a serial radio loads parameters and description."""
     radio = Radio(BAUD)
     config = RADIO_CONFIG.format(device=radio.device, baud=BAUD)
     gateway = Gateway(folder, "demo", config=config)
@@ -306,8 +306,8 @@ def time_radio(folder: Path) -> None:
 def main() -> None:
     """Start the demo, measure, stop it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--gateway", action="store_true", help="its own start alone")
-    parser.add_argument("--radio", action="store_true", help="a station on a serial radio alone")
+    parser.add_argument("--gateway", action="store_true", help="only the gateway's own start")
+    parser.add_argument("--radio", action="store_true", help="only a station on a serial radio")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_RUNTIME_DIR"] = folder

@@ -2,9 +2,9 @@
 
 A turn is the time between two waits of the loop, in which no input is handled. The program's own
 share is the time in which its thread computes or waits for a disk, a lock or another thread. In a
-turn without such a wait that is its processor time; from any other turn the time is subtracted in
-which the thread was ready and the kernel ran others. Time that the host of a virtual machine takes
-remains in it: `even_turns`, a loop whose turns do the same work, measures that.
+turn without such a wait that is its processor time; in any other turn, the time in which the thread
+was ready but the kernel ran others is subtracted. Time used by the host of a virtual machine is
+still included: `even_turns`, a loop whose turns do the same work, measures that.
 """
 
 import asyncio
@@ -18,13 +18,13 @@ import time
 from typing import Any, NamedTuple
 
 WORST = 5
-"""Turns that are kept."""
+"""Number of stored turns."""
 LONG_US = 2000.0
-"""Turns whose own share is longer are counted."""
+"""Own share above which a turn is counted as long."""
 PAUSE_S = 0.001
 COUNT = 25_000
-"""Numbers that an even turn adds up: 0.3 ms or more, as a turn of the gateway takes, so that the
-machine takes as much from either."""
+"""Numbers that a turn of the baseline adds: 0.3 ms or more, like a turn of the gateway, so that the
+machine affects both equally."""
 
 
 class Turn(NamedTuple):
@@ -33,9 +33,9 @@ class Turn(NamedTuple):
     own_us: float
     wall_us: float
     end_ns: int
-    """Of `time.perf_counter_ns`, which all programs of a machine share."""
+    """End by `time.perf_counter_ns`, which is the same for all programs of a machine."""
     longest: str
-    """The callback that took longest."""
+    """The longest callback."""
 
 
 class TurnWatch(selectors.EpollSelector):
@@ -48,9 +48,9 @@ class TurnWatch(selectors.EpollSelector):
         self.turns = self.long_turns = 0
         self.longest_wall_us = 0.0
         self.longest_collection_us = [0.0, 0.0, 0.0]
-        """Of the garbage collector, by generation."""
+        """Longest run of the garbage collector by generation."""
         self.marks: list[tuple[float, str]] = []
-        """Times, in s since the start, and texts of noted events."""
+        """Times (s since the start) and texts of noted events."""
         self._run = asyncio.Handle._run  # noqa: SLF001
         self._schedule = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
         self._waited_ns = self._waits = self._computed_ns = 0
@@ -59,7 +59,7 @@ class TurnWatch(selectors.EpollSelector):
         self.restart()
 
     def restart(self) -> None:
-        """Begin, and discard the results so far."""
+        """Start measuring, and discard earlier results."""
         self._is_on = True
         self.worst.clear()
         self.turns = self.long_turns = 0
@@ -74,11 +74,11 @@ class TurnWatch(selectors.EpollSelector):
         self._is_on = False
 
     def mark(self, what: str) -> None:
-        """Note an event, to be compared with the longest turns."""
+        """Note an event, for comparison with the longest turns."""
         self.marks.append((self.seconds_at(time.perf_counter_ns()), what))
 
     def seconds_at(self, time_ns: int) -> float:
-        """Return when a time of `time.perf_counter_ns` was, since the watch began."""
+        """Convert a time of `time.perf_counter_ns` to seconds since the start."""
         return (time_ns - self._began_ns) / 1e9
 
     def longest(self) -> Turn:
@@ -124,7 +124,7 @@ class TurnWatch(selectors.EpollSelector):
             (heapq.heappush if len(self.worst) < WORST else heapq.heapreplace)(self.worst, turn)
 
     def _ready_ns(self) -> int:
-        """Return how long the thread has waited for a processor."""
+        """Return the total time for which the thread has waited for a processor."""
         return int(os.pread(self._schedule, 64, 0).split()[1])
 
     def _on_collection(self, phase: str, info: dict[str, int]) -> None:
@@ -152,7 +152,7 @@ class TurnWatch(selectors.EpollSelector):
 
 
 def waits() -> int:
-    """Return how often the thread has waited for anything."""
+    """Return the number of voluntary waits of the thread."""
     return resource.getrusage(resource.RUSAGE_THREAD).ru_nvcsw
 
 
@@ -170,7 +170,7 @@ async def _add_up(parent: int) -> None:
 
 
 def even_turns(seconds: float) -> tuple[Turn, float, int, int]:
-    """Measure a loop that does the same work in every turn, at most until its parent process ends.
+    """Measure a loop that does the same work in every turn, until its parent process ends.
 
     Returns
     -------

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from gateway.config import GatewaySettings, render
 
 STATE = Path("/var/lib/mavgate")
-"""The unit's StateDirectory: all else is read-only to it."""
+"""StateDirectory of the unit, its only writable folder."""
 
 default = GatewaySettings()
 recording = replace(default.recording, folder=str(STATE / "recordings"))
