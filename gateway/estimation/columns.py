@@ -1,6 +1,6 @@
-"""The one definition of the numbers that go into and come out of the kernels.
+"""The columns of the inputs and outputs of the kernels.
 
-A live sample is one row, a log many of the same: this is why both give the same bits.
+A live sample is one row, a log many such rows, so both give exactly the same results.
 """
 
 import math
@@ -26,14 +26,14 @@ GYRO: Final = 3
 MAG: Final = 6
 """Magnetic field in body FRD, uT: three columns, NaN unless new."""
 CLIPPED: Final = 9
-"""1 where a sensor touched the end of its range, else 0."""
+"""1 where a sensor reached the end of its range, else 0."""
 MAG_UNCALIBRATED: Final = 10
 GYRO_UNCALIBRATED: Final = 11
 ACCEL_UNCALIBRATED: Final = 12
-"""1 where that sensor was never calibrated, else 0."""
+"""1 where the sensor of each column was never calibrated, else 0."""
 ACCEL_FILTERED: Final = 13
 GYRO_FILTERED: Final = 14
-"""1 where the node has filtered that sensor, else 0."""
+"""1 where the node has filtered the sensor of each column, else 0."""
 IMU_COLUMNS: Final = 15
 
 GPS_USABLE: Final = 0
@@ -42,17 +42,17 @@ GPS_LAT: Final = 1
 GPS_LON: Final = 2
 GPS_ALT: Final = 3
 GPS_VEL: Final = 4
-"""Velocity NED, m/s: three columns, NaN where the receiver reports none."""
+"""Velocity NED, m/s: three columns, NaN if the receiver does not report it."""
 GPS_H_ACC: Final = 7
 GPS_V_ACC: Final = 8
 GPS_SPEED_ACC: Final = 9
-"""The receiver's own standard deviations; NaN where it reports none."""
+"""Standard deviations reported by the receiver; NaN if it does not report them."""
 GPS_DECLINATION: Final = 10
-"""Declination in rad; NaN while not known."""
+"""Declination in rad; NaN if unknown."""
 GPS_DIP: Final = 11
-"""Dip of the Earth's field at the position, positive down, rad; NaN while not known."""
+"""Dip of the Earth's field at the position, positive down, rad; NaN if unknown."""
 GPS_STRENGTH: Final = 12
-"""Norm of that field, uT; NaN while not known."""
+"""Norm of the Earth's field, uT; NaN if unknown."""
 GPS_COLUMNS: Final = 13
 
 NAV_QUAT: Final = 0
@@ -75,14 +75,14 @@ ROW_FLAGS: Final = (
     int(ImuFlags.ACCEL_FILTERED),
     int(ImuFlags.GYRO_FILTERED),
 )
-"""A column each."""
+"""Names of the columns."""
 
 _flags_of = cache(NavFlags)
-"""They are the same for many samples; a lookup costs a tenth of making them."""
+"""Flags are the same for many samples; a lookup costs a tenth of creating them."""
 FLAG: Final = cast(Any, namedtuple("Flag", NavFlags.__members__))(*map(int, NavFlags))
-"""The bits of `NavFlags` by their names, as plain numbers for compiled code."""
+"""The bits of `NavFlags` by their names, as numbers for compiled code."""
 HEADING_VALID_RAD: Final = 0.26
-"""A heading is valid up to this standard deviation."""
+"""Maximum standard deviation of a valid heading."""
 BARO_STALE_S: Final = 2.0
 """A barometer without readings for longer is not in use."""
 FRESH_GPS_S: Final = 1.5
@@ -90,21 +90,21 @@ FRESH_GPS_S: Final = 1.5
 
 
 def imu_row(sample: ImuSample) -> ImuRow:
-    """Lay out an IMU sample: unfiltered, for these estimators do their own averaging."""
+    """Return the row of an IMU sample, unfiltered, since these estimators average by themselves."""
     mag = sample.mag_b_ut or UNKNOWN_VEC3
     return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, *_flag_columns(int(sample.flags)))
 
 
 @cache
 def _flag_columns(flags: int) -> tuple[float, ...]:
-    """Return the columns that show the flags, which are the same for many samples."""
+    """Return the columns of the flags, which are the same for many samples."""
     return tuple(1.0 if flags & bits else 0.0 for bits in ROW_FLAGS)
 
 
 def imu_rows(
     accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, mag_b_ut: FloatArray, flags: IntArray
 ) -> FloatArray:
-    """Lay out n IMU samples, as `imu_row` each: vectors (n, 3), and `ImuFlags` (n,)."""
+    """Return the rows of n IMU samples like `imu_row`: vectors (n, 3), and `ImuFlags` (n,)."""
     shown = [(flags & bits) != 0 for bits in ROW_FLAGS]
     return np.column_stack([accel_b_mps2, gyro_b_radps, mag_b_ut, *shown]).astype(np.float64)
 
@@ -120,7 +120,7 @@ def imu_vectors(row: FloatArray) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsRow:
-    """Lay out a fix, and the Earth's magnetic field, which a usable fix updates."""
+    """Return the row of a fix, with the Earth's magnetic field, which a usable fix updates."""
     lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
     usable = is_usable(fix, settings)
     if usable:
@@ -144,7 +144,7 @@ def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsR
 
 
 def nav_state(time_us: int, row: FloatArray) -> NavState:
-    """Read a navigation state out of a kernel's output row, shape (NAV_COLUMNS,)."""
+    """Read a navigation state from a kernel's output row, shape (NAV_COLUMNS,)."""
     v = row.tolist()
     return NavState(
         time_us=time_us,
@@ -172,7 +172,7 @@ def nav_row(state: NavState) -> list[float]:
 
 @compiled
 def gps_flags(since_fix_s: float, since_reject_s: float, hold_s: float) -> int:
-    """Return the bits of `NavFlags` that follow from the age of the last fix and rejected one.
+    """Return the bits of `NavFlags` from the ages of the last accepted and the last rejected fix.
 
     A position is valid for `hold_s` after the last fix.
     """

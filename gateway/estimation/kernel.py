@@ -1,4 +1,4 @@
-"""The compiled estimator behind the interface of all: one sample live, or a whole log."""
+"""The compiled estimators with the common interface: one sample live, or a whole log."""
 
 import struct
 from collections.abc import Callable, Sequence
@@ -37,15 +37,15 @@ from gateway.estimation.reference import EarthField, EarthLocation, ReferenceSet
 from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 
 _ROW: Final = struct.Struct(f"={IMU_COLUMNS}d")
-"""Fills the row of one sample in half the time that numpy takes for a tuple."""
+"""Writes the row of one sample in half the time that numpy needs for a tuple."""
 
 Aiding = tuple[int, BaroSample | GpsFix]
-"""A height or a fix, and the number of the IMU sample before which it arrived."""
+"""A height or a fix, with the number of the IMU sample before which it arrived."""
 
 
 @dataclass(frozen=True, slots=True)
 class SampleLog:
-    """A whole log as arrays; each kind in the order of its time."""
+    """A whole log as arrays; each kind in the order of time."""
 
     imu_time_us: IntArray
     imu: FloatArray
@@ -53,13 +53,13 @@ class SampleLog:
     baro_time_us: IntArray
     baro_alt_m: FloatArray
     gps_time_us: IntArray
-    """Arrival."""
+    """Time of arrival."""
     gps: FloatArray
     """Shape (m, GPS_COLUMNS)."""
 
 
 def log_arrays(log: SampleLog) -> tuple[SampleLog, kernels.LogArrays]:
-    """Return a log with contiguous arrays, and where they lie; valid as long as these live."""
+    """Return a log with contiguous arrays, and their addresses, valid while the arrays exist."""
     log = SampleLog(*(np.ascontiguousarray(getattr(log, field.name)) for field in fields(log)))
     numbers = {field.name: address_of(getattr(log, field.name)) for field in fields(log)}
     numbers["imu_count"] = len(log.imu_time_us)
@@ -69,25 +69,25 @@ def log_arrays(log: SampleLog) -> tuple[SampleLog, kernels.LogArrays]:
 
 
 class FoundLatency(NamedTuple):
-    """A GPS latency that manoeuvres have shown."""
+    """A GPS latency that was estimated in manoeuvres."""
 
     latency_s: float
     std_s: float
 
 
 class Kernels(NamedTuple):
-    """The record of state of an estimator, and its entry points; all of them take both records."""
+    """The state record of an estimator, and its entry points, which take state and gains."""
 
     state: type
     begin_state: EntryPoint[[int, int]]
     imu_steps: EntryPoint[[int, int, int, int, int, int]]
     gps_step: EntryPoint[[int, int, int, int]]
     baro_step: EntryPoint[[int, int, float]] | None = None
-    """None if it has no use for a barometer."""
+    """None if the estimator does not use a barometer."""
 
 
 class CompiledEstimator:
-    """An estimator made of compiled kernels over one record of state.
+    """An estimator of compiled kernels with one state record.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class CompiledEstimator:
         self._time_us = np.zeros(1, np.int64)
         self._row, self._fix = np.zeros(IMU_COLUMNS), np.zeros(GPS_COLUMNS)
         self._output = np.empty(NAV_COLUMNS)
-        # An item of an array is set five times slower.
+        # Setting an item of an array would take five times as long.
         self._time_view, self._row_view = self._time_us.data, self._row.data
         self._time_at, self._row_at = address_of(self._time_us), address_of(self._row)
         self._fix_at, self._output_at = address_of(self._fix), address_of(self._output)
@@ -128,7 +128,7 @@ class CompiledEstimator:
         )
 
     def snapshot(self) -> bytes:
-        """Return the whole state, including the position on the Earth."""
+        """Return the complete state, including the position on the Earth."""
         return msgspec.msgpack.encode((pack_record(self._state), self._earth.state))
 
     def restore(self, snapshot: bytes) -> None:
@@ -150,12 +150,12 @@ class CompiledEstimator:
             step(self._at, self._gains_at, sample.alt_pressure_m)
 
     def update_gps(self, fix: GpsFix) -> None:
-        """Use one GPS fix at its arrival, as of the time it was valid."""
+        """Use one GPS fix at its arrival; it is compared with the state at its time of validity."""
         self._fix[:] = gps_row(fix, self._reference, self._earth)
         self._kernels.gps_step(self._at, self._gains_at, fix.time_us, self._fix_at)
 
     def fix_row(self, fix: GpsFix) -> GpsRow:
-        """Lay out one fix of a log that is to be run as arrays."""
+        """Return the row of one fix of a log that is processed as arrays."""
         return gps_row(fix, self._reference, self._earth)
 
     def run_in_arrival_order(
@@ -170,11 +170,11 @@ class CompiledEstimator:
         Parameters
         ----------
         time_us : ndarray, shape (n,)
-            Of the IMU samples.
+            Times of the IMU samples.
         imu : ndarray, shape (n, IMU_COLUMNS)
         aiding : sequence of tuple
-            Heights and fixes in their order, each with the number of the sample before which it
-            arrived: up to n.
+            Heights and fixes in order, each with the number (up to n) of the sample before which it
+            arrived.
         on_fix : callable, optional
             Called after each fix.
 
@@ -220,17 +220,17 @@ class KernelEstimator(CompiledEstimator):
 
     @property
     def state(self) -> State:
-        """A copy of the state, to be read."""
+        """A copy of the state."""
         return copy_record(self._state)
 
     @property
     def gps_latency_s(self) -> tuple[float, float]:
-        """The latency in use, which the motion may have corrected, and the one that is set."""
+        """The latency in use, which may be corrected by motion, and that of the settings."""
         used_s = float(self._state.gps_latency_s)
         return used_s, self._reference.gps_latency_s
 
     def latency_of(self, log: SampleLog) -> float:
-        """Return the GPS latency of a whole log, s: the set one, or that shown by manoeuvres."""
+        """Return the GPS latency of a whole log, s: the set or the estimated one."""
         other = KernelEstimator(self.gains, self._reference)
         other.restore(self.snapshot())
         other.run(log)
@@ -238,19 +238,19 @@ class KernelEstimator(CompiledEstimator):
         return set_s if found is None else latency_to_use(found.latency_s, set_s)
 
     def found_latency(self) -> FoundLatency | None:
-        """Return the GPS latency that manoeuvres have shown so far; None where none has."""
+        """Return the GPS latency estimated in manoeuvres so far; None if there is no estimate."""
         std_s = latency_std(self._state)
         if std_s > KNOWN_STD_S:
             return None
         return FoundLatency(float(self._state.latency_found[0]), std_s)
 
     def run(self, log: SampleLog) -> FloatArray:
-        """Advance over a whole log, with the same bits as sample by sample.
+        """Advance over a whole log, with exactly the same result as sample by sample.
 
         Parameters
         ----------
         log : SampleLog
-            At each IMU sample, the barometer samples and fixes that are not later come first.
+            Before each IMU sample, the barometer samples and fixes that are not later are used.
 
         Returns
         -------

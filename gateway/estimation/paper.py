@@ -1,19 +1,19 @@
-"""The paper's estimator: filters, then three complementary filters, its equations corrected.
+"""The paper's estimator: filters, then three complementary filters, with corrected equations.
 
 Accelerometer and gyroscope give roll and pitch, the magnetometer corrects yaw, and the acceleration
-is integrated twice and blended with GPS [1]_. Deviations from the print:
+is integrated twice and blended with GPS [1]_. Deviations from the printed equations:
 
 - Eq. 1, 2, 7, 8: the course is counted from north, so its cosine is the north velocity and north
   velocity drives latitude; a metre east is `180 / (pi r_e cos(lat))` degrees. They are recursions:
   `V = alpha (V + a dt) + (1 - alpha) V_gps`. By default they blend once at each fix; blending at
   every sample against the held fix, as printed, drags the track back to the last fix.
-- Eq. 1, 2: the acceleration is the specific force rotated to NED, gravity added.
-- Eq. 3 to 6: the receiver's velocity replaces the bearing between two fixes, which is used where
-  there is none. A fix is moved on over its latency by its velocity and by the acceleration since.
-  The vertical axis, which the paper leaves out, is blended by the same equations.
+- Eq. 1, 2: the acceleration is the specific force rotated to NED plus gravity.
+- Eq. 3 to 6: the receiver's velocity replaces the bearing between two fixes, which is used only
+  without a velocity. A fix is extrapolated over its latency by its velocity and the acceleration.
+  The vertical axis, which the paper omits, is blended by the same equations.
 - The gyroscope is integrated as a quaternion; Euler angles are only blended.
-- A rate that is constant at rest is subtracted as bias. The high-pass of the rate would also remove
-  the steady rate of a turn, so it is off unless it is set.
+- A constant rate at rest is subtracted as bias. The high-pass of the rate would also remove the
+  steady rate of a turn, so it is off by default.
 
 References
 ----------
@@ -86,29 +86,29 @@ from gateway.settings import Settings, setting
 from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
 
 GAP_S: Final = 2.5
-"""A longer interval of the IMU is not integrated."""
+"""Longest interval of the IMU that is integrated."""
 GAIN_INTERVAL_S: Final = 0.01
-"""The attitude weights hold for this interval; other intervals take the matching power."""
+"""Interval for which the attitude weights are given; for others the matching power is used."""
 POSITION_HOLD_S: Final = 30.0
-"""A position is not valid after a longer time of dead reckoning."""
+"""Longest dead reckoning with a valid position."""
 MOST_GAINS: Final = 2000
-"""Samples of the longest latency at 1000 a second."""
+"""Number of samples in the longest latency at 1000 a second."""
 STALE_MAG_S: Final = 2.0
 """A compass without readings for longer is not in use."""
 MIN_COS_PITCH: Final = 0.05
-"""Near the vertical the accelerometer does not give the roll."""
+"""Cosine of the pitch below which the accelerometer does not give the roll."""
 LIMITS: Final = (500.0, 50.0)
 """Largest force in m/s2 and rate in rad/s that a sensor of this kind can measure."""
 NEVER_US: Final = -(1 << 62)
-"""A time before everything."""
+"""A time earlier than all others."""
 REST: Final = (0.035, 0.5, 0.1, 0.7)
-"""At rest rate and force are this close to their means, rad/s and m/s2; the mean rate is no larger,
-rad/s, nor the GPS speed, m/s."""
+"""Maximum values at rest: deviation of rate and force from their means, rad/s and m/s2, mean rate,
+rad/s, and GPS speed, m/s."""
 REST_S: Final = 1.5
-"""Rest begins after this time; the means and the bias follow with it as time constant."""
+"""Time after which rest begins, and time constant of the means and the bias."""
 FIRST_RATE_HZ: Final = 100.0
 RATE_CHANGE: Final = 0.1
-"""The filters are redesigned when the sample rate changes by this share."""
+"""Relative change of the sample rate at which the filters are redesigned."""
 FLOAT: Final = np.dtype(np.float64)
 INT: Final = np.dtype(np.int64)
 
@@ -119,15 +119,17 @@ class PaperSettings(Settings, frozen=True):
     accel_filter: Annotated[
         Kind, setting("Second-order low-pass of the acceleration: butterworth or chebyshev.")
     ] = "butterworth"
-    accel_cutoff_hz: Annotated[float, setting("Its cutoff.", "Hz", ge=0.1, le=500.0)] = 10.0
+    accel_cutoff_hz: Annotated[
+        float, setting("Cutoff of the low-pass.", "Hz", ge=0.1, le=500.0)
+    ] = 10.0
     chebyshev_ripple_db: Annotated[
         float, setting("Ripple of the Chebyshev filter's pass band.", "dB", ge=0.01, le=6.0)
     ] = 1.0
     gyro_highpass_hz: Annotated[
         float,
         setting(
-            "Cutoff of the rate's first-order high-pass; 0 for none. It also removes the steady "
-            "rate of a long turn.",
+            "Cutoff of the first-order high-pass of the rate, which also removes the steady rate "
+            "of a long turn; 0 for none.",
             "Hz",
             ge=0.0,
             le=10.0,
@@ -136,21 +138,21 @@ class PaperSettings(Settings, frozen=True):
     alpha_gyro: Annotated[
         float,
         setting(
-            "Weight of the gyroscope in roll and pitch over 10 ms. Small follows the "
-            "accelerometer's noise and levels long turns, large drifts; time constant "
+            "Weight of the gyroscope in roll and pitch over 10 ms. Small: follows the noise of the "
+            "accelerometer, and levels long turns. Large: drifts. Time constant: "
             "0.01 s * a / (1 - a).",
             ge=0.0,
             le=1.0,
         ),
     ] = 0.9997
     alpha_yaw: Annotated[
-        float, setting("The same in yaw, against the magnetometer.", ge=0.0, le=1.0)
+        float, setting("The same for yaw, with the magnetometer.", ge=0.0, le=1.0)
     ] = 0.999
     alpha_accel: Annotated[
         float,
         setting(
-            "Alpha: weight of the integrated acceleration in the velocity, against the GPS "
-            "velocity. Small is smooth, large is spiky and drifts.",
+            "Alpha: weight of the integrated acceleration in the velocity, relative to the GPS "
+            "velocity. Small: smooth. Large: noisy, and drifts.",
             ge=0.0,
             le=1.0,
         ),
@@ -158,20 +160,20 @@ class PaperSettings(Settings, frozen=True):
     beta_velocity: Annotated[
         float,
         setting(
-            "Beta: weight of the integrated velocity in the position, against the GPS position. "
-            "Small follows the fixes, large lags and drifts.",
+            "Beta: weight of the integrated velocity in the position, relative to the GPS "
+            "position. Small: follows the fixes. Large: lags, and drifts.",
             ge=0.0,
             le=1.0,
         ),
     ] = 0.1
     blend: Annotated[
         Literal["at_fix", "every_sample"],
-        setting("When velocity and position are blended: at_fix or every_sample (as printed)."),
+        setting("Times of blending velocity and position: at_fix, or every_sample (as printed)."),
     ] = "at_fix"
 
 
 class PaperState:
-    """All that the estimator keeps; times in microseconds on the gateway clock."""
+    """State of the estimator; times in microseconds on the gateway clock."""
 
     started: int
     time_us: int
@@ -184,7 +186,7 @@ class PaperState:
     highpass: Annotated[FloatArray, (5,)]
     """Coefficients at `rate_hz`."""
     delays: Annotated[FloatArray, (2, 6)]
-    """Of the low-pass and the high-pass, see `filter_step`."""
+    """Delays of the low-pass and the high-pass, see `filter_step`."""
     gyro_mean: Annotated[FloatArray, (3,)]
     accel_mean: Annotated[FloatArray, (3,)]
     rest_s: float
@@ -197,10 +199,10 @@ class PaperState:
     fix_us: int
     fix_from: Annotated[FloatArray, (3,)]
     fix_location: Annotated[FloatArray, (3,)]
-    """The last fix, as received above, moved on by its latency here."""
+    """The last fix: as received in `fix_from`, extrapolated by its latency here."""
     fix_vel: Annotated[FloatArray, (3,)]
     gains: Annotated[FloatArray, (MOST_GAINS, 4)]
-    """Times of recent samples in us, and the integral of the acceleration there, m/s: a ring."""
+    """Ring of the times of recent samples, us, and the integral of the acceleration, m/s."""
     first_gain: int
     gain_count: int
 
@@ -221,12 +223,12 @@ class PaperGains:
     """1 if fixes are blended at every sample."""
     gps_latency_s: float
     declination_rad: float
-    """NaN where it is looked up at the position of a fix."""
+    """NaN if it is looked up at the position of a fix."""
 
 
 @compiled
 def retune(s: PaperState, p: PaperGains, rate_hz: float) -> None:
-    """Redesign the filters, which start again at the next sample."""
+    """Redesign the filters, which restart at the next sample."""
     s.rate_hz = rate_hz
     lowpass = discretise(p.damping, p.w0_sq, p.accel_cutoff_hz, rate_hz)
     highpass = design_highpass(p.gyro_highpass_hz, rate_hz)
@@ -237,7 +239,7 @@ def retune(s: PaperState, p: PaperGains, rate_hz: float) -> None:
 
 @compiled
 def update_imu(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> bool:
-    """Advance by one IMU sample; return whether it is sound."""
+    """Advance by one IMU sample; return whether it is valid."""
     gyro, accel, mag = imu_vectors(row)
     sound = is_below(accel, LIMITS[0]) and is_below(gyro, LIMITS[1])
     if s.started == 0:
@@ -275,7 +277,7 @@ def update_imu(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> b
 
 @compiled
 def update_gps(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> None:
-    """Blend one fix: eq. 1 to 8, moved on by its latency."""
+    """Blend one fix, extrapolated by its latency: eq. 1 to 8."""
     if row[GPS_USABLE] == 0.0:
         return
     s.declination_rad = row[GPS_DECLINATION]
@@ -311,7 +313,7 @@ def gained_since(s: PaperState, time_us: int) -> Vec3:
 
 @compiled
 def bearing_velocity(s: PaperState, location: Vec3, time_us: int) -> Vec3:
-    """Return speed and bearing from one fix to the next: eq. 3 to 6 over a short way."""
+    """Return the velocity from one fix to the next: eq. 3 to 6 for a short distance."""
     f, dt_s = s.fix_from, (time_us - s.fix_us) / US_PER_S
     if not 0.0 < dt_s < POSITION_HOLD_S:
         return (0.0, 0.0, 0.0)
@@ -392,7 +394,7 @@ def correct_yaw(s: PaperState, p: PaperGains, mag_b: Vec3) -> None:
 def blend_fix(s: PaperState, p: PaperGains) -> None:
     """Blend velocity and position with the fix: eq. 1, 2, 7 and 8 as recursions."""
     write_vec(s.vel_n, part_way(as_vec(s.vel_n), as_vec(s.fix_vel), 1.0 - p.alpha_accel))
-    # The longitude may wrap between the two.
+    # The longitude may wrap between the two positions.
     fix_lon = s.location[1] + wrap_180(s.fix_location[1] - s.location[1])
     fix = (s.fix_location[0], fix_lon, s.fix_location[2])
     lat, lon, alt = part_way(as_vec(s.location), fix, 1.0 - p.beta_velocity)
@@ -418,13 +420,13 @@ def flags_of(s: PaperState, sound: bool) -> int:
 
 @compiled
 def blend_angle(weight: float, own: float, measured: float) -> float:
-    """Return the weighted mean of two angles, the short way round."""
+    """Return the weighted mean of two angles, along the shorter arc."""
     return float(measured + weight * wrap_pi(own - measured))
 
 
 @compiled
 def tilt(accel: Vec3) -> tuple[float, float]:
-    """Return roll and pitch of a specific force that is gravity alone."""
+    """Return roll and pitch from a specific force that is only gravity."""
     level = math.hypot(accel[1], accel[2])
     return (math.atan2(-accel[1], -accel[2]), math.atan2(accel[0], level))
 
@@ -478,7 +480,7 @@ def gps_step(state: int, gains: int, arrival_us: int, fix: int) -> None:
 
 
 class PaperEstimator(CompiledEstimator):
-    """The paper's fusion behind the interface of all estimators; it has no use for a barometer."""
+    """The paper's fusion with the common interface of estimators; it does not use a barometer."""
 
     def __init__(self, settings: PaperSettings, reference: ReferenceSettings) -> None:
         damping, w0_sq = prototype_of(settings.accel_filter, settings.chebyshev_ripple_db)

@@ -1,8 +1,8 @@
 """State and gains of a kernel as one flat numpy record, declared once as a typed class.
 
-A kernel's state is read as `s.q_ib[0]`, copied as bytes and handed between live and offline runs
+A kernel's state is read as `s.q_ib[0]`, copied as bytes and passed between live and offline runs
 without conversion. The declaration is a class that is never instantiated: mypy checks each access
-by it, while the memory behind it is a plain structured scalar whose fields numba compiles.
+with it, while the memory is a plain structured scalar whose fields numba compiles.
 """
 
 import zlib
@@ -21,11 +21,11 @@ IntArray = NDArray[np.int64]
 
 Declared = TypeVar("Declared")
 Packed = tuple[int, bytes]
-"""A mark of the layout, and the bytes of a record."""
+"""A checksum of the layout, and the bytes of a record."""
 
 
 def layout(declaration: type) -> np.dtype[np.void]:
-    """Derive the memory layout: one 8-byte aligned field per annotation of a class, in their order.
+    """Derive the memory layout: one 8-byte aligned field per annotation of a class, in order.
 
     The annotations are `float`, `int` or `Annotated[FloatArray, shape]`.
     """
@@ -42,7 +42,7 @@ def _layout(declaration: Hashable) -> np.dtype[np.void]:
             fields.append((name, "i8", ()))
         else:
             fields.append((name, "f8", get_args(hint)[1]))
-    # `np.record` lets Python read the fields as attributes too.
+    # With `np.record` Python can read the fields as attributes, too.
     return np.dtype((np.record, fields))
 
 
@@ -60,7 +60,7 @@ def filled_record(declaration: type[Declared], values: dict[str, Any]) -> Declar
 
 
 def copy_record(record: Declared) -> Declared:
-    """Copy a record, for a state that is read out or restored."""
+    """Copy a record, to return or restore a state."""
     return cast(Declared, cast(np.void, record).copy())
 
 
@@ -71,7 +71,7 @@ def pack_record(record: object) -> Packed:
 
 
 def unpack_record(declaration: type[Declared], packed: Packed) -> Declared:
-    """Read a record back; raises ValueError if it is one of another declaration, or damaged."""
+    """Read a packed record; raises ValueError if it is of another declaration or damaged."""
     wanted, (mark, data) = layout(declaration), packed
     if mark != _mark(wanted) or len(data) != wanted.itemsize:
         raise ValueError("a state of another layout")

@@ -12,12 +12,12 @@ USABLE_FIXES: Final = frozenset(
     {GpsFixType.FIX_2D, GpsFixType.FIX_3D, GpsFixType.GNSS_AND_DEAD_RECKONING}
 )
 FIELD_RENEWAL_M: Final = 20_000.0
-"""The declination changes by well under 0.5 deg over this way."""
+"""Distance of a new look-up: the declination changes by well under 0.5 deg over it."""
 NO_DECLINATION_RAD: Final = 0.29
-"""Magnetic north may be off by so much where the declination is not known: the root of the mean
-square of the declination within 60 deg of the equator."""
+"""Standard deviation of an unknown declination: its root mean square within 60 deg of the
+equator."""
 EarthLocation = tuple[float, float, MagneticField]
-"""Latitude and longitude in degrees, and the model's field there."""
+"""Latitude and longitude in degrees, and the model's field at this position."""
 
 
 class ReferenceSettings(Settings, frozen=True):
@@ -26,8 +26,8 @@ class ReferenceSettings(Settings, frozen=True):
     gps_latency_s: Annotated[
         float,
         setting(
-            "From the moment a fix is valid to its arrival at the gateway. Where manoeuvres "
-            "show another one by more than 0.07 s, eskf uses that.",
+            "Time from the validity of a fix to its arrival at the gateway. If the latency "
+            "estimated in manoeuvres differs by more than 0.07 s, eskf uses that.",
             "s",
             ge=0.0,
             le=2.0,
@@ -35,14 +35,12 @@ class ReferenceSettings(Settings, frozen=True):
     ] = 0.15
     gps_max_h_acc_m: Annotated[
         float,
-        setting(
-            "Fixes whose own horizontal accuracy is worse are not used.", "m", ge=1.0, le=1000.0
-        ),
+        setting("Maximum reported horizontal accuracy of a usable fix.", "m", ge=1.0, le=1000.0),
     ] = 30.0
     gps_relock_s: Annotated[
         float,
         setting(
-            "Rejected fixes that agree with one another are accepted after this time (eskf).",
+            "Time after which rejected fixes that agree with one another are accepted (eskf).",
             "s",
             ge=0.5,
             le=120.0,
@@ -53,12 +51,12 @@ class ReferenceSettings(Settings, frozen=True):
         setting("Magnetic declination: model (World Magnetic Model at the fix) or fixed."),
     ] = "model"
     declination_deg: Annotated[
-        float, setting("Declination where it is fixed, positive east.", "deg", ge=-180.0, le=180.0)
+        float, setting("Fixed declination, positive east.", "deg", ge=-180.0, le=180.0)
     ] = 0.0
 
 
 def is_usable(fix: GpsFix, settings: ReferenceSettings) -> bool:
-    """Return whether a fix may be fused; one of unknown accuracy (NaN) may."""
+    """Return whether a fix may be fused; an unknown accuracy (NaN) is accepted."""
     return (
         fix.fix_ok
         and fix.fix_type in USABLE_FIXES
@@ -68,7 +66,7 @@ def is_usable(fix: GpsFix, settings: ReferenceSettings) -> bool:
 
 
 class EarthField:
-    """The magnetic reference: looked up once, and again after a long way."""
+    """The magnetic reference: looked up once, and again after `FIELD_RENEWAL_M`."""
 
     def __init__(self, settings: ReferenceSettings) -> None:
         self._settings = settings
@@ -77,7 +75,7 @@ class EarthField:
     def reset(self) -> None:
         """Discard the position."""
         self.state: EarthLocation | None = None
-        """The last position that was looked up; None before the first fix. May be restored."""
+        """The position of the last look-up; None before the first fix. May be restored."""
 
     @property
     def field(self) -> MagneticField | None:
@@ -86,7 +84,7 @@ class EarthField:
 
     @property
     def declination_rad(self) -> float:
-        """Declination, positive east; NaN as long as it is not known."""
+        """Declination, positive east; NaN if unknown."""
         if self._settings.declination == "fixed":
             return math.radians(self._settings.declination_deg)
         return math.nan if self.state is None else self.state[2].declination_rad

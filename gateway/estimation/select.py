@@ -1,4 +1,4 @@
-"""Estimators: the interface of all, their settings, and the choice of one."""
+"""Estimators: their common interface, their settings, and the selection of one."""
 
 from collections.abc import Callable
 from typing import Annotated, Final, Protocol
@@ -12,10 +12,10 @@ from gateway.settings import Settings, setting
 
 
 class Estimator(Protocol):
-    """A causal fusion of samples into navigation states, one aircraft each.
+    """A causal fusion of the samples of one aircraft into navigation states.
 
-    Samples come in the order of their `time_us`; the estimator handles a sample from the past, a
-    gap, and a value that is not finite. No method raises on data.
+    Samples are passed in the order of their `time_us`; the estimator handles samples from the past,
+    gaps, and values that are not finite. No method raises on data.
     """
 
     def update_imu(self, sample: ImuSample) -> NavState:
@@ -28,10 +28,10 @@ class Estimator(Protocol):
         """Use one GPS fix at its arrival; the estimator compensates the latency."""
 
     def snapshot(self) -> bytes:
-        """Return the whole state."""
+        """Return the complete state."""
 
     def restore(self, snapshot: bytes) -> None:
-        """Continue from a snapshot to the last bit; raises ValueError for another estimator's."""
+        """Continue exactly from a snapshot; raises ValueError for that of another estimator."""
 
     def reset(self) -> None:
         """Discard everything except the settings."""
@@ -40,13 +40,13 @@ class Estimator(Protocol):
 Maker = Callable[["EstimationSettings"], Estimator]
 
 ESTIMATORS: Final[dict[str, Maker]] = {}
-"""By name, in the order of their numbers as a MAVLink parameter."""
+"""Estimators by name, in the order of their numbers as a MAVLink parameter."""
 
 
 def add_estimator(name: str, make: Maker) -> None:
-    """Let `[estimation] estimator` name one more estimator.
+    """Register an estimator for the setting `estimator` of `[estimation]`.
 
-    `make` builds one for one aircraft. Raises ValueError if there is an estimator of that name.
+    `make` builds one for one aircraft. Raises ValueError if the name is already used.
     """
     if name in ESTIMATORS:
         raise ValueError(f"there is an estimator {name!r} already")
@@ -54,7 +54,7 @@ def add_estimator(name: str, make: Maker) -> None:
 
 
 class EstimationSettings(Settings, frozen=True):
-    """Which estimator runs, and the settings of each."""
+    """Selection and settings of the estimators."""
 
     estimator: Annotated[str, setting("Estimator: eskf or paper.", choices=ESTIMATORS)] = "eskf"
     reference: ReferenceSettings = ReferenceSettings()
@@ -69,7 +69,7 @@ class EstimationSettings(Settings, frozen=True):
 
 
 def make_estimator(settings: EstimationSettings) -> Estimator:
-    """Build the estimator that the settings name, for one aircraft."""
+    """Build the estimator of the settings for one aircraft."""
     return ESTIMATORS[settings.estimator](settings)
 
 

@@ -1,13 +1,12 @@
-"""A recorded flight from both ends: the Rauch-Tung-Striebel smoother over the Kalman filter.
+"""The Rauch-Tung-Striebel smoother of a recorded flight, based on the Kalman filter.
 
-The filter runs forward as live. At each node a copy of it continues by inertial samples alone; at
-the next node the two differ by the corrections of all measurements in between, late fixes included,
-in whatever order they came. Backward, each node is corrected by the correction of the next one, in
-proportion to their covariance [1]_, so an outage is bridged from its end as well. What came before
-a reset is not corrected by what came after.
+The filter runs forward as live. At each node a copy of it continues with inertial samples only; at
+the next node the two differ by the corrections of all measurements in between, including late fixes
+in any order. Backward, each node is corrected by the correction of the next one, in proportion to
+their covariance [1]_, so an outage is also bridged from its end. Data after a reset does not
+correct states before it.
 
-Where manoeuvres contradict the GPS latency that is set, the flight is smoothed with the latency
-that they show.
+If manoeuvres contradict the set GPS latency, the flight is smoothed with the estimated latency.
 
 References
 ----------
@@ -81,15 +80,16 @@ NODE_S: Final = 0.5
 """Interval of the nodes; in between the corrections are interpolated."""
 LASTING_CORRELATION_S: Final = 0.75
 LASTING_VIBRATION: Final = 1.5
-"""Slow errors are noise to a filter that fades, but not to averages over minutes: the smoother
-counts fewer fixes as independent, and more of the vibration, which aliases to slow errors."""
+"""Factors for slow errors, which are noise to a fading filter but not to averages over minutes: the
+smoother counts fewer fixes as independent, and more of the vibration, which aliases to slow
+errors."""
 AXES_RAD: Final = 0.005
-"""Error of the sensor axes, which averages do not reduce: half a per cent."""
+"""Error of the sensor axes, half a per cent, which averages do not reduce."""
 LEAST_VAR: Final = 1e-24
 RIDGE: Final = 1e-9
 """Added to the correlation matrix so that it can be inverted."""
 BLOCK: Final = 256
-"""Nodes whose gains are computed at once."""
+"""Number of nodes whose gains are computed at once."""
 
 STATE_SIZE: Final = STATE_LAYOUT.itemsize
 MATRIX: Final = STATES * STATES
@@ -132,10 +132,10 @@ def correction(s: State, copy: State, d: FloatArray) -> None:
 
 @compiled
 def end_stretch(s: State, copy: State, F: FloatArray, predicted: FloatArray) -> None:
-    """Write the predicted covariance, and cut the transition of states that were reset.
+    """Write the predicted covariance, and clear the transition of states that were reset.
 
-    So are states that are not estimated without GPS: velocity and position, and what is only
-    considered then.
+    The same applies to states that are not estimated without GPS: velocity, position, and states
+    that are only considered then.
     """
     unaided = min(s.aided, copy.aided) == 0
     for i in range(STATES):
@@ -152,7 +152,7 @@ def end_stretch(s: State, copy: State, F: FloatArray, predicted: FloatArray) -> 
 
 @compiled
 def move_copy(s: State, p: Gains, time_us: int, row: FloatArray, used: bool, F: FloatArray) -> None:
-    """Move the copy by one IMU sample, if the filter has used it."""
+    """Advance the copy by one IMU sample, if the filter has used it."""
     if s.started == 0 or time_us <= s.time_us:
         return
     s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
@@ -167,7 +167,7 @@ def move_copy(s: State, p: Gains, time_us: int, row: FloatArray, used: bool, F: 
 
 @compiled
 def share_raised(s: State, copy: State) -> bool:
-    """Raise variances of the copy as those of the filter; return whether that was reset since."""
+    """Raise the variances of the copy like the filter's; return whether the filter was reset."""
     reset = s.started != copy.started
     for k in range(STATES):
         copy.P[k, k] += s.raised[k] - copy.raised[k]
@@ -180,7 +180,7 @@ def share_raised(s: State, copy: State) -> bool:
 def write_row(s: State, copy: State, p: Gains, reset: bool, row: FloatArray) -> None:
     """Write the prediction, and the part of its standard deviations beyond the covariance.
 
-    Where the filter was reset, its own output is written.
+    After a reset of the filter, its own output is written.
     """
     chosen = s if reset else copy
     write_output(chosen, p, row)
@@ -221,9 +221,9 @@ def run_forward(
 ) -> None:
     """Run the filter, and a copy of it from each node to the next; all arguments are addresses.
 
-    `states` are two records, `nodes` the index of the first sample of each stretch and the end.
-    Written are the output rows, and by stretch the covariance at its begin, the transition, the
-    predicted covariance and the correction; by sample whether the filter was reset.
+    `states` are two records, `nodes` the index of the first sample of each interval and the end.
+    Outputs are the rows; for each interval the covariance at its begin, the transition, the
+    predicted covariance and the correction; for each sample whether the filter was reset.
     """
     s = record_at(states, STATE_LAYOUT)
     copy = record_at(states + STATE_SIZE, STATE_LAYOUT)
@@ -266,18 +266,18 @@ def smooth(estimator: KernelEstimator, log: SampleLog) -> tuple[FloatArray, floa
     Parameters
     ----------
     estimator : KernelEstimator
-        The Kalman filter, fresh or in a state to continue from; it is not changed.
+        The Kalman filter, new or in a state to continue from; it is not changed.
     log : SampleLog
-        At each IMU sample, the barometer samples and fixes that are not later come first. Takes
-        32 kB of memory for a second of flight.
+        Before each IMU sample, the barometer samples and fixes that are not later are used. A
+        second of flight takes 32 kB of memory.
 
     Returns
     -------
     states : ndarray, shape (n, NAV_COLUMNS)
-        One row per IMU sample. Rates are the filter's; attitude and heading are valid where their
-        smoothed standard deviation allows it.
+        One row per IMU sample. Rates are those of the filter; attitude and heading are valid if
+        their smoothed standard deviation is small enough.
     latency_s : float
-        The GPS latency that the flight was smoothed with.
+        The GPS latency with which the flight was smoothed.
     """
     gains: Gains = copy_record(estimator.gains)
     gains.gps_latency_s = latency_s = estimator.latency_of(log)
@@ -317,9 +317,9 @@ def _nodes(time_us: IntArray) -> IntArray:
 def _backward(
     P: FloatArray, F: FloatArray, predicted: FloatArray, d: FloatArray, last_P: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Run the recursion from the end, whose covariance is `last_P`.
+    """Run the recursion from the end, where the covariance is `last_P`.
 
-    Returns the corrections at the begin of each stretch and of the predictions at its end, shape
+    Returns the corrections at the begin of each interval and of the predictions at its end, shape
     (m + 1, STATES) and (m, STATES), and the smoothed variances, (m + 1, STATES).
     """
     count = len(d)
@@ -340,7 +340,7 @@ def _backward(
 
 
 def _gains(P: FloatArray, F: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Compute `P F^T predicted^-1` for many nodes, on correlations, which are of one size."""
+    """Compute `P F^T predicted^-1` for many nodes, from correlations, which have one magnitude."""
     scale = np.sqrt(np.maximum(np.diagonal(predicted, axis1=1, axis2=2), LEAST_VAR))
     norm = predicted / (scale[:, :, None] * scale[:, None, :]) + RIDGE * np.eye(STATES)
     gains = np.linalg.solve(norm, (F @ P) / scale[:, :, None]).transpose(0, 2, 1)
@@ -360,18 +360,18 @@ def _correct(
     stretch = np.repeat(np.arange(len(nodes) - 1), np.diff(nodes))
     if len(stretch) == 0:
         return
-    # A stretch begins at the last sample of the one before.
+    # An interval begins at the last sample of the previous one.
     start_us = time_us[np.maximum(nodes[:-1] - 1, 0)]
     length = np.maximum(time_us[nodes[1:] - 1] - start_us, 1)
     share = ((time_us - start_us[stretch]) / length[stretch])[:, None]
-    # A reset cannot be interpolated: the filter's own output is corrected as at the next node.
+    # A reset cannot be interpolated: the filter's output gets the correction of the next node.
     cut = np.add.reduceat(reset, nodes[:-1])[stretch] > 0
     share[cut, 0] = reset[cut]
     following = np.where(reset[:, None], begins[stretch + 1], ends[stretch])
     off = (1.0 - share) * begins[stretch] + share * following
     quat = slice(NAV_QUAT, NAV_QUAT + 4)
     out[:, quat] = _rotated(off[:, ATT : ATT + 3], out[:, quat])
-    # Without GPS, position and velocity are those of the newest fix, and no states.
+    # Without GPS, position and velocity are those of the newest fix, and not states.
     aided = np.isfinite(out[:, NAV_POS_STD])
     out[aided, NAV_VEL : NAV_VEL + 3] += off[aided, VEL : VEL + 3]
     if aided.any():
@@ -391,7 +391,7 @@ def _correct(
         std[:] = np.sqrt(std**2 + np.maximum(variance[:, first : first + 3], 0.0))
     attitude_std = out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3]
     flags = out[:, NAV_FLAGS].astype(np.int64)
-    # NaN, before the filter has begun, compares false.
+    # NaN, before the start of the filter, compares false.
     flags[~(attitude_std[:, :2].max(axis=1) < LEVEL_VALID_RAD)] &= ~FLAG.ATTITUDE_VALID
     flags[~(attitude_std[:, 2] < HEADING_VALID_RAD)] &= ~FLAG.HEADING_VALID
     out[:, NAV_FLAGS] = flags

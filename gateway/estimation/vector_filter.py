@@ -1,6 +1,6 @@
 """The paper's filters on vectors: second-order low-pass and first-order high-pass.
 
-A filter starts as if its first sample had been constant for ever, so it has no transient.
+A filter starts as if all earlier samples were equal to the first one, so it has no transient.
 """
 
 import math
@@ -32,7 +32,8 @@ def discretise(damping: float, w0_sq: float, cutoff_hz: float, rate_hz: float) -
     """Apply the bilinear transform to a prototype: eq. 17 and 18 for Butterworth.
 
     Deviation: it is scaled to unit gain at 0 Hz, because the even order of Chebyshev would
-    otherwise shrink gravity by the ripple. A cutoff beyond half the sample rate passes all.
+    otherwise reduce gravity by the ripple. A cutoff beyond half the sample rate disables the
+    filter.
     """
     if cutoff_hz >= 0.5 * rate_hz:
         return PASS_THROUGH
@@ -45,7 +46,7 @@ def discretise(damping: float, w0_sq: float, cutoff_hz: float, rate_hz: float) -
 
 @compiled
 def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
-    """Design a first-order high-pass; a cutoff of 0 Hz passes all."""
+    """Design a first-order high-pass; a cutoff of 0 Hz disables it."""
     if not 1e-6 < cutoff_hz < 0.5 * rate_hz:
         return PASS_THROUGH
     k = math.tan(math.pi * cutoff_hz / rate_hz)
@@ -57,7 +58,7 @@ def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
 def filter_step(c: Coefficients, z: Any, x: Vec3) -> Vec3:
     """Filter one finite vector in transposed direct form II.
 
-    `z` are two delays for each axis, which are changed; NaN before the first sample.
+    `z` are two delays for each axis, which are updated; NaN before the first sample.
     """
     if c == PASS_THROUGH:
         return x

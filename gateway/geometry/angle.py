@@ -1,4 +1,4 @@
-"""Angles brought to the shortest way round, one at a time in kernels or whole columns."""
+"""Wrapping of angles, single ones in kernels or whole columns."""
 
 import math
 from typing import TypeVar
@@ -13,11 +13,11 @@ Angle = TypeVar("Angle", float, NDArray[np.float64])
 
 @compiled
 def wrap_pi(angle_rad: Angle) -> Angle:
-    """Bring an angle, or an array of them, into [-pi, pi)."""
+    """Wrap an angle, or an array of them, to [-pi, pi)."""
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
 
 
 @compiled
 def wrap_180(angle_deg: Angle) -> Angle:
-    """Bring an angle, or an array of them, into [-180, 180): a longitude, or a way between two."""
+    """Wrap an angle, or an array of them, to [-180, 180): a longitude, or a difference of two."""
     return (angle_deg + 180.0) % 360.0 - 180.0

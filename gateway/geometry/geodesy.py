@@ -1,7 +1,7 @@
 """The WGS 84 ellipsoid near one position: metres north and east against degrees.
 
 `pymap3d` does the exact conversions in tools and analysis; the two radii here are for the
-per-sample kernels, which only ever step a few metres from a known latitude.
+per-sample kernels, which only move some metres from a known latitude.
 """
 
 import math
@@ -34,7 +34,8 @@ def offset_deg(
 ) -> tuple[float, float]:
     """Return latitude and longitude after a step north and east.
 
-    It is exact to first order, so for steps well below a kilometre. Longitude is in [-180, 180).
+    It is a first-order approximation, for steps well below a kilometre. Longitude is in
+    [-180, 180).
     """
     meridian, parallel = radii_m(lat_deg, alt_m)
     lat = lat_deg + math.degrees(north_m / meridian)
@@ -46,7 +47,7 @@ def offset_deg(
 def displacement_m(
     from_lat_deg: float, from_lon_deg: float, to_lat_deg: float, to_lon_deg: float, alt_m: float
 ) -> tuple[float, float]:
-    """Measure a short way as metres north and east, with the radii at its start."""
+    """Return a short distance as metres north and east, with the radii at its start."""
     meridian, parallel = radii_m(from_lat_deg, alt_m)
     delta_lon = wrap_180(to_lon_deg - from_lon_deg)
     return (math.radians(to_lat_deg - from_lat_deg) * meridian, math.radians(delta_lon) * parallel)

@@ -26,7 +26,7 @@ def multiply(p: Quat, q: Quat) -> Quat:
     """Compose two rotations: the Hamilton product `p * q`.
 
     It is the rotation `q` followed by `p`. Eq. 14; deviation: the printed second row has `-c1*d2`
-    and the last row `b1*b2` in place of `b1*c2`, which is no Hamilton product.
+    and the last row `b1*b2` instead of `b1*c2`, which is not a Hamilton product.
     """
     pw, px, py, pz = p
     qw, qx, qy, qz = q
@@ -61,13 +61,13 @@ def scaled(v: Vec3, factor: float) -> Vec3:
 
 @compiled
 def is_below(v: Vec3, limit: float) -> bool:
-    """Return whether the size of every component is below a limit; false if one is not finite."""
+    """Return whether every component is below a limit in magnitude; False if one is not finite."""
     return bool(abs(v[0]) < limit and abs(v[1]) < limit and abs(v[2]) < limit)
 
 
 @compiled
 def part_way(a: Vec3, b: Vec3, share: float) -> Vec3:
-    """Return the vector a share of the way from one to another; exact at 0 and 1."""
+    """Interpolate linearly between two vectors; exact at the shares 0 and 1."""
     kept = 1.0 - share
     return (kept * a[0] + share * b[0], kept * a[1] + share * b[1], kept * a[2] + share * b[2])
 
@@ -80,7 +80,7 @@ def norm_sq(v: Vec3) -> float:
 
 @compiled
 def rotate(q: Quat, v: Vec3) -> Vec3:
-    """Take a vector from the body to the navigation frame by `q_nb`: eq. 13, `q * v * conj(q)`."""
+    """Rotate a vector from the body to the navigation frame: eq. 13, `q * v * conj(q)`."""
     w, x, y, z = q
     tx = 2.0 * (y * v[2] - z * v[1])
     ty = 2.0 * (z * v[0] - x * v[2])
@@ -94,7 +94,7 @@ def rotate(q: Quat, v: Vec3) -> Vec3:
 
 @compiled
 def rotate_inverse(q: Quat, v: Vec3) -> Vec3:
-    """Take a vector from the navigation to the body frame."""
+    """Rotate a vector from the navigation to the body frame."""
     return rotate((q[0], -q[1], -q[2], -q[3]), v)
 
 
@@ -106,10 +106,10 @@ def body_axes(q: Quat) -> tuple[Vec3, Vec3, Vec3]:
 
 @compiled
 def from_rotation_vector(v: Vec3) -> Quat:
-    """Turn a rotation vector, axis times angle in rad, into a unit quaternion: eq. 9 to 12."""
+    """Convert a rotation vector, axis times angle in rad, to a unit quaternion: eq. 9 to 12."""
     angle_sq = norm_sq(v)
     if angle_sq < 1e-12:
-        # Series of sin(a/2)/a: the closed form divides by zero here.
+        # Series of sin(a/2)/a, because the closed form would divide by zero.
         scale = 0.5 - angle_sq / 48.0
         return normalise((1.0 - angle_sq / 8.0, v[0] * scale, v[1] * scale, v[2] * scale))
     angle = math.sqrt(angle_sq)
@@ -133,14 +133,14 @@ def from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quat:
 
 @compiled
 def to_euler(q: Quat) -> Vec3:
-    """Split `q_nb` into roll and yaw in (-pi, pi] and pitch in [-pi/2, pi/2], in that order.
+    """Return roll, pitch and yaw of `q_nb`: roll and yaw in (-pi, pi], pitch in [-pi/2, pi/2].
 
     Eq. 16; deviations: the printed pitch repeats the roll's numerator, and the first denominator
-    has `S4` for `S3`; the angles are named as the field names them (roll phi, yaw psi).
+    has `S4` for `S3`; the angles have their usual names (roll phi, yaw psi).
     """
     w, x, y, z = q
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    # In this order NaN stays NaN.
+    # This order of the arguments keeps NaN.
     pitch = math.asin(max(min(2.0 * (w * y - z * x), 1.0), -1.0))
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return (roll, pitch, yaw)

@@ -1,17 +1,17 @@
 """One compiled step that forwards the frames of a read: check, look up, send.
 
-Theory of operation. The step receives datagrams into a buffer (or finds the chunk of a stream
-there), walks over the frames, and gathers those whose route is known into a run. A run ends where
-the next frame goes to other clients; it is sent to each of its clients by one system call. The
-first bytes that need Python end the walk: Python handles them, moves on, and calls the step again,
-so that all frames stay in their order. They are:
+Theory of operation. The step receives datagrams into a buffer (or uses a chunk of a stream in it),
+processes the frames in order, and gathers those with a known route into a run. A run ends where the
+next frame goes to other clients; it is sent to each of its clients by one system call. The step
+ends at the first bytes that need Python: Python handles them, advances, and calls the step again,
+so that all frames stay in order. These bytes are:
 
 | bytes                                                               | status      |
 | ------------------------------------------------------------------- | ----------- |
-| no frame of MAVLink 2 with a route in the table and a good checksum | `HAND_OVER` |
+| not a MAVLink 2 frame with a route in the table and a good checksum | `HAND_OVER` |
 | a run that is recorded, has other clients, or was not sent to all   | `RUN_SENT`  |
 | an error of the socket                                              | `ERROR`     |
-| datagrams after one of these, or beyond the most bytes of a read    | `UNREAD`    |
+| datagrams after one of these, or beyond the byte limit of a read    | `UNREAD`    |
 
 Counters are kept in the rows of the routes. All memory belongs to `forwarding.Forwarding`.
 """
@@ -38,36 +38,37 @@ from gateway.compiled.system_calls import receive_many
 from gateway.wire.frame_scan import SEQUENCE, frame_holds, frame_key, frame_size
 
 MAX_DATAGRAM: Final = 4096
-"""Programs that join frames fill a packet of the network, at most some 2000 bytes; longer datagrams
-are cut off."""
+"""Maximum size of a datagram, longer ones are truncated: programs that join frames fill a network
+packet, at most some 2000 bytes."""
 READS: Final = ROOM
-"""Most datagrams of a read, and most frames of a run."""
+"""Maximum datagrams of a read, and maximum frames of a run."""
 HAND_OVER, RUN_SENT, ERROR, UNREAD = 1, 2, 4, 8
 
 STATUS, NOW_US, MOST, IS_RECORDED, COUNT, AT, OFFSET, TAKEN, READ, ERROR_NUMBER = range(10)
-"""Words of the state of a step: its result and the time; most bytes of a read, and whether Python
-takes each run; the number of datagrams, the present one and the offset in it; bytes walked over and
-read; the number of an error."""
+"""Words of the state of a step: its result and the time; maximum bytes of a read, and whether
+Python records each run; the number of datagrams, the present one and the offset in it; bytes
+processed and read; the number of an error."""
 FRAME, TARGETS, FAILED, BUFFER_AT, HEADERS_AT, OUTBOX_AT, TABLE_AT, FAILED_AT = range(10, 18)
-"""Size of the frame that is handed over, if it is one; the address of the targets of the run, and
-the number of those that failed; addresses of the other memory."""
+"""Size of the frame that is passed to Python, if it is one; the address of the targets of the run,
+and the number of failed ones; addresses of the other memory."""
 WORDS: Final = 18
 CLIENT_ID, INPUT, OUTPUT, WAY, IS_PLAIN, LARGEST = range(6)
-"""Words of a client: its id; the file to receive from and to send to, or -1, and the way to send;
-whether its frames may be forwarded without Python; the size of its largest recent datagram."""
+"""Words of a client: its id; the files to receive from and to send to, or -1, and the mode of
+sending; whether its frames may be forwarded without Python; the size of its largest recent
+datagram."""
 CLIENT_WORDS: Final = 6
 SEED, TARGETS_OF, NUMBERS_AT, FRAMES, SIZE, HEARD_US = range(6)
 """Words of a route: seed of the checksum, addresses of its targets and of the times by sequence
-number; frames, bytes, and the time of the last one."""
+number; numbers of frames and bytes, and the time of the last frame."""
 ROUTE_WORDS: Final = 6
 TARGET_COUNT, HAS_OTHERS, FIRST_TARGET = range(3)
-"""Words of targets: how many follow, whether Python serves others, address of the first client."""
+"""Words of targets: number of clients, whether Python serves others, address of the first."""
 KEY_CLIENT, KEY, ROUTE_AT = range(3)
 """Words of an entry of the table."""
 ENTRIES: Final = 8192
 FAILED_WORDS: Final = 4
-"""Index of a client among the targets, frames that it was sent, number of the error, and bytes of
-the next frame that were sent."""
+"""Words of a failed client: index among the targets, number of frames sent, number of the error,
+and bytes of the next frame that were sent."""
 MAX_FAILED: Final = 4096
 
 _INT: Final = np.dtype(np.int64)
@@ -77,7 +78,7 @@ _LEAST_DATAGRAM: Final = 32
 
 @EntryPoint
 def forward(work_at: int, client_at: int, reads: int) -> None:
-    """Receive, if wanted, and forward up to the first bytes that need Python."""
+    """Receive if `reads`, and forward up to the first bytes that need Python."""
     work = array_at(work_at, (WORDS,), _INT)
     client = array_at(client_at, (CLIENT_WORDS,), _INT)
     headers = array_at(work[HEADERS_AT], (READS, HEADER_WORDS), _INT)
@@ -103,7 +104,7 @@ def _receive(work: Any, client: Any, headers: Any) -> None:
             work[STATUS], work[ERROR_NUMBER] = ERROR, -count
         return
     work[COUNT] = count
-    # It falls slowly, so that a mixture of sizes is not underestimated.
+    # The size decreases slowly, so that a mixture of sizes is not underestimated.
     largest = max(_LEAST_DATAGRAM, client[LARGEST] - client[LARGEST] // 4)
     for k in range(count):
         work[READ] += headers[k, LENGTH]
@@ -144,7 +145,7 @@ def _walk(work: Any, client: Any, headers: Any, outbox: Any) -> None:
 
 @compiled
 def entry_of(client_id: int, key: int) -> int:
-    """Return where the search for a route in the table begins."""
+    """Return the index in the table at which the search for a route begins."""
     return (key ^ key >> 13 ^ key >> 24 ^ client_id * 61) % ENTRIES
 
 
@@ -176,7 +177,7 @@ def _gather(work: Any, outbox: Any, route: Any, data: Any, begin: int, size: int
 
 @compiled
 def _send_run(work: Any, outbox: Any) -> None:
-    """Send the run to its clients, and discard it unless Python has to do more for it."""
+    """Send the run to its clients, and discard it unless Python must process it further."""
     if outbox[PARTS] == 0:
         return
     count = array_at(work[TARGETS], (1,), _INT)[TARGET_COUNT]

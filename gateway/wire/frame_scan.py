@@ -22,7 +22,7 @@ def crc_step(crc: int, byte: int) -> int:
 
 @compiled
 def crc_holds(data: Any, begin: int, end: int, seed: int) -> bool:
-    """Return whether two bytes at `end` are the checksum of those from `begin` and of a seed."""
+    """Return whether two bytes at `end` are the checksum of the bytes from `begin` and a seed."""
     crc = 0xFFFF
     for i in range(begin, end):
         crc = crc_step(crc, int(data[i]))
@@ -50,5 +50,5 @@ def frame_key(data: Any, begin: int) -> int:
 
 @compiled
 def frame_holds(data: Any, begin: int, seed: int) -> bool:
-    """Return whether the checksum of a complete frame of MAVLink 2 holds."""
+    """Return whether the checksum of a complete frame of MAVLink 2 is correct."""
     return crc_holds(data, begin + 1, begin + int(data[begin + 1]) + _OVERHEAD - 2, seed)

@@ -1,1 +1,1 @@
-"""The error-state Kalman filter: the one estimator that fuses every sensor."""
+"""The error-state Kalman filter, which fuses all sensors."""

@@ -1,10 +1,10 @@
 """Attitude from motion: the accelerometer against GPS velocities.
 
-The gyroscope keeps a frame of its own, in which the specific force is integrated from fix to fix;
-the GPS velocity gives the same change in NED, gravity added. The rotation between the two frames
-that fits all pairs of the last seconds is Wahba's problem, solved by Davenport's q-method [1]_. It
-needs no initial attitude, so it finds the first one in flight, a heading without a compass, and an
-attitude that was lost.
+The integrated gyroscope defines a frame, in which the specific force is integrated from fix to fix;
+the GPS velocity gives the same change in NED after gravity is subtracted. The rotation between the
+two frames that fits all pairs of the last seconds is Wahba's problem, solved by Davenport's
+q-method [1]_. It needs no initial attitude, so it determines the first one in flight, a heading
+without a compass, and an attitude that was lost.
 
 All sums are one weighted matrix of second moments of `(r, f, 1, t)`: the reference acceleration in
 NED, the measured one in the gyroscope frame, and the time before the newest pair.
@@ -35,31 +35,32 @@ from gateway.records import Quat, Vec3
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
 PAIR_S: Final = 0.45
-"""Fixes closer together are joined: the difference of their velocities is mostly noise."""
+"""Least interval of a pair: the difference of closer velocities is mostly noise."""
 MAX_PAIR_S: Final = 2.5
-"""Fixes further apart are not paired."""
+"""Maximum interval of a pair."""
 MEMORY_S: Final = 20.0
-"""Older pairs fade, because the gyroscope frame drifts."""
+"""Time constant by which pairs fade, because the gyroscope frame drifts."""
 NOISE_MPS: Final = 0.2
 """Noise of a GPS velocity in a pair."""
 TRACK_NOISE_MPS: Final = 0.6
-"""The same of a velocity derived from two positions."""
+"""The same for a velocity derived from two positions."""
 MISMATCH_SIGMA: Final = 4.0
-"""Standard deviations beyond which a difference is no chance."""
+"""Standard deviations beyond which a difference is significant."""
 MISMATCH_MPS2: Final = 4.0
-"""Difference of a pair that also contradicts the other pairs: a turn by 25 deg causes it."""
+"""Least difference of a pair that contradicts the other pairs: that of a turn by 25 deg."""
 DRIFT_RADPS: Final = 0.3 * RAD_PER_DEG
-"""Drift of the gyroscope frame by an unknown bias."""
+"""Drift of the gyroscope frame due to an unknown bias."""
 SQUARINGS: Final = 14
-"""The matrix to the power 2**14 is its leading eigenvector to within double precision."""
+"""Number of squarings: the matrix to the power 2**14 gives its leading eigenvector in double
+precision."""
 UNKNOWN_RAD: Final = 3.0
 """Standard deviation of an unknown angle."""
 ANY_HEADING_VAR: Final = 2.0
 """Mean squared chord of a uniformly distributed heading, rad2."""
 ENOUGH_PAIRS: Final = MEMORY_S / PAIR_S
-"""Pairs of the whole memory."""
+"""Number of pairs in the whole memory."""
 FITTED_PARAMETERS: Final = 3.0
-"""Pairs used up by the constant, the ramp and the noise of the heading fit."""
+"""Degrees of freedom of the constant, the ramp and the noise of the heading fit."""
 
 R: Final = 0
 F: Final = 3
@@ -98,7 +99,7 @@ def add_velocity(
     north, east = (vel[0] - v[0]) / dt, (vel[1] - v[1]) / dt
     force = ((force_i[0] - f[0]) / dt, (force_i[1] - f[1]) / dt, (force_i[2] - f[2]) / dt)
     late_sq = p.gps_jitter_sq * (north * north + east * east)
-    # Over one second the noise that successive differences share averages out.
+    # Over one second, the noise that successive differences share averages out.
     weight = dt / (2.0 * (noise_mps * noise_mps + late_sq))
     reference = (north, east, (vel[2] - v[2]) / dt - STANDARD_GRAVITY_MPS2)
     excess = contradiction(s, reference, force, weight)
@@ -115,7 +116,7 @@ def add_velocity(
 def contradiction(s: State, reference: Vec3, force: Vec3, weight: float) -> float:
     """Return the noise that a pair would add if it contradicts the level of the earlier ones, or 0.
 
-    Either GPS is wrong or the gyroscope has missed a turn, as in a blow.
+    Then either GPS is wrong or the gyroscope has missed a turn, as in a shock.
     """
     if s.pairs < FITTED_PARAMETERS + 1.0:
         return 0.0
@@ -147,7 +148,7 @@ def add_pair(s: State, reference: Vec3, force: Vec3, weight: float, dt: float) -
 
 @compiled
 def set_davenport(s: State) -> float:
-    """Write Davenport's matrix, shifted by the returned number so that it is not negative."""
+    """Write Davenport's matrix, shifted by the returned number to be positive semidefinite."""
     M, K = s.moments, s.work[0]
     shift = 0.0
     for i in range(6):
@@ -167,8 +168,8 @@ def set_davenport(s: State) -> float:
 def solve_rotation(s: State) -> tuple[Quat, float]:
     """Return the rotation from the gyroscope frame to NED, and its misfit.
 
-    The misfit is the mean squared residual in units of the assumed noise, 1 or more. The heading is
-    arbitrary where nothing accelerates.
+    The misfit is the mean squared residual in units of the assumed noise, 1 or more. Without
+    acceleration the heading is arbitrary.
     """
     set_davenport(s)
     for n in range(SQUARINGS):
@@ -191,13 +192,13 @@ def solve_rotation(s: State) -> tuple[Quat, float]:
     for i in range(4):
         for j in range(4):
             fit += q[i] * K[i, j] * q[j]
-    # Three numbers a pair, each half a square; `fit` contains the shift once.
+    # A pair has three numbers, each with half a square; `fit` contains the shift once.
     return q, max(1.0, (2.0 * shift - fit) / (1.5 * max(s.pairs, 1.0)))
 
 
 @compiled
 def level_std(s: State, misfit: float) -> float:
-    """Return the standard deviation of the level that the pairs give, rad."""
+    """Return the standard deviation of the level from the pairs, rad."""
     M = s.moments
     total = M[0, 0] + M[1, 1] + M[2, 2]
     a, b, c = total - M[0, 0], total - M[1, 1], total - M[2, 2]
@@ -205,7 +206,7 @@ def level_std(s: State, misfit: float) -> float:
     level = a * b - d * d
     if level < 1.0:
         return UNKNOWN_RAD
-    # A constant acceleration of unknown heading may be tilt: the heading has a prior.
+    # A constant acceleration of unknown heading may be tilt, so the heading has a prior.
     known = c + 1.0 / ANY_HEADING_VAR
     determinant = known * level - a * f * f - b * e * e + 2.0 * d * e * f
     variance = ((a + b) * known - e * e - f * f) / determinant * misfit
@@ -222,12 +223,13 @@ def drift_variance(s: State) -> float:
 def heading_of_pairs(s: State, q_ni: Quat, bias_radps: float) -> tuple[float, float, float]:
     """Return the heading of the pairs relative to a solution's, its standard deviation, and noise.
 
-    With the level known, GPS and accelerometer give the same horizontal accelerations, turned by
-    the heading: `r = turn(f - c - d t) + noise`. The constant `c` is the level's error, the ramp
-    `d t` that of the gyroscope bias, with its standard deviation `bias_radps`. Without both, the
-    sum of the products of `r` and `f` is a complex number: its angle is the heading, its size over
-    the noise the concentration of a von Mises distribution [2]_. The noise is the variance of what
-    the turn leaves, in units of the assumed one, 1 or more; 0 while there are too few pairs.
+    If the level is known, GPS and accelerometer give the same horizontal accelerations, rotated by
+    the heading: `r = turn(f - c - d t) + noise`. The constant `c` is due to the error of the level,
+    the ramp `d t` due to the gyroscope bias, whose standard deviation is `bias_radps`. After both
+    are removed, the sum of the products of `r` and `f` is a complex number: its angle is the
+    heading, its magnitude over the noise the concentration of a von Mises distribution [2]_. The
+    noise is the variance of the residual, in units of the assumed one, 1 or more; 0 with too few
+    pairs.
     """
     if s.pairs < FITTED_PARAMETERS + 1.0:
         return 0.0, UNKNOWN_RAD, 0.0
@@ -295,6 +297,6 @@ def level_difference(q_a: Quat, q_b: Quat) -> float:
 
 @compiled
 def heading_difference(q_a: Quat, q_b: Quat) -> float:
-    """Return the turn about down from the second attitude to the first, rad."""
+    """Return the rotation about down from the second attitude to the first, rad."""
     turn = multiply(q_a, (q_b[0], -q_b[1], -q_b[2], -q_b[3]))
     return wrap_pi(2.0 * math.atan2(turn[3], turn[0]))

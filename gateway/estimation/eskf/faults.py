@@ -4,11 +4,12 @@
 | --- | --- | --- |
 | not finite, out of range, all zero | the value | replaced |
 | one sensor repeats its values while the other changes | `STUCK_S` | replaced |
-| a single sample far from those around it | six times the usual change | replaced |
+| a single outlier | six times the usual change | replaced |
 | both sensors repeat their values | five times the usual time | no sample: a gap |
 | a gap | time stamps | bridged from both of its ends, or the attitude is lost |
 
-A missing rate or force is the last sound one for `HOLD_S`, then no turn, and gravity alone.
+A missing rate or force is replaced by the last valid one for `HOLD_S`, then by no rotation and
+gravity alone.
 """
 
 import math
@@ -40,41 +41,41 @@ from gateway.units import STANDARD_GRAVITY_MPS2
 
 GYRO_LIMIT_RADPS: Final = 40.0
 ACCEL_LIMIT_MPS2: Final = 400.0
-"""Beyond the largest ranges of such sensors: 2000 deg/s and 32 g."""
+"""Limits beyond the largest ranges of such sensors, which are 2000 deg/s and 32 g."""
 START_SHARES: Final = (0.5, 2.0)
-"""The first force must be within these multiples of gravity to give a level."""
+"""Limits of the first force, in multiples of gravity, for an initial level."""
 STUCK_S: Final = 1.0
 HOLD_S: Final = 0.2
 USUAL_S: Final = 0.5
-"""Time constant of the usual change from sample to sample."""
+"""Time constant of the average change from sample to sample."""
 TIMES_USUAL: Final = 6.0
 LARGEST_CHANGE: Final = ((2.0, 200.0), (10.0, 1000.0))
-"""Step and slope of an agile multirotor or a blow: rad/s and rad/s2, m/s2 and m/s3."""
+"""Step and slope of an agile multirotor or a shock: rad/s and rad/s2, m/s2 and m/s3."""
 TIMES_USUAL_REPEAT: Final = 5.0
 USUAL_REPEAT_S: Final = 5.0
-"""Time constant of the usual time that both sensors repeat a sample."""
+"""Time constant of the average time for which both sensors repeat a sample."""
 UNKNOWN_REPEAT_S: Final = 60.0
-"""Its initial value: a log may hold each sample until the next."""
+"""Initial value of that average: a log may repeat each sample until the next."""
 
 GAP_S: Final = 0.5
 GAP_STEPS: Final = 2.5
-"""A longer interval, also in usual intervals, is a gap; below that samples are interpolated."""
+"""Interval, in s and in usual intervals, above which it is a gap; below, it is interpolated."""
 LOST_STEPS: Final = 1.5
-"""Samples further apart than this multiple of the usual interval had others in between."""
+"""Multiple of the usual interval above which samples in between were lost."""
 SLOWEST_STEP_S: Final = 2.0
-"""Longest interval that a first sample may show to be usual: half that of the slowest logs."""
+"""Maximum first estimate of the usual interval: half that of the slowest logs."""
 STEP_SHARE: Final = 0.01
-"""Share of the newest interval in the usual one: an average over a hundred samples."""
+"""Weight of the newest interval in the usual one: an average over a hundred samples."""
 LONGEST_GAP_S: Final = 60.0
 """Capped: a longer gap adds no information and would destabilise the covariance."""
 RATE_TAU_S: Final = 0.3
-"""Correlation time of the angular rate, between a hand's and that of a fixed wing."""
+"""Correlation time of the angular rate, between that of a hand and of a fixed-wing aircraft."""
 TURNING_S: Final = 5.0
 """Time constant of the mean square of the rate."""
 UNSEEN_MPS2: Final = 3.0
 """Standard deviation of the acceleration in a gap."""
 WANDER_RADPS: Final = 0.05
-"""Change of the rate in a gap."""
+"""Standard deviation of the change of the mean rate in a gap."""
 
 
 @compiled
@@ -96,7 +97,7 @@ def change_of(v: Vec3, values: FloatArray, first: int) -> float:
 def is_hanging(s: State, gyro: Vec3, accel: Vec3, moving: bool, dt: float) -> bool:
     """Return whether both sensors have repeated a sample for too long.
 
-    A live sensor does not repeat six numbers, but a log may hold samples, and an input without
+    A live sensor does not repeat six numbers, but a log may repeat samples, and an input without
     noise is constant at rest.
     """
     most_s = max(HOLD_S, TIMES_USUAL_REPEAT * s.usual_repeat_s)
@@ -115,15 +116,15 @@ def is_hanging(s: State, gyro: Vec3, accel: Vec3, moving: bool, dt: float) -> bo
 def check_sensor(s: State, k: int, v: Vec3, limit: float, other_same: bool, dt: float) -> int:
     """Check the gyroscope (`k` = 0) or the accelerometer (1).
 
-    Returns 0 for a sound value, 1 for a single odd one, and 2 for a fault.
+    Returns 0 for a valid value, 1 for a single outlier, and 2 for a fault.
     """
     first = 3 * k
     from_last, from_held = change_of(v, s.imu_last, first), change_of(v, s.imu_held, first)
     same = from_last == 0.0
-    # A gap between two equal samples is no time for which the sensor repeated them.
+    # A gap between two equal samples does not count as time of repetition.
     repeated_s = min(dt, gap_limit_s(s))
     s.stuck_s[k] = s.stuck_s[k] + repeated_s if same and not other_same else 0.0
-    # A change that is real is there in the next sample too.
+    # A real change also appears in the next sample.
     change = min(from_last, from_held)
     most = LARGEST_CHANGE[k][0] + LARGEST_CHANGE[k][1] * dt + TIMES_USUAL * s.usual_change[k]
     if math.isfinite(change):
@@ -144,7 +145,7 @@ def check_sensors(
     accel_fault = check_sensor(s, 1, accel, ACCEL_LIMIT_MPS2, same_gyro, dt)
     s.fault = 1 if gyro_fault == 2 or accel_fault == 2 or clipped != 0.0 else 0
     s.sound_s = s.sound_s + dt if s.fault == 0 else 0.0
-    # A bus error changes both sensors, as a reset to zeros; a blow changes the force alone.
+    # A bus error changes both sensors, like a reset to zeros; a shock changes the force alone.
     odd = gyro_fault == 1 or norm_sq(gyro) + norm_sq(accel) == 0.0
     good_gyro, good_accel = gyro_fault == 0 and not odd, accel_fault == 0 and not odd
     for k in range(3):
@@ -160,13 +161,13 @@ def check_sensors(
 
 @compiled
 def substitute_gyro(s: State) -> Vec3:
-    """Return the rate for a sample without a sound one."""
+    """Return the rate for a sample without a valid one."""
     return as_vec(s.imu_held[0:3]) if s.missing_s[0] < HOLD_S else as_vec(s.gyro_bias_b)
 
 
 @compiled
 def substitute_accel(s: State) -> Vec3:
-    """Return the force for a sample without a sound one."""
+    """Return the force for a sample without a valid one."""
     if s.missing_s[1] < HOLD_S:
         return as_vec(s.imu_held[3:6])
     gravity = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, STANDARD_GRAVITY_MPS2))
@@ -175,23 +176,23 @@ def substitute_accel(s: State) -> Vec3:
 
 @compiled
 def gap_limit_s(s: State) -> float:
-    """Return the longest interval that is no gap."""
+    """Return the longest interval that is not a gap."""
     return max(GAP_S, GAP_STEPS * s.usual_step_s)
 
 
 @compiled
 def end_share_s(unseen_s: float) -> float:
-    """Return the time for which either end of a gap counts: `tau tanh(T / 2 tau)`."""
+    """Return the effective time of either end of a gap: `tau tanh(T / 2 tau)`."""
     return RATE_TAU_S * math.tanh(0.5 * unseen_s / RATE_TAU_S)
 
 
 @compiled
 def unseen_turn_var(s: State, before: Vec3, after: Vec3, steady: Vec3, unseen_s: float) -> float:
-    """Return the variance of an angle that was not measured between two samples, rad2.
+    """Return the variance of the unmeasured rotation between two samples, rad2.
 
     The rate is an Ornstein-Uhlenbeck process about a steady turn, with the variance of the recent
-    motion: its integral given both ends has the variance `2 tau (T - 2 tau tanh(T / 2 tau))` times
-    that.
+    motion: its integral, given both ends, has the variance of the rate times
+    `2 tau (T - 2 tau tanh(T / 2 tau))`.
     """
     ends_sq = 0.0
     for k in range(3):
@@ -202,7 +203,7 @@ def unseen_turn_var(s: State, before: Vec3, after: Vec3, steady: Vec3, unseen_s:
 
 @compiled
 def follow_step(s: State, gyro: Vec3, dt: float) -> None:
-    """Follow the usual interval, and the mean square of the rate."""
+    """Update the usual interval, and the mean square of the rate."""
     if s.usual_step_s == 0.0:
         s.usual_step_s = min(dt, SLOWEST_STEP_S)
     s.usual_step_s += STEP_SHARE * (min(dt, 2.0 * s.usual_step_s) - s.usual_step_s)
@@ -215,7 +216,8 @@ def interpolate(
 ) -> tuple[Vec3, Vec3]:
     """Return the mean rate and force of an interval, and add noise where samples were lost.
 
-    A sample contains the usual interval before it; both change evenly over the missing samples.
+    A sample is the mean of the usual interval before it; both change linearly over the missing
+    samples.
     """
     unseen_s = dt - s.usual_step_s
     if dt < LOST_STEPS * s.usual_step_s or s.sound_s <= dt:
@@ -253,7 +255,7 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     write_quat(s.q_ib, normalise(multiply(as_quat(s.q_ib), turn)))
     flown_s = 0.0
     if s.aided == 1:
-        # Fixes in the gap have moved position and velocity already.
+        # Fixes in the gap have already updated position and velocity.
         flown_s = min(s.time_s - s.fix_s, dt)
         half_rad = 0.5 * about * flown_s
         turn = from_rotation_vector((0.0, 0.0, half_rad))
@@ -280,7 +282,7 @@ def steady_turn(s: State) -> tuple[Vec3, float, Vec3]:
 
 @compiled
 def is_still(s: State, p: Gains, gyro: Vec3, accel: Vec3) -> bool:
-    """Return whether a sample is close to the means of a rest."""
+    """Return whether a sample is close to the means at rest."""
     return bool(
         change_of(gyro, s.imu_mean, 0) < 2.0 * p.rest_gyro_radps
         and change_of(accel, s.imu_mean, 3) < p.rest_accel_mps2
@@ -300,7 +302,7 @@ def add_gap_variance(s: State, turned_var: float, flown_s: float) -> None:
 
 @compiled
 def close_gap(s: State) -> None:
-    """Discard everything that needs an unbroken IMU."""
+    """Discard the state that needs continuous IMU samples."""
     s.history_count = 0
     clear_velocities(s)
     s.pair_s = NEVER_S

@@ -1,7 +1,7 @@
 """The filter sample by sample, and its entry points for compiled code.
 
-One IMU sample passes: clock, gap and fault checks, prediction, rest, the measurements that replace
-GPS, and the compass. Barometer samples and fixes arrive between IMU samples.
+The steps for an IMU sample are: clock, gap and fault checks, prediction, rest, the measurements
+that replace GPS, and the compass. Barometer samples and fixes arrive between IMU samples.
 """
 
 import math
@@ -107,16 +107,17 @@ from gateway.records import NAN, UNKNOWN_VEC3, Vec3
 from gateway.units import RAD_PER_DEG
 
 UNAIDED_SCALE: Final = 0.01
-"""Gyroscope scale error before the first fix, a third of an MPU6050's tolerance."""
+"""Gyroscope scale error before the first fix: a third of an MPU6050's tolerance."""
 MAX_ALTITUDE_M: Final = 30_000.0
-"""Largest pressure altitude of a sound barometer."""
+"""Largest valid pressure altitude."""
 LEVEL_VALID_RAD: Final = 0.1
-"""A level is valid up to this standard deviation."""
+"""Maximum standard deviation of a valid level."""
 COMPASS_RAD: Final = 2.0 * RAD_PER_DEG
-"""Error of the declination, of the compass axes on their board, and by soft iron. It is in the
-output alone: it lasts, so no average over the flight reduces it, as the smoother's."""
+"""Error of the heading by the declination, the compass axes on their board, and soft iron. It is
+only added in the output: it is constant, so averages over a flight, as in the smoother, do not
+reduce it."""
 UNAIDED_VALID_S: Final = 1.0
-"""A position that is not estimated is valid for this time after its fix."""
+"""Time after its fix for which a position that is not estimated is valid."""
 
 STATE_LAYOUT: Final = layout(State)
 GAINS_LAYOUT: Final = layout(Gains)
@@ -149,7 +150,7 @@ def start(s: State, p: Gains) -> None:
 
 @compiled
 def clear_times(s: State) -> None:
-    """Discard everything that depends on the clock."""
+    """Clear all state that depends on the clock."""
     s.mag_s = s.mag_used_s = s.fix_s = s.update_s = s.level_s = NEVER_S
     s.baro_s = s.rejected_s = s.track_s = s.zero_s = NEVER_S
     s.reject_s, s.zero_velocity_wrong = 0.0, 0
@@ -160,7 +161,7 @@ def clear_times(s: State) -> None:
 def update_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
     """Advance by one IMU sample; see `columns` for its row.
 
-    A late sample is left out; a clock that went far back is a new clock.
+    A late sample is ignored; a clock that has gone back far counts as restarted.
     """
     gyro, accel, mag = imu_vectors(row)
     check_calibration(s, p, row)
@@ -186,7 +187,7 @@ def update_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
 
 @compiled
 def end_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, since_s: float) -> None:
-    """Bridge a gap at the first sound sample after it."""
+    """Bridge a gap at the first valid sample after it."""
     sound = is_below(gyro, GYRO_LIMIT_RADPS) and is_below(accel, ACCEL_LIMIT_MPS2)
     if not sound or norm_sq(gyro) + norm_sq(accel) == 0.0:
         s.fault = 1
@@ -211,14 +212,14 @@ def advance(
     if is_sound_field(s, mag, dt):
         update_mag(s, p, mag)
     elif s.mag_misplaced > misplaced:
-        # The heading, and the sensor errors estimated with it, came from wrong axes.
+        # The heading, and the sensor errors estimated with it, are from wrong axes.
         discard_calibration(s, p)
         lose_attitude(s, p)
 
 
 @compiled
 def begin(s: State, p: Gains, time_us: int, gyro: Vec3, accel: Vec3) -> None:
-    """Start at the first sound sample; gravity gives the level within the first second."""
+    """Start at the first valid sample; gravity gives the level within the first second."""
     if not is_start(s, gyro, accel):
         return
     s.started, s.base_us, s.time_us, s.time_s, s.imu_s = 1, time_us, time_us, 0.0, 0.0
@@ -258,7 +259,7 @@ def check_calibration(s: State, p: Gains, row: FloatArray) -> None:
 
 @compiled
 def move(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bool:
-    """Integrate one sample or its substitute; return whether both sensors were sound."""
+    """Integrate one sample or its substitute; return whether both sensors were valid."""
     sound_gyro, sound_accel = check_sensors(s, gyro, accel, clipped, dt)
     sound = sound_gyro and sound_accel
     if sound:
@@ -272,7 +273,7 @@ def move(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, dt: float)
         accel = substitute_accel(s)
     integrate(s, p, gyro, accel, dt)
     if clipped != 0.0:
-        # As much as a sensor reads at the end of its range may be cut off.
+        # The part above the range may be as large as the clipped reading.
         for k in range(3):
             s.pending_noise[0] += (dt * s.imu_held[k]) ** 2
             s.pending_noise[1] += (dt * s.imu_held[3 + k]) ** 2
@@ -282,7 +283,7 @@ def move(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, dt: float)
 
 @compiled
 def level(s: State, p: Gains) -> None:
-    """Use rest, and gravity where GPS does not give the velocity."""
+    """Update by rest, and by gravity if GPS does not give the velocity."""
     since_s = s.time_s - s.level_s
     if since_s < LEVEL_INTERVAL_S:
         return
@@ -344,7 +345,7 @@ def heading_std_rad(s: State) -> float:
 
 @compiled
 def write_position(s: State, row: FloatArray) -> None:
-    """Write position, velocity and their standard deviations; NaN for the unknown."""
+    """Write position, velocity and their standard deviations; unknown ones are NaN."""
     write_vec(row[NAV_VEL : NAV_VEL + 3], UNKNOWN_VEC3)
     row[NAV_VEL_STD : NAV_POS_STD + 3] = NAN
     row[NAV_LAT] = row[NAV_LON] = NAN
@@ -425,7 +426,7 @@ def gps_step(state: int, gains: int, arrival_us: int, fix: int) -> None:
 
 
 class LogArrays:
-    """Lengths and addresses of the arrays of a `SampleLog`, by its names."""
+    """Lengths and addresses of the arrays of a `SampleLog`, with the same names."""
 
     imu_count: int
     imu_time_us: int
@@ -445,7 +446,7 @@ LOG_LAYOUT: Final = layout(LogArrays)
 def update_aiding(
     s: State, p: Gains, log: LogArrays, until_us: int, baros: int, fixes: int
 ) -> tuple[int, int]:
-    """Use the heights, then the fixes up to a time, and return how many have been used so far."""
+    """Use the heights, then the fixes up to a time; return the total numbers used so far."""
     baro_time_us = array_at(log.baro_time_us, (log.baro_count,), INT)
     baro_alt_m = array_at(log.baro_alt_m, (log.baro_count,), FLOAT)
     gps_time_us = array_at(log.gps_time_us, (log.gps_count,), INT)
@@ -460,7 +461,7 @@ def update_aiding(
 
 @EntryPoint
 def run(state: int, gains: int, log_at: int, outputs: int) -> None:
-    """Advance over a log: before each IMU sample the heights, then the fixes not later than it."""
+    """Advance over a log; heights, then fixes, are used before the first IMU sample not earlier."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
     log = record_at(log_at, LOG_LAYOUT)
     imu_time_us = array_at(log.imu_time_us, (log.imu_count,), INT)

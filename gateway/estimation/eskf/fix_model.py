@@ -1,13 +1,13 @@
-"""Measurement model of a GPS fix: its row at the time it was valid, its variance, and glitches.
+"""Measurement model of a GPS fix: its row for the time of validity, its variance, and glitches.
 
-A fix is compared with the state at the time it was valid, `L` seconds ago, and its row carries that
-state's error to the present one:
+A fix is compared with the state at its time of validity, `L` seconds ago, and its row expresses the
+error of that state by the present one:
 
     vel_then = vel - att x S + R L accel_bias
     pos_then = pos - L vel + att x (L S - D) - R L^2 / 2 accel_bias
 
-with `S` and `D` the first and second integral of the specific force over the lag. This equals
-fusing the fix in time, but for the process noise of the few tenths of a second between.
+with `S` and `D` the first and second integral of the specific force over the lag. This is the same
+as fusing the fix on time, except for the process noise during the lag, some tenths of a second.
 """
 
 import math
@@ -33,26 +33,26 @@ from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 NOISE_SHARE: Final = 0.2
-"""Share of a receiver's accuracy that is noise from fix to fix."""
+"""Share of the reported accuracy that is noise from fix to fix."""
 ERROR_SHARES: Final = (0.7, 0.7, 0.9)
-"""Share of it that is slow error, north, east (of a radial accuracy) and down."""
+"""Shares of the reported accuracy that are slow error: north, east (of a radial accuracy), down."""
 SPEED_SHARES: Final = (0.4, 0.4, 0.8)
-"""Share of its speed accuracy that is noise of one axis."""
+"""Shares of the reported speed accuracy that are noise of one axis."""
 SLOW_ERROR_MPS: Final = 0.05
 SLOW_ERROR_S: Final = 4.0
-"""Slow error of GPS velocities where the receiver reports none, and its correlation time."""
+"""Slow error of GPS velocities without a reported accuracy, and its correlation time."""
 LEAST_FIX_INTERVAL_S: Final = 0.05
-"""Fixes closer together count as that far apart."""
+"""Least interval of fixes; closer ones count as if they had this interval."""
 LEAST_LAG_S: Final = 0.1
-"""Over less, a mean acceleration is mostly vibration."""
+"""Least time of a mean acceleration, which over a shorter time is mostly vibration."""
 VELOCITY: Final = 0
 POSITION: Final = 1
 GLITCH_GATE_SQ: Final = (9.0, 16.0)
-"""Innovations of velocity and position beyond these squared gates, in variances, are glitches."""
+"""Squared gates of velocity and position, in variances, beyond which innovations are glitches."""
 MAX_GLITCH: Final = (5.0, 30.0)
 """Largest size of a glitch, m/s and m."""
 GLITCH_S: Final = 10.0
-"""Fixes of this time share a glitch."""
+"""Time in which fixes share the same glitch."""
 GLITCH_FADE_S: Final = 1.0
 RECEIVER_LAG_S: Final = 0.2
 """Lag of the receiver's own filter in a manoeuvre."""
@@ -93,7 +93,7 @@ def lag_integrals(s: State, lag: float) -> tuple[Vec3, Vec3]:
 
 @compiled
 def set_error_variances(s: State, p: Gains, row: FloatArray) -> None:
-    """Take the slow errors of a fix from the accuracies that the receiver reports."""
+    """Set the slow errors of a fix from the reported accuracies."""
     for k in range(3):
         usual = p.gps_error_var if k < 2 else p.gps_height_error_var
         accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
@@ -105,13 +105,13 @@ def set_error_variances(s: State, p: Gains, row: FloatArray) -> None:
 
 @compiled
 def reported_variance(variance: float, accuracy: float, share: float) -> float:
-    """Return the variance by a reported accuracy, or the usual one where there is none."""
+    """Return the variance from a reported accuracy, or the default if none is reported."""
     return (share * accuracy) ** 2 if accuracy > 0.0 else variance
 
 
 @compiled
 def position_variance(s: State, p: Gains, row: FloatArray, k: int, since_s: float) -> float:
-    """Return the noise of one coordinate of a fix, m2; its latency varies."""
+    """Return the noise of one coordinate of a fix, m2, with that of its varying latency."""
     usual = p.gps_position_var if k < 2 else p.gps_height_var
     accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
     white = reported_variance(usual, accuracy, NOISE_SHARE)
@@ -123,13 +123,13 @@ def position_variance(s: State, p: Gains, row: FloatArray, k: int, since_s: floa
 def velocity_variance(
     s: State, p: Gains, row: FloatArray, accel_n: Vec3, k: int, since_s: float
 ) -> float:
-    """Return the white noise with the long-term effect of one velocity's errors, m2/s2."""
+    """Return white noise with the same long-term effect as the errors of a velocity, m2/s2."""
     accuracy = row[GPS_SPEED_ACC]
     usual = p.gps_velocity_var if k < 2 else p.gps_climb_var
     white = reported_variance(usual, accuracy, SPEED_SHARES[k])
     assumed = NOISE_MPS * NOISE_MPS
     if k < 2 and s.time_s - s.mag_used_s > STALE_MAG_S:
-        # Without a compass the heading depends on these velocities alone.
+        # Without a compass, the heading depends only on these velocities.
         white = max(white, assumed * s.fix_excess)
     white *= max(1.0, p.gps_correlation_s / since_s)
     late = p.gps_jitter_sq * accel_n[k] * accel_n[k]
@@ -172,7 +172,7 @@ def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
 
 @compiled
 def set_attitude(s: State, k: int, w: Vec3) -> None:
-    """Write how `(att x w)[k]` depends on the attitude error."""
+    """Write the dependence of `(att x w)[k]` on the attitude error."""
     a, b = (k + 1) % 3, (k + 2) % 3
     s.h[ATT + a] = w[b]
     s.h[ATT + b] = -w[a]
@@ -180,7 +180,7 @@ def set_attitude(s: State, k: int, w: Vec3) -> None:
 
 @compiled
 def is_unlikely(s: State, p: Gains, row: FloatArray, off: Vec3, lag: float) -> bool:
-    """Return whether a position is outside the gate, north or east."""
+    """Return whether a position is outside the gate in north or east."""
     once, twice = lag_integrals(s, lag)
     worst = 0.0
     for k in range(2):
@@ -192,11 +192,10 @@ def is_unlikely(s: State, p: Gains, row: FloatArray, off: Vec3, lag: float) -> b
 
 @compiled
 def raise_glitch_variance(s: State, kind: int, off: float, variance: float, since_s: float) -> None:
-    """Add the variance of a glitch: an innovation outside the gate is shared by several fixes.
+    """Add the variance of a glitch, an innovation outside the gate that several fixes share.
 
-    Taken for errors that are new in each fix, a glitch
-    would win over sound inertial sensors. The variance that errs as much in the long run is that of
-    one error times the number of fixes that share it.
+    If its errors counted as independent in each fix, a glitch would outweigh valid inertial
+    sensors. The equivalent variance is that of one error times the number of fixes that share it.
     """
     off = min(abs(off), MAX_GLITCH[kind])
     excess = off * off / GLITCH_GATE_SQ[kind] - innovation_variance(s, variance)
@@ -207,7 +206,7 @@ def raise_glitch_variance(s: State, kind: int, off: float, variance: float, sinc
 def update_fix(
     s: State, p: Gains, row: FloatArray, off_pos: Vec3, off_vel: Vec3, lag: float
 ) -> None:
-    """Update by velocity and position of a fix; components that are not finite are left out."""
+    """Update by velocity and position of a fix; components that are not finite are ignored."""
     once, twice = lag_integrals(s, lag)
     since_s = max(s.time_s - s.update_s, LEAST_FIX_INTERVAL_S)
     s.update_s = s.time_s
@@ -217,7 +216,7 @@ def update_fix(
     s.glitch_var[POSITION] *= faded
     s.hard_accel_sq = max(norm_sq(accel_n), s.hard_accel_sq * faded)
     late_var = RECEIVER_LAG_S * RECEIVER_LAG_S * s.hard_accel_sq
-    # The whole fix is checked before any of it is used: a glitch affects all components.
+    # All components are checked before any is used, because a glitch affects all of them.
     for k in range(3):
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)

@@ -1,4 +1,4 @@
-"""GPS fixes as they arrive: recognised, completed, and used to start, restart or update."""
+"""Processing of GPS fixes: checked, completed, and used to start, restart or update."""
 
 import math
 from typing import Final
@@ -51,29 +51,29 @@ from gateway.geometry.quaternion import difference, is_below, norm_sq
 from gateway.records import NAN, Vec3
 
 FASTEST_MPS: Final = 1000.0
-"""A larger velocity is an error."""
+"""Velocity above which it is an error."""
 BASELINE_S: Final = 2.0 * PAIR_S
-"""Positions closer together differ mostly by their noise."""
+"""Least interval of positions for a velocity: closer ones differ mostly by noise."""
 ZERO_S: Final = 3.0
 ZERO_MPS: Final = 2.0
-"""Fixes that move so fast for this time contradict a velocity of exactly zero."""
+"""Speed and time of moving fixes that contradict a velocity of exactly zero."""
 AFTER_GAP_S: Final = 2.0
-"""After a gap: corrections of the position are blended in, and late fixes show no latency."""
+"""Time after a gap in which position corrections are blended in and latency is not estimated."""
 STATIONARY_MPS: Final = 0.1
-"""A receiver at rest reports up to this speed, and may repeat itself."""
+"""Maximum reported speed of a receiver at rest, which may repeat a fix."""
 SLOWEST_FIXES_S: Final = 1.1
-"""Longest usual interval of fixes; a fix without velocity may repeat after that."""
+"""Longest usual interval of fixes, after which a fix without velocity may be repeated."""
 MOVING_MPS: Final = 3.0
-"""A level that was found by gravity is discarded at this speed."""
+"""Speed at which a level found by gravity is discarded."""
 ORIGIN_RENEWAL_M: Final = 5_000.0
-"""The origin follows the aircraft, because metres are taken at the radii of the origin."""
+"""Distance after which the origin is moved, because metres are computed with its radii."""
 AGREE_M: Final = 10.0
-"""Rejected fixes within this distance of their own dead reckoning agree."""
+"""Maximum distance of rejected fixes that agree from their own dead reckoning."""
 AGREE_S: Final = 5.0
-"""Rejected fixes further apart in time do not."""
+"""Maximum interval of rejected fixes that agree."""
 FIRST_VELOCITY_VAR: Final = 0.5**2
 NO_VELOCITY_VAR: Final = 5.0**2
-"""Of the first velocity with and without one in the fix, m2/s2."""
+"""Variances of the first velocity with and without one in the fix, m2/s2."""
 
 
 @compiled
@@ -96,7 +96,7 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
     if sound:
         write_vec(s.fix_vel, vel)
     if arrival_s - s.imu_s > gap_limit_s(s):
-        # Without an IMU the state is that of the fix.
+        # Without an IMU, the state is that of the fix.
         if s.aided == 1:
             restart_at(s, p, pos, vel, arrival_s - wanted_s)
             s.fix_s = arrival_s
@@ -106,7 +106,7 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
         pair_velocity(s, p, vel_s, vel, noise_mps)
     valid_s = look_back(s, wanted_s)
     if sound:
-        # Integrals that do not reach back: the fix moves on by its own velocity.
+        # The integrals do not reach back far enough: extrapolate the fix by its own velocity.
         since_s = valid_s - wanted_s
         pos = (pos[0] + vel[0] * since_s, pos[1] + vel[1] * since_s, pos[2] + vel[2] * since_s)
     north, east = s.pos_n[0] + s.blend_n[0], s.pos_n[1] + s.blend_n[1]
@@ -119,7 +119,7 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
 def use_fix(
     s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, reported: Vec3, lag: float
 ) -> None:
-    """Follow, restart at or fuse a fix that is `lag` seconds old."""
+    """Copy, restart at or fuse a fix that is `lag` seconds old."""
     if s.heading_known == 0:
         follow_fix(s, pos, lag)
     elif s.aided == 0:
@@ -133,8 +133,8 @@ def use_fix(
 def is_new_fix(s: State, row: FloatArray) -> bool:
     """Return whether a row is a usable fix that does not repeat the last one.
 
-    A log may hold a fix until the next one, and a receiver may be stuck. A moving receiver is never
-    at the same position twice; at rest a repetition may be real.
+    A log may repeat a fix until the next one, and a receiver may be stuck. A moving receiver never
+    reports the same position twice; at rest a repetition may be real.
     """
     lat, lon, vel = row[GPS_LAT], row[GPS_LON], as_vec(row[GPS_VEL : GPS_VEL + 3])
     if row[GPS_USABLE] == 0.0 or not math.isfinite(lat + lon):
@@ -154,7 +154,7 @@ def is_new_fix(s: State, row: FloatArray) -> bool:
 
 @compiled
 def learn_declination(s: State, row: FloatArray) -> None:
-    """Take the Earth's field at a fix; a magnetic heading becomes a true one."""
+    """Set the Earth's field at a fix, and convert a magnetic heading to a true one."""
     if math.isfinite(row[GPS_DIP] + row[GPS_STRENGTH]):
         s.earth_dip_rad, s.earth_norm_ut = row[GPS_DIP], row[GPS_STRENGTH]
     if not math.isfinite(row[GPS_DECLINATION]):
@@ -167,7 +167,7 @@ def learn_declination(s: State, row: FloatArray) -> None:
 
 @compiled
 def position_of(s: State, row: FloatArray) -> Vec3:
-    """Return a fix in metres from the origin, which the first one sets, down positive."""
+    """Return a fix in metres from the origin, down positive; the first fix sets the origin."""
     if s.has_origin == 0:
         s.origin[0], s.origin[1], s.has_origin = row[GPS_LAT], row[GPS_LON], 1
     elif math.hypot(s.pos_n[0], s.pos_n[1]) > ORIGIN_RENEWAL_M:
@@ -185,7 +185,7 @@ def position_of(s: State, row: FloatArray) -> Vec3:
 
 @compiled
 def is_level_sound(vel: Vec3) -> bool:
-    """Return whether a velocity has sound horizontal components."""
+    """Return whether the horizontal components of a velocity are valid."""
     return is_below((vel[0], vel[1], 0.0), FASTEST_MPS)
 
 
@@ -207,9 +207,9 @@ def is_zero_velocity_wrong(s: State, pos: Vec3, vel: Vec3) -> bool:
 
 @compiled
 def complete_velocity(s: State, valid_s: float, pos: Vec3, vel: Vec3) -> tuple[Vec3, float]:
-    """Return the velocity of a fix, from two positions where it has none, and its time.
+    """Return the velocity of a fix and its time; from two positions if the fix has no velocity.
 
-    Without heights it does not climb; unknown components are NaN.
+    Without heights the climb is zero; unknown components are NaN.
     """
     f = s.track_pos_n
     dt = valid_s - s.track_s
@@ -232,10 +232,10 @@ def complete_velocity(s: State, valid_s: float, pos: Vec3, vel: Vec3) -> tuple[V
 
 @compiled
 def pair_velocity(s: State, p: Gains, vel_s: float, vel: Vec3, noise_mps: float) -> None:
-    """Add the velocity of a fix to the alignment, and check the attitude by it."""
+    """Add the velocity of a fix to the alignment, and check the attitude with it."""
     unaided = s.aided == 0 and s.pairs == 0.0
     if unaided and s.lost == 0 and math.hypot(vel[0], vel[1]) > MOVING_MPS:
-        # The level was found by gravity alone while turns and accelerations imitated it.
+        # The level was found by gravity alone, which turns and accelerations may have distorted.
         lose_attitude(s, p)
     at_s = look_back(s, vel_s)
     dt = add_velocity(s, p, at_s, vel, as_vec(s.then), noise_mps)
@@ -252,7 +252,7 @@ def accept_fix(s: State) -> None:
 
 @compiled
 def fuse_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, lag: float) -> None:
-    """Update by a fix; one that is far off is rejected, unless such fixes have long agreed."""
+    """Update by a fix; an outlier is rejected, unless such fixes have agreed for long."""
     propagate(s, p)
     start_height(s, p, pos[2] + s.vel_n[2] * lag)
     past_pos, past_vel = past_state(s, lag)
@@ -281,7 +281,7 @@ def have_agreed(s: State, p: Gains, pos: Vec3, vel: Vec3) -> bool:
 
 @compiled
 def follow_fix(s: State, pos: Vec3, lag: float) -> None:
-    """Set the position to a fix, moved on by its velocity, while no heading allows fusing it."""
+    """Set the position to an extrapolated fix, which cannot be fused without a heading."""
     s.fix_s = s.time_s
     for k in range(3):
         moved = s.fix_vel[k] * lag
@@ -291,7 +291,7 @@ def follow_fix(s: State, pos: Vec3, lag: float) -> None:
 
 @compiled
 def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
-    """Take position and velocity from one fix, `lag` seconds old; NaN where it has none."""
+    """Set position and velocity from one fix, `lag` seconds old; NaN for missing components."""
     propagate(s, p)
     sound = is_below(vel, FASTEST_MPS)
     reset_states(s, VEL, FIRST_VELOCITY_VAR if sound else NO_VELOCITY_VAR)
@@ -308,7 +308,7 @@ def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
 
 @compiled
 def start_height(s: State, p: Gains, down_m: float) -> None:
-    """Take the height from the first fix that has one."""
+    """Set the height from the first fix that has one."""
     if s.has_height == 1 or not math.isfinite(down_m):
         return
     start_position(s, 2, down_m, p.gps_height_var)
@@ -319,7 +319,7 @@ def start_height(s: State, p: Gains, down_m: float) -> None:
 
 @compiled
 def start_position(s: State, k: int, value: float, noise_var: float) -> None:
-    """Start one coordinate at a fix, whose slow error it then has, with the opposite sign."""
+    """Start one coordinate at a fix; its error is the slow error with the opposite sign."""
     error_var = s.gps_error_var[k]
     s.pos_n[k], s.gps_error_n[k] = value, 0.0
     reset_state(s, POS + k, error_var + noise_var)

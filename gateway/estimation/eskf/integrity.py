@@ -1,4 +1,4 @@
-"""Integrity of the attitude: levelled by gravity, found from motion, and checked by it.
+"""Integrity of the attitude: found by gravity or from motion, and checked with both.
 
 | state | condition | next |
 | --- | --- | --- |
@@ -48,30 +48,30 @@ from gateway.geometry.quaternion import from_rotation_vector, multiply, normalis
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 LOST_LEVEL_VAR: Final = 0.5**2
-"""Of an unknown level, rad2: about the largest that a linear filter can still correct."""
+"""Variance of an unknown level, rad2: about the largest that a linear filter can correct."""
 LOST_LEVEL_RAD: Final = 0.35
-"""An attitude with a larger standard deviation is lost."""
+"""Standard deviation above which an attitude is lost."""
 FOUND_LEVEL_RAD: Final = 0.08
 FOUND_HEADING_RAD: Final = 0.3
-"""Alignments with smaller standard deviations are accepted: the filter is linear within them."""
+"""Maximum standard deviations of an accepted alignment: the filter is linear within them."""
 PATIENCE_S: Final = 8.0
-"""For each of these times that the attitude has been lost, a worse level is accepted."""
+"""Time without an attitude after which the accepted error of the level grows in proportion."""
 MISMATCH_LEVEL_RAD: Final = 0.14
 MISMATCH_S: Final = 2.0
-"""The attitude is replaced when the alignment differs by more than this, or more in heading than
-is accepted, and than chance explains, for this time."""
+"""Significant difference of the level from the alignment, and its duration, after which the
+attitude is replaced; the limit of the heading is that of its acceptance."""
 GRAVITY_MISMATCH_RAD: Final = 0.6
 GRAVITY_MISMATCH_S: Final = 5.0
-"""The same without GPS, where manoeuvres imitate a tilt."""
+"""The same without GPS, when manoeuvres may look like a tilt."""
 
 
 @compiled
 def lose_attitude(s: State, p: Gains) -> None:
-    """Discard the attitude; the position follows the fixes until another one is found."""
+    """Discard the attitude; the position follows the fixes until an attitude is found."""
     s.lost, s.lost_s, s.mismatch_s, s.heading_known = 1, 0.0, 0.0, 0
     clear_pairs(s)
     begin_attitude(s, p, LOST_LEVEL_VAR, NO_HEADING_VAR)
-    # The low-pass contains forces rotated by the discarded attitude, or by none.
+    # The low-pass contains forces rotated by the discarded attitude, or by an unknown one.
     s.force_lp_s = 0.0
 
 
@@ -81,7 +81,7 @@ def begin_attitude(s: State, p: Gains, level_var: float, heading_var: float) -> 
     propagate(s, p)
     reset_state(s, ATT, level_var)
     reset_state(s, ATT + 1, level_var)
-    # While no heading is known, it is counted from where the filter began, which is certain.
+    # An unknown heading is relative to the start of the filter, and so has no variance.
     reset_state(s, ATT + 2, heading_var if s.heading_known == 1 or s.lost == 1 else 0.0)
     end_aiding(s)
     # The integrals in NED contain the old attitude.
@@ -116,7 +116,7 @@ def level_by_gravity(s: State, p: Gains, dt: float) -> None:
 
 @compiled
 def find_level(s: State, p: Gains, dt: float) -> None:
-    """Rotate the attitude until the filtered force is vertical, and accept it if certain."""
+    """Rotate the attitude to make the filtered force vertical, and accept it if accurate enough."""
     s.lost_s += dt
     north, east, down = gravity_force_n(s)
     level = math.hypot(north, east)
@@ -157,7 +157,7 @@ def check_attitude(s: State, p: Gains, dt: float, sound: bool) -> None:
 
 @compiled
 def differs_from_alignment(s: State) -> bool:
-    """Return whether the alignment and the attitude cannot both be right."""
+    """Return whether alignment and attitude differ significantly."""
     found, q_nb = as_quat(s.aligned_q_nb), as_quat(s.q_nb)
     allowed = MISMATCH_SIGMA * math.sqrt(s.aligned_std[0] ** 2 + level_variance(s))
     if level_difference(found, q_nb) > max(MISMATCH_LEVEL_RAD, allowed):
@@ -170,7 +170,7 @@ def differs_from_alignment(s: State) -> bool:
 
 @compiled
 def replace_attitude(s: State, p: Gains) -> None:
-    """Replace the attitude by the alignment's, the heading too where that is known."""
+    """Replace the attitude by that of the alignment, with its heading if known."""
     found = as_quat(s.aligned_q_nb)
     heading_std = s.aligned_std[1]
     s.lost, s.mismatch_s = 0, 0.0
@@ -195,7 +195,7 @@ def require_bias_variance(s: State, std: float) -> None:
 
 @compiled
 def discard_calibration(s: State, p: Gains) -> None:
-    """Discard the sensor errors that were estimated with a wrong attitude."""
+    """Reset the sensor errors that were estimated with a wrong attitude."""
     reset_accel_bias(s, p)
     reset_hard_iron(s, p)
     s.gyro_scale_b[:] = 0.0
@@ -207,7 +207,7 @@ def discard_calibration(s: State, p: Gains) -> None:
 
 @compiled
 def reset_accel_bias(s: State, p: Gains) -> None:
-    """Discard the accelerometer bias."""
+    """Reset the accelerometer bias."""
     propagate(s, p)
     s.accel_bias_b[:] = 0.0
     reset_states(s, ACCEL_BIAS, accel_bias_var(s, p))
@@ -215,7 +215,7 @@ def reset_accel_bias(s: State, p: Gains) -> None:
 
 @compiled
 def reset_gyro_bias(s: State, p: Gains) -> None:
-    """Discard the gyroscope bias, and that of the last rest."""
+    """Reset the gyroscope bias, and that of the last rest."""
     propagate(s, p)
     s.gyro_bias_b[:] = 0.0
     s.rest_bias_b[:] = 0.0

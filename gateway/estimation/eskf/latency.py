@@ -1,10 +1,10 @@
 """GPS latency from motion: GPS velocity against the accelerometer, for several latencies at once.
 
-The specific force is integrated in the gyroscope frame. Within a window of some seconds one
-rotation takes its changes to those of the GPS velocity, gravity added. The misfit of Wahba's
-problem is known without the rotation itself [1]_. The misfits of all windows with a manoeuvre add
-up, and the latency is at the minimum of a parabola through the smallest ones; its curvature gives
-the variance.
+The specific force is integrated in the gyroscope frame. Within a window of some seconds, one
+rotation transforms its changes into those of the GPS velocity, after gravity is subtracted. The
+misfit of Wahba's problem is known without the rotation itself [1]_. The misfits of all windows with
+a manoeuvre are added, and the latency is at the minimum of a parabola through the smallest ones;
+its curvature gives the variance.
 
 References
 ----------
@@ -26,38 +26,38 @@ from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 STEP_S: Final = 0.05
-"""Between the latencies, from 0 to 0.6 s: no receiver is later."""
+"""Step of the compared latencies, from 0 to 0.6 s, which no receiver exceeds."""
 LEAST_PAIR_S: Final = 0.15
-"""Shortest interval of two velocities that are compared."""
+"""Shortest interval of two compared velocities."""
 WINDOW_S: Final = 8.0
-"""The drift of the gyroscope frame is negligible for this time."""
+"""Length of a window, in which the drift of the gyroscope frame is negligible."""
 WINDOW_PAIRS: Final = 6.0
-"""Fewest pairs of a window."""
+"""Least number of pairs of a window."""
 MANOEUVRE_MPS2: Final = 0.7
-"""RMS variation of the acceleration from which on a window counts."""
+"""Least RMS variation of the acceleration of a window that counts."""
 SHARED: Final = 2.0
-"""Successive differences share the noise of a velocity, so they count half."""
+"""Divisor for the weight of differences, since successive ones share the noise of a velocity."""
 WINDOW_STD_S: Final = 0.02
-"""Least error of a window: the latency varies, and so does the filter in the receiver."""
+"""Least standard deviation of a window, since latency and the receiver's filter vary."""
 WINDOW_KEPT: Final = 0.98
 """Forgetting factor from window to window."""
 KNOWN_STD_S: Final = 0.012
-"""Largest standard deviation of a latency that is used."""
+"""Maximum standard deviation of a usable latency estimate."""
 CONFLICT_S: Final = 0.07
-"""The set latency stays in use within this difference: position may lag behind velocity by that."""
+"""Maximum difference at which the set latency is used: position may lag velocity by this."""
 MOST_HALF_SPAN: Final = 3
-"""A parabola is fitted to at most so many misfits on either side of the smallest."""
+"""Maximum number of misfits on either side of the smallest to which a parabola is fitted."""
 SLEW: Final = 0.01
-"""Change of the latency in use per second, so that no fix seems to jump."""
+"""Maximum change of the latency in use per second, so that fixes do not seem to jump."""
 NEWTON_STEPS: Final = 12
-"""Quadratic convergence from above, to double precision."""
+"""Number of steps, which converge quadratically from above to double precision."""
 CERTAIN: Final = 1e30
-"""Information that no window outweighs, 1/s2."""
+"""Inverse variance of a fixed latency, which no window outweighs, 1/s2."""
 
 
 @compiled
 def begin_certain(s: State, latency_s: float) -> None:
-    """Start with a latency that no manoeuvre changes."""
+    """Start with a fixed latency, which manoeuvres do not change."""
     s.gps_latency_s = latency_s
     clear_velocities(s)
     for k in range(LATENCIES):
@@ -116,7 +116,7 @@ def close_window(s: State) -> None:
 
 @compiled
 def add_window(s: State, n: float) -> None:
-    """Add the misfits, each by what it has beyond the smallest, and find the best latency."""
+    """Add the misfits, each minus the smallest, and find the best latency."""
     m = s.window_misfit
     least = 0
     for k in range(LATENCIES):
@@ -171,11 +171,11 @@ def best_fit(s: State, k: int) -> float:
 def sharpest_parabola(s: State, least: int) -> tuple[float, float]:
     """Fit a parabola over the shortest span in which the misfit rises beyond noise.
 
-    Returns the position of its minimum in steps, and its curvature; 0 where it does not rise.
+    Returns the position of its minimum in steps, and its curvature, 0 if the misfit does not rise.
     """
     for half in range(1, MOST_HALF_SPAN + 1):
         lowest, curve = fit_parabola(s.latency_misfit, least, half)
-        # The noise is the same over any span, so it bends a short one more.
+        # The noise is the same over any span, so it changes the curvature of a short one more.
         if curve * half * half > MISMATCH_SIGMA**2 * (MOST_HALF_SPAN + 1 - half):
             return lowest, curve
     return 0.0, 0.0
@@ -200,19 +200,19 @@ def fit_parabola(misfit: FloatArray, least: int, half: int) -> tuple[float, floa
 
 @compiled
 def latency_std(s: State) -> float:
-    """Return the standard deviation of the latency that was found, s."""
+    """Return the standard deviation of the estimated latency, s."""
     return 1.0 / math.sqrt(s.latency_found[1]) if s.latency_found[1] > 0.0 else math.inf
 
 
 @compiled
 def latency_to_use(found_s: float, set_s: float) -> float:
-    """Return the set latency, or the found one where they conflict, s."""
+    """Return the set latency, or the estimated one if they conflict, s."""
     return max(found_s, 0.0) if abs(found_s - set_s) > CONFLICT_S else set_s
 
 
 @compiled
 def slew_latency(s: State, set_s: float, dt: float) -> None:
-    """Move the latency in use towards the wanted one."""
+    """Move the latency in use towards the set or estimated one."""
     known = latency_std(s) < KNOWN_STD_S
     wanted = latency_to_use(s.latency_found[0], set_s) if known else set_s
     most = SLEW * dt

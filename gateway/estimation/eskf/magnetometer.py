@@ -1,10 +1,10 @@
-"""Magnetometer: sound readings, disturbances, misplaced axes, hard iron, and the heading.
+"""Magnetometer: valid readings, disturbances, misplaced axes, hard iron, and the heading.
 
 Three checks precede the heading. A reading that does not change during a turn is stuck. The field
-must turn as the gyroscope does, or axes are swapped. And its norm and dip must be the usual ones; a
-new field that stays the same while the aircraft turns becomes the usual one [1]_. The hard iron
-itself is three states of the filter: turns separate it from the heading, since it turns with the
-body, and they change the norm.
+must rotate as the gyroscope measures, or axes are swapped. And its norm and dip must be the usual
+ones; a new field that stays the same while the aircraft turns becomes the usual one [1]_. The hard
+iron itself is three states of the filter: turns distinguish it from the heading, since it rotates
+with the body and changes the norm.
 
 References
 ----------
@@ -53,54 +53,54 @@ STALE_MAG_S: Final = 1.0
 FIELD_RANGE_UT: Final = (1.0, 200.0)
 """The Earth's field is 22 to 67 uT; outside this range it is a fault or a magnet."""
 MIN_LEVEL_SHARE: Final = 0.05
-"""A field with a smaller horizontal share gives no heading."""
+"""Least horizontal share of a field that gives a heading."""
 STUCK_TURN_RAD: Final = 0.05
-"""A reading that repeats exactly over such a turn is stuck."""
+"""Turn over which an exactly repeated reading counts as stuck."""
 
 SETTLE_S: Final = 0.5
-"""A usual field counts as undisturbed after this time, as in VQF."""
+"""Time after which a usual field counts as undisturbed, as in VQF."""
 REJECT_MAX_S: Final = 60.0
-"""After this time a disturbed field is used again, at half its weight, as in VQF."""
+"""Time after which a disturbed field is used again, at half its weight, as in VQF."""
 FIELD_TAU_S: Final = 20.0
 """Time constant of the usual norm and dip, as in VQF."""
 NEW_FIELD_S: Final = 20.0
-"""A candidate becomes the usual field after this time in turns, as in VQF."""
+"""Time in turns after which a candidate becomes the usual field, as in VQF."""
 FIRST_FIELD_S: Final = 5.0
-"""The first candidate after this time, as in VQF."""
+"""The same time for the first candidate, as in VQF."""
 TURNING_RADPS: Final = 0.35
-"""Angular rate of a turn in this sense, 20 deg/s, as in VQF."""
+"""Least angular rate of such a turn, 20 deg/s, as in VQF."""
 HALF_WEIGHT_NORM: Final = 0.04
 HALF_WEIGHT_DIP_RAD: Final = 0.035
-"""A field that differs by this in norm or dip counts half: a third of the tolerances."""
+"""Differences in norm or dip at which a field has half the weight: a third of the tolerances."""
 NORM_NOISE_UT: Final = 4.5
-"""Changes of the norm with the attitude by the scales and axes of the sensor."""
+"""Change of the norm with the attitude due to errors of the scales and axes of the sensor."""
 CORRELATION_S: Final = 1.0
-"""Correlation time of compass errors: those of soft iron and currents change with the attitude."""
+"""Correlation time of compass errors: soft iron and currents change with the attitude."""
 UNAIDED_CORRELATION_S: Final = 2.5
-"""The same without GPS, where the level's error turns the heading through the dip."""
+"""The same without GPS, when an error of the level rotates the heading through the dip."""
 STEEP_DIP_RAD: Final = 74.0 * RAD_PER_DEG
-"""Beyond this dip the horizontal field is too weak for the set noise, which then grows as 1/cos."""
+"""Dip above which the horizontal field is weak, so that the set noise grows as 1/cos."""
 DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
 NORM_ERROR: Final = 0.07
-"""Errors of the model's dip and norm at a location, with those of the sensor's scales."""
+"""Errors of the model's dip and norm at a location, including those of the sensor's scales."""
 
 TURN_SHARE: Final = 0.2
-"""A turn is evaluated once it has changed the field by this share of its norm."""
+"""Least change of the field, as a share of its norm, at which a turn is evaluated."""
 TURNS_KEPT: Final = 0.99
 """Forgetting factor from turn to turn."""
 MISPLACED_SHARE: Final = 0.75
 WELL_PLACED_SHARE: Final = 0.5
-"""Unexplained share of the squared changes: swapped or reversed axes leave most of it."""
+"""Maximum unexplained share of the squared changes; with swapped axes most is unexplained."""
 NORM_SHARE: Final = 0.1
-"""Hard iron changes the norm by more than this share of what it leaves unexplained."""
+"""Least change of the norm due to hard iron, as a share of the unexplained squared change."""
 
 BIAS_TURN_RAD: Final = 4.0 * math.pi
-"""An apparent turn of two circles without a turn of anything else is a gyroscope bias."""
+"""Apparent turn, two circles, that is a gyroscope bias if no other sensor measures a turn."""
 
 
 @compiled
 def is_sound_field(s: State, mag_b: Vec3, dt: float) -> bool:
-    """Return whether a sample contains a usable new field; to be called for each sample."""
+    """Return whether a sample contains a valid new field; must be called for each sample."""
     stuck = norm_sq(as_vec(s.mag_turned)) > STUCK_TURN_RAD * STUCK_TURN_RAD
     if s.at_rest == 0 and not stuck:
         for k in range(3):
@@ -118,17 +118,17 @@ def is_sound_field(s: State, mag_b: Vec3, dt: float) -> bool:
 
 @compiled
 def begin_turn(s: State, mag_b: Vec3) -> None:
-    """Compare the following fields with this one; zero compares none."""
+    """Set the field with which the following ones are compared; zero for no comparison."""
     write_vec(s.mag_from_b, mag_b)
     write_vec(s.mag_from_i, rotate(as_quat(s.q_ib), mag_b))
 
 
 @compiled
 def check_placement(s: State, mag_b: Vec3) -> None:
-    """Compare how the field turns in the body with the gyroscope.
+    """Compare the rotation of the field in the body with the gyroscope.
 
-    Swapped or reversed axes keep the norm. A strong hard iron leaves as much unexplained, but it
-    changes the norm, and is no reason to reject the compass.
+    Swapped or reversed axes do not change the norm. A strong hard iron leaves as much unexplained,
+    but it changes the norm, and is not a reason to reject the compass.
     """
     begin = as_vec(s.mag_from_b)
     carried = rotate_inverse(as_quat(s.q_ib), as_vec(s.mag_from_i))
@@ -143,11 +143,11 @@ def check_placement(s: State, mag_b: Vec3) -> None:
     if changed_sq > NORM_SHARE * expected_sq:
         s.rest_turn_rad = 0.0
     else:
-        # Only the gyroscope turns, so its bias is unknown.
+        # Only the gyroscope measures a turn, so its bias is unknown.
         s.rest_seen, s.rest_turn_rad = 0, BIAS_TURN_RAD
     change = math.sqrt(norm_sq(mag_b)) - math.sqrt(begin_sq)
     q = s.mag_squares
-    # One such turn is assumed to have been explained, so that a few cannot decide.
+    # One such turn is assumed to be explained, so that a few turns cannot decide.
     q[0] = TURNS_KEPT * (q[0] if q[0] > 0.0 else begin_sq) + changed_sq
     q[1] = TURNS_KEPT * q[1] + norm_sq(difference(mag_b, carried))
     q[2] = TURNS_KEPT * q[2] + change * change
@@ -157,7 +157,7 @@ def check_placement(s: State, mag_b: Vec3) -> None:
 
 @compiled
 def agreement(norm_off: float, dip_off: float) -> float:
-    """Return the weight of a field by its differences from the expected one."""
+    """Return the weight of a field from its differences to the expected one."""
     unlike = (norm_off / HALF_WEIGHT_NORM) ** 2 + (dip_off / HALF_WEIGHT_DIP_RAD) ** 2
     return float(1.0 / (1.0 + unlike))
 
@@ -166,7 +166,7 @@ def agreement(norm_off: float, dip_off: float) -> float:
 def field_weight(s: State, p: Gains, norm: float, dip: float, dt: float) -> float:
     """Compare a field with the usual one; return the weight of its heading, 0 to 1.
 
-    Before there is a usual one, it is compared with the Earth model's.
+    Before a usual field is known, it is compared with that of the Earth model.
     """
     if s.mag_ref[0] == 0.0:
         learn_field(s, p, norm, dip, dt)
@@ -192,7 +192,7 @@ def field_weight(s: State, p: Gains, norm: float, dip: float, dt: float) -> floa
 
 @compiled
 def learn_field(s: State, p: Gains, norm: float, dip: float, dt: float) -> None:
-    """Follow a candidate field, and make it the usual one when it has proved steady."""
+    """Update a candidate field, and make it the usual one after it was constant for long enough."""
     new = s.mag_new
     like = abs(norm - new[0]) < p.field_norm_tolerance * new[0]
     if not like or abs(dip - new[1]) > p.field_dip_tolerance_rad:
@@ -210,7 +210,7 @@ def learn_field(s: State, p: Gains, norm: float, dip: float, dt: float) -> None:
 
 @compiled
 def update_mag(s: State, p: Gains, mag_b: Vec3) -> None:
-    """Use one sound reading of the calibrated field in body FRD, uT."""
+    """Use one valid reading of the calibrated field in body FRD, uT."""
     if s.lost == 1:
         return
     turned = scaled(as_vec(s.rate_b), s.mag_latency_s)
@@ -269,9 +269,9 @@ def update_hard_iron(s: State, p: Gains, mag_b: Vec3, weight: float, dt: float) 
 def heading_row(s: State, field_n: Vec3) -> None:
     """Write the row of a magnetic heading, `declination - atan2(east, north)` of the field in NED.
 
-    By the errors it is `att_d - down (north att_n + east att_e) / level^2` (a tilt turns the
+    Its derivatives are `att_d - down (north att_n + east att_e) / level^2` (a tilt rotates the
     heading through the dip), plus `(east x_n - north x_e) / level^2` for hard iron on a body axis
-    `x`, plus the turn in the latency of the sample.
+    `x`, plus the rotation during the latency of the sample.
     """
     north, east, down = field_n
     level_sq = north * north + east * east
@@ -281,7 +281,7 @@ def heading_row(s: State, field_n: Vec3) -> None:
     axes = body_axes(as_quat(s.q_nb))
     for k in range(3):
         s.h[HARD_IRON + k] = (east * axes[k][0] - north * axes[k][1]) / level_sq
-    # A field that is older by dt is turned back by the angular rate times dt.
+    # A field that is older by dt is rotated back by the angular rate times dt.
     rate_n = rotate(as_quat(s.q_nb), as_vec(s.rate_b))
     for k in range(3):
         s.h[MAG_LATENCY] -= s.h[ATT + k] * rate_n[k]
@@ -291,8 +291,8 @@ def heading_row(s: State, field_n: Vec3) -> None:
 def consider_unaided(s: State) -> None:
     """Clear the row, and consider states that the compass must not change without GPS.
 
-    The level depends on the accelerometer alone then: the dip must not change it. And hard iron
-    turns the compass in step with each turn, as a scale error would.
+    Then the level depends only on the accelerometer, and the dip must not change it. And hard iron
+    has the same effect on the heading in each turn as a scale error of the gyroscope.
     """
     clear_row(s)
     if s.aided == 0:
@@ -309,7 +309,7 @@ def declination(s: State) -> float:
 
 @compiled
 def start_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
-    """Take the heading from the compass."""
+    """Set the heading from the compass."""
     turn_heading(s, declination(s) - math.atan2(field_n[1], field_n[0]))
     reset_state(s, ATT + 2, NO_HEADING_VAR)
     clear_row(s)
@@ -321,7 +321,7 @@ def start_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
 
 @compiled
 def update_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
-    """Update by the direction of the horizontal field, whose errors last for a while."""
+    """Update by the direction of the horizontal field, whose errors are correlated in time."""
     consider_unaided(s)
     heading_row(s, field_n)
     correlation_s = CORRELATION_S if s.aided == 1 else UNAIDED_CORRELATION_S
@@ -334,8 +334,8 @@ def update_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
 def raise_hard_iron(s: State) -> None:
     """Raise the variance of the hard iron by the difference of the field from the Earth model's.
 
-    Hard iron that changes norm and dip changes the heading as much. A heading that follows the
-    compass gets the same error.
+    Hard iron that changes norm and dip changes the heading by as much, so the variance of a heading
+    from the compass is raised too.
     """
     field, norm = as_vec(s.field_n), s.earth_norm_ut
     level = math.hypot(field[0], field[1])
@@ -360,7 +360,7 @@ def raise_hard_iron(s: State) -> None:
 
 @compiled
 def reset_hard_iron(s: State, p: Gains) -> None:
-    """Discard the hard iron that was found."""
+    """Reset the estimated hard iron."""
     propagate(s, p)
     s.hard_iron_b[:] = 0.0
     s.mag_mean_s = 0.0
@@ -375,7 +375,7 @@ def hard_iron_var(s: State, p: Gains) -> float:
 
 @compiled
 def turn_heading(s: State, turn_rad: float) -> None:
-    """Turn the whole attitude about down."""
+    """Rotate the attitude about down."""
     turn = from_rotation_vector((0.0, 0.0, turn_rad))
     write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
     s.resets[ATT + 2] += 1.0

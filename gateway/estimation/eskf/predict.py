@@ -1,4 +1,4 @@
-"""Prediction: the nominal state by each IMU sample, the covariance every `COVARIANCE_INTERVAL_S`.
+"""Prediction: the nominal state at each IMU sample, the covariance every `COVARIANCE_INTERVAL_S`.
 
 With the attitude error in NED, `R` the integral of `R_nb`, `f` that of the specific force in NED
 and `dt` the time, the error state obeys [1]_
@@ -7,8 +7,8 @@ and `dt` the time, the error state obeys [1]_
     vel' = vel + att x f - R accel_bias
     pos' = pos + vel dt
 
-Corrections of the gyroscope bias are white while the model is right. A bias that steps or drifts is
-corrected in one direction again and again: the part of the recent corrections beyond chance becomes
+Corrections of the gyroscope bias are white if the model is correct. A bias that steps or drifts is
+repeatedly corrected in one direction: the significant part of the recent corrections becomes
 process noise of the bias [2]_.
 
 References
@@ -64,23 +64,23 @@ from gateway.units import STANDARD_GRAVITY_MPS2
 COVARIANCE_INTERVAL_S: Final = 0.02
 """Interval of the covariance's propagation; measurements propagate it in between."""
 ACCELERATION_S: Final = 1.0
-"""An acceleration keeps its body axis for about this time, and its scale error the sign."""
+"""Time for which an acceleration keeps its body axis, and its scale error the sign."""
 NO_HEADING_VAR: Final = 3.0
 """Variance of an unknown heading: that of a uniform angle, `pi^2 / 3`, rad2."""
 BIAS_MEMORY_S: Final = 20.0
-"""Corrections of the gyroscope bias are summed over this time."""
+"""Time constant of the sum of corrections of the gyroscope bias."""
 BIAS_CHANCE_SQ: Final = 6.0
-"""A sum is chance up to this multiple of its variance: chi-squared of 1, 98.6 %."""
+"""Squared sum, in variances, above which it is significant: chi-squared with 1 degree, 98.6 %."""
 BIAS_RAISE_S: Final = 0.3
-"""Time in which the rest is added to the variance of the bias."""
+"""Time in which the significant part is added to the variance of the bias."""
 BLEND_S: Final = 1.0
 """Time constant with which a corrected position is blended in after a gap."""
 STEP_LIMIT: Final = 1e4
-"""A larger squared change from sample to sample is a fault, and NaN compares false."""
+"""Squared change from sample to sample above which it is a fault; NaN compares false."""
 MEANS_S: Final = 0.05
-"""Samples further apart are means, without vibration, and change by the motion between them."""
+"""Interval above which samples are means without vibration, which differ by the motion."""
 HISTORY_INTERVAL_S: Final = 0.005
-"""Samples that come faster share a slot; between slots the integrals are interpolated."""
+"""Interval of the stored integrals, which are interpolated; faster samples share a slot."""
 CLIMB_DENSITY: Final = 4.0
 """Random walk of the height without GPS, m2/s: a climb of 2 m/s that lasts for a second."""
 
@@ -100,7 +100,7 @@ def rate_of(s: State, gyro: Vec3) -> Vec3:
 def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     """Advance the nominal state by one sample, and collect the terms of the propagation.
 
-    Midpoint rule: the force acts at the attitude half way through the interval.
+    Midpoint rule: the force is rotated by the attitude in the middle of the interval.
     """
     rate = rate_of(s, gyro)
     write_vec(s.rate_b, rate)
@@ -129,7 +129,7 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
             s.pos_n[k] += (s.vel_n[k] + 0.5 * a * dt) * dt
             s.vel_n[k] += a * dt
         elif k < 2 and s.time_s - s.fix_s < FRESH_GPS_S:
-            # A fix that no heading allows to fuse moves on by its velocity.
+            # Without a heading, fixes cannot be fused: extrapolate the position by its velocity.
             s.pos_n[k] += s.fix_vel[k] * dt
     for k in range(2):
         s.blend_n[k] -= min(1.0, dt / BLEND_S) * s.blend_n[k]
@@ -141,10 +141,10 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
 
 @compiled
 def add_vibration(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
-    """Add the noise by how the changes from sample to sample change: motion is steady, noise not.
+    """Add vibration noise, measured by second differences of the samples, in which motion is small.
 
-    The second difference contains the noise of three samples, the middle one twice: six variances
-    on each of three axes.
+    The second difference contains the noise of three samples, that of the middle one twice: six
+    variances on each of three axes.
     """
     gyro_sq = accel_sq = 0.0
     for k in range(3):
@@ -165,7 +165,7 @@ def add_vibration(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> Non
 def follow_gravity(s: State, p: Gains, force_i: Vec3, dt: float) -> None:
     """Low-pass the force in the gyroscope frame, where gravity is constant [3]_.
 
-    A plain mean at first, so that the first sample does not count for a whole time constant.
+    It starts as a mean, so that the first sample does not have the weight of a time constant.
     """
     s.force_lp_s += dt
     share = min(1.0, dt / min(p.gravity_tau_s, s.force_lp_s))
@@ -193,7 +193,7 @@ def store_integrals(s: State) -> None:
 
 @compiled
 def look_back(s: State, time_s: float) -> float:
-    """Interpolate the integrals of a past time into `then`; return the time they hold for."""
+    """Interpolate the integrals of a past time into `then`; return the time actually found."""
     count = s.history_count
     if time_s >= s.time_s or count == 0:
         for k in range(INTEGRALS):
@@ -285,10 +285,10 @@ def add_row(P: FloatArray, to: int, factor: float, row: int, columns: int) -> No
 
 @compiled
 def mirror(P: FloatArray) -> None:
-    """Transpose the product from the left, for one from the right, without a copy.
+    """Transpose the product from the left in place, for the product from the right.
 
-    The second product changes the columns of the moving states alone. Their rows keep what is
-    final: the covariances with the other states.
+    The second product changes only the columns of the moving states. Their rows keep final values:
+    the covariances with the other states.
     """
     for j in range(MOVING_STATES):
         for i in range(j + 1, STATES):
@@ -300,9 +300,9 @@ def mirror(P: FloatArray) -> None:
 
 @compiled
 def symmetrise(P: FloatArray) -> None:
-    """Remove the asymmetry of rounding, which would grow without bound in long flights.
+    """Remove the asymmetry due to rounding, which would grow without bound in long flights.
 
-    The moving states alone have any: the covariances with the others are copies, and an update
+    Only the moving states have it: the covariances with the others are copies, and an update
     subtracts a symmetric product.
     """
     for i in range(MOVING_STATES):
@@ -318,7 +318,7 @@ def unexpected_bias_density(s: State, k: int) -> float:
 
 @compiled
 def follow_bias_steps(s: State, dt: float) -> None:
-    """Fade the sums; they start once a known attitude was corrected for `BIAS_MEMORY_S`."""
+    """Fade the sums, which start once a known attitude was corrected for `BIAS_MEMORY_S`."""
     known = s.lost == 0 and s.heading_known == 1
     s.bias_watch_s = min(s.bias_watch_s + dt, BIAS_MEMORY_S) if known else 0.0
     if min(s.bias_watch_s, s.sound_s) < BIAS_MEMORY_S:

@@ -1,8 +1,8 @@
-"""Rest: quiet sensors with a constant mean, and no speed. The mean rate is then the bias.
+"""Rest: low noise with a constant mean, and no speed. The mean rate is then the bias.
 
-A rate beyond the usual bias is the bias of an uncalibrated gyroscope if it turns nothing: not the
-force, which is constant and that of gravity, and not the magnetic field; without a compass, if it
-has not ended after two full circles.
+A rate beyond the usual bias is the bias of an uncalibrated gyroscope if no other sensor measures a
+rotation: the force is constant and equal to gravity, and the magnetic field is constant or, without
+a compass, the rate has not ended after two full circles.
 """
 
 import math
@@ -21,12 +21,12 @@ from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 MEAN_S: Final = 0.5
 """Time constant of the means."""
 DRIFT_S: Final = 10.0
-"""Time constant by which the means of a rest may drift, as in a sensor that warms up."""
+"""Time constant of the drift of the means at rest, as of a sensor that warms up."""
 REST_RATE_RADPS: Final = 0.5 * RAD_PER_DEG
 REST_FORCE_MPS2: Final = 0.35
-"""Changes of the means that end a rest: 2 deg of tilt."""
+"""Change of the mean that ends a rest: 2 deg of tilt."""
 USUAL_BIAS_RADPS: Final = 6.0 * RAD_PER_DEG
-"""A larger constant rate is more often a turn than a bias."""
+"""Constant rate above which it is more often a turn than a bias."""
 STATIONARY_BIAS_TURN_RAD: Final = 1.0
 """The same as `BIAS_TURN_RAD` while GPS shows no speed."""
 GRAVITY_SHARE: Final = 0.2
@@ -35,7 +35,7 @@ GRAVITY_SHARE: Final = 0.2
 
 @compiled
 def is_moving(s: State, p: Gains) -> bool:
-    """Return whether GPS, or dead reckoning with one standard deviation, shows a speed."""
+    """Return whether GPS, or dead reckoning minus one standard deviation, gives a speed."""
     fresh = s.time_s - s.fix_s < FRESH_GPS_S
     if s.aided == 0:
         return fresh and math.hypot(s.fix_vel[0], s.fix_vel[1]) > p.rest_speed_mps
@@ -96,7 +96,7 @@ def keeps_means(s: State, dt: float) -> bool:
 
 @compiled
 def is_usual_bias(s: State, rate: Vec3) -> bool:
-    """Return whether a rate is close to the bias of the last rest."""
+    """Return whether a rate is close to the bias measured at the last rest."""
     b = s.rest_bias_b
     off = max(abs(rate[0] - b[0]), abs(rate[1] - b[1]))
     return bool(max(off, abs(rate[2] - b[2])) < USUAL_BIAS_RADPS)
@@ -104,7 +104,7 @@ def is_usual_bias(s: State, rate: Vec3) -> bool:
 
 @compiled
 def is_likely_bias(s: State, quiet: bool, dt: float) -> bool:
-    """Return whether the mean rate can be a bias; beyond the usual one it must turn nothing."""
+    """Return whether the mean rate can be a bias; a large one must not be a rotation."""
     upright = norm_sq = 0.0
     for k in range(3):
         upright += (s.imu_mean[k] - s.rest_bias_b[k]) * s.imu_mean[3 + k]
@@ -122,7 +122,7 @@ def is_likely_bias(s: State, quiet: bool, dt: float) -> bool:
 
 @compiled
 def begin_rest(s: State, p: Gains) -> None:
-    """Store the bias of a rest; one that is far off has turned the attitude, which is lost then."""
+    """Store the bias of a rest; if it differs much, it has rotated the attitude, which is lost."""
     off = 0.0
     for k in range(3):
         off = max(off, abs(s.gyro_mean[k] - s.gyro_bias_b[k]))

@@ -1,4 +1,4 @@
-"""Settings of the filter, and the same as variances and densities in SI units."""
+"""Settings of the filter, also as variances and densities in SI units."""
 
 import math
 from typing import Annotated
@@ -36,7 +36,7 @@ class EskfSettings(Settings, frozen=True):
     gyro_turn_deg: Annotated[
         float,
         setting(
-            "Attitude error after a turn of 1 rad, by axes that are not orthogonal.",
+            "Attitude error after a turn of 1 rad due to axes that are not orthogonal.",
             "deg",
             ge=0.0,
             le=10.0,
@@ -55,7 +55,7 @@ class EskfSettings(Settings, frozen=True):
     gyro_bias_change_degps: Annotated[
         float,
         setting(
-            "Change of the gyroscope bias between rest and motion, by heat and vibration.",
+            "Change of the gyroscope bias between rest and motion due to heat and vibration.",
             "deg/s",
             ge=0.0,
             le=5.0,
@@ -88,8 +88,8 @@ class EskfSettings(Settings, frozen=True):
     gravity_tau_s: Annotated[
         float,
         setting(
-            "Time constant of each of two low-passes that find gravity without GPS. Small follows "
-            "accelerations, large the drift of the gyroscope.",
+            "Time constant of each of two low-passes that determine gravity without GPS. Small: "
+            "follows accelerations. Large: follows the drift of the gyroscope.",
             "s",
             ge=0.1,
             le=20.0,
@@ -97,12 +97,12 @@ class EskfSettings(Settings, frozen=True):
     ] = 1.0
     gravity_noise_mps2: Annotated[
         float,
-        setting("Acceleration that low-pass filtered gravity contains.", "m/s2", ge=0.001, le=5.0),
+        setting("Acceleration in the low-pass filtered gravity.", "m/s2", ge=0.001, le=5.0),
     ] = 0.1
     gravity_motion: Annotated[
         float,
         setting(
-            "Share of the difference between both low-passes that counts as error of gravity.",
+            "Share of the difference of the two low-passes that counts as error of gravity.",
             ge=0.0,
             le=2.0,
         ),
@@ -110,7 +110,9 @@ class EskfSettings(Settings, frozen=True):
     gps_position_m: Annotated[
         float, setting("Noise of a fix, horizontal.", "m", ge=0.01, le=50.0)
     ] = 1.2
-    gps_height_m: Annotated[float, setting("Noise of its height.", "m", ge=0.01, le=50.0)] = 1.9
+    gps_height_m: Annotated[
+        float, setting("Noise of the height of a fix.", "m", ge=0.01, le=50.0)
+    ] = 1.9
     gps_error_m: Annotated[
         float, setting("Slow error of the GPS position, horizontal.", "m", ge=0.01, le=50.0)
     ] = 0.7
@@ -118,18 +120,21 @@ class EskfSettings(Settings, frozen=True):
         float, setting("Slow error of the GPS height.", "m", ge=0.01, le=50.0)
     ] = 2.5
     gps_error_s: Annotated[
-        float, setting("Correlation time of these slow errors.", "s", ge=1.0, le=3600.0)
+        float, setting("Correlation time of the slow GPS errors.", "s", ge=1.0, le=3600.0)
     ] = 29.0
     gps_velocity_mps: Annotated[
         float, setting("Noise of the GPS velocity, horizontal.", "m/s", ge=0.01, le=10.0)
     ] = 0.4
     gps_climb_mps: Annotated[
-        float, setting("Noise of its vertical velocity.", "m/s", ge=0.01, le=10.0)
+        float, setting("Noise of the GPS velocity, vertical.", "m/s", ge=0.01, le=10.0)
     ] = 0.25
     gps_correlation_s: Annotated[
         float,
         setting(
-            "Correlation time of this noise: faster fixes add no information.", "s", ge=0.0, le=10.0
+            "Correlation time of the velocity noise: faster fixes add no information.",
+            "s",
+            ge=0.0,
+            le=10.0,
         ),
     ] = 0.4
     gps_jitter_s: Annotated[
@@ -139,10 +144,10 @@ class EskfSettings(Settings, frozen=True):
         float, setting("Compass noise, sample to sample.", "deg", ge=0.1, le=45.0)
     ] = 5.3
     mag_latency_s: Annotated[
-        float, setting("Age of the field in its sample.", "s", ge=0.0, le=0.2)
+        float, setting("Age of the magnetic field in a sample.", "s", ge=0.0, le=0.2)
     ] = 0.02
     mag_latency_std_s: Annotated[
-        float, setting("Standard deviation of that age.", "s", ge=0.0, le=0.2)
+        float, setting("Standard deviation of the age of the field.", "s", ge=0.0, le=0.2)
     ] = 0.03
     hard_iron_ut: Annotated[
         float, setting("Hard iron left by a calibration, per axis.", "uT", ge=0.001, le=50.0)
@@ -155,12 +160,10 @@ class EskfSettings(Settings, frozen=True):
     ] = 0.005
     field_norm_tolerance: Annotated[
         float,
-        setting(
-            "Relative difference from the usual field strength that is accepted.", ge=0.01, le=1.0
-        ),
+        setting("Maximum relative difference from the usual field strength.", ge=0.01, le=1.0),
     ] = 0.1
     field_dip_tolerance_deg: Annotated[
-        float, setting("Difference from the usual dip that is accepted.", "deg", ge=1.0, le=90.0)
+        float, setting("Maximum difference from the usual dip.", "deg", ge=1.0, le=90.0)
     ] = 10.0
     baro_noise_m: Annotated[
         float, setting("Noise of the barometer's height.", "m", ge=0.01, le=20.0)
@@ -170,37 +173,35 @@ class EskfSettings(Settings, frozen=True):
     ] = 1.2
     dead_reckoning_s: Annotated[
         float,
-        setting("How long position and velocity are carried without GPS.", "s", ge=1.0, le=600.0),
+        setting("Longest dead reckoning without GPS.", "s", ge=1.0, le=600.0),
     ] = 60.0
     gate_sigma: Annotated[
         float,
-        setting(
-            "Innovations beyond this many standard deviations are weighted down.", ge=2.0, le=20.0
-        ),
+        setting("Standard deviations above which innovations have less weight.", ge=2.0, le=20.0),
     ] = 5.0
     gate_m: Annotated[
         float,
         setting(
-            "A fix that is off by less is never rejected, only weighted down.",
+            "Distance of a fix below which it has less weight but is never rejected.",
             "m",
             ge=0.0,
             le=100.0,
         ),
     ] = 10.0
     rest_gyro_degps: Annotated[
-        float, setting("At rest the rate stays this close to its mean.", "deg/s", ge=0.01, le=10.0)
+        float, setting("Maximum deviation of the rate at rest.", "deg/s", ge=0.01, le=10.0)
     ] = 2.0
     rest_accel_mps2: Annotated[
-        float, setting("At rest the force stays this close to its mean.", "m/s2", ge=0.01, le=5.0)
+        float, setting("Maximum deviation of the force at rest.", "m/s2", ge=0.01, le=5.0)
     ] = 0.5
     rest_time_s: Annotated[
-        float, setting("How long that must last to be called rest.", "s", ge=0.2, le=30.0)
+        float, setting("Time within both deviations after which it is rest.", "s", ge=0.2, le=30.0)
     ] = 1.5
     rest_speed_mps: Annotated[
-        float, setting("GPS speed above which nothing is at rest.", "m/s", ge=0.05, le=10.0)
+        float, setting("Maximum GPS speed at rest.", "m/s", ge=0.05, le=10.0)
     ] = 0.7
     bias_limit_degps: Annotated[
-        float, setting("Largest gyroscope bias that is possible.", "deg/s", ge=0.1, le=30.0)
+        float, setting("Largest possible gyroscope bias.", "deg/s", ge=0.1, le=30.0)
     ] = 20.0
 
 
@@ -247,7 +248,7 @@ class Gains:
     field_norm_tolerance: float
     field_dip_tolerance_rad: float
     declination_rad: float
-    """NaN where it is looked up at the position of a fix."""
+    """NaN if it is looked up at the position of a fix."""
     baro_var: float
     baro_density: float
     dead_reckoning_s: float
@@ -261,7 +262,7 @@ class Gains:
 
 
 def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
-    """Convert the settings to SI units; those of the same name are in SI units already."""
+    """Convert the settings to SI units; those with the same name are already in SI units."""
     same = msgspec.structs.asdict(reference) | msgspec.structs.asdict(settings)
     return filled_record(Gains, same | _variances(settings, reference))
 

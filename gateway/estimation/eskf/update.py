@@ -2,7 +2,7 @@
 
 A measurement of several numbers is a group of scalar updates, so no matrix is inverted. For each
 number the row `h` of the measurement matrix is written, `update_scalar` adds the correction to the
-error `dx` of the group, and at the end `inject` moves that into the nominal state.
+error `dx` of the group, and at the end `inject` applies it to the nominal state.
 
 | measurement | model | function |
 | --- | --- | --- |
@@ -53,15 +53,16 @@ from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 REST_GATE_SQ: Final = 4.0
-"""Two standard deviations: the rate at rest may be a slow turn."""
+"""Squared gate, two standard deviations, because the rate at rest may be a slow turn."""
 GRAVITY_TOLERANCE: Final = 0.02
-"""A mean force beyond gravity by more than this share, an MPU6050's scale error, accelerates."""
+"""Deviation of the mean force from gravity, as a share, above which it is an acceleration: the
+scale error of an MPU6050."""
 LEVEL_INTERVAL_S: Final = 0.1
 """Interval of the measurements that replace GPS."""
 REST_VELOCITY_VAR: Final = 0.2**2
-"""Of a vehicle that idles, m2/s2."""
+"""Variance of the velocity of a vehicle with an idling engine, m2/s2."""
 REST_RATE_VAR: Final = 0.002**2
-"""Of the mean rate at rest, which has the noise of an idling engine, rad2/s2."""
+"""Variance of the mean rate at rest, with the noise of an idling engine, rad2/s2."""
 
 
 @compiled
@@ -73,7 +74,7 @@ def clear_row(s: State) -> None:
 
 @compiled
 def consider(s: State, first: int, count: int) -> None:
-    """Keep states as they are in this update, while their uncertainty counts [2]_."""
+    """Exclude states from this update, but include their uncertainty [2]_."""
     s.considered[first : first + count] = 1.0
 
 
@@ -105,13 +106,13 @@ def innovation_variance(s: State, variance: float) -> float:
 def update_scalar(s: State, innovation: float, variance: float, gate_sq: float) -> None:
     """Update by one number, measured minus predicted.
 
-    With the innovation `e`, less `h dx` of the group's earlier rows, and its variance
+    With the innovation `e`, minus `h dx` of the group's earlier rows, and its variance
     `S = h P h^T + variance`, the gain is `K = P h^T / S`; then `dx' = dx + K e` and
-    `P' = P - K S K^T` ([1]_, section 6.1). Considered states have no gain, and among themselves
-    keep their covariance [2]_.
+    `P' = P - K S K^T` ([1]_, section 6.1). Considered states have no gain, and the covariance among
+    them does not change [2]_.
 
     An innovation outside the gate inflates `S` until it is on the gate, `e^2 = gate_sq S`: an
-    outlier has little effect, while a lasting difference is followed in the end.
+    outlier has little effect, while a lasting difference is corrected in the end.
     """
     for j in range(STATES):
         innovation -= s.h[j] * s.dx[j]
@@ -137,7 +138,7 @@ def update_scalar(s: State, innovation: float, variance: float, gate_sq: float) 
 
 @compiled
 def inject(s: State) -> None:
-    """Move the corrections of a group of updates into the nominal state: `q(att) * q_nb` [1]_."""
+    """Apply the corrections of a group of updates to the nominal state: `q(att) * q_nb` [1]_."""
     d = s.dx
     turn = from_rotation_vector((d[ATT], d[ATT + 1], d[ATT + 2]))
     write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
@@ -156,7 +157,7 @@ def inject(s: State) -> None:
 
 @compiled
 def gravity_force_n(s: State) -> Vec3:
-    """Return the low-pass filtered force in NED by the present attitude, m/s2."""
+    """Return the low-pass filtered force, rotated to NED by the present attitude, m/s2."""
     force_b = rotate_inverse(as_quat(s.q_ib), as_vec(s.force_lp_i[1]))
     return rotate(as_quat(s.q_nb), force_b)
 
@@ -179,11 +180,11 @@ def gravity_variance(s: State, p: Gains) -> float:
 
 @compiled
 def update_gravity(s: State, p: Gains, dt: float) -> None:
-    """Level by the direction of the filtered force, whose errors last for its time constants.
+    """Level by the direction of the filtered force, whose errors are correlated in time.
 
     Without acceleration the true force in NED, `f_n + att x f_n - R accel_bias`, has no horizontal
-    part. The bias of the accelerometer cannot be separated from tilt here, so it is only
-    considered: the covariance of the level contains it, and the first fixes resolve both.
+    part. The accelerometer bias cannot be distinguished from tilt here, so it is only considered:
+    the covariance of the level includes it, and the first fixes separate the two.
     """
     propagate(s, p)
     north, east, down = gravity_force_n(s)
@@ -227,7 +228,7 @@ def update_height(s: State, p: Gains) -> None:
 
 @compiled
 def restart_baro(s: State, p: Gains) -> None:
-    """Take the barometer's offset from the present height."""
+    """Set the barometer's offset from the present height."""
     propagate(s, p)
     s.baro_offset_m = s.pos_n[2] - s.baro_down_m
     s.resets[BARO_OFFSET] += 1.0
