@@ -1,5 +1,5 @@
 #!/bin/sh
-# Install Debian packages that are missing, if this user may; say so, and fail if not.
+# Install missing Debian packages if this user may; otherwise print them and fail.
 # usage: tools/apt_install.sh PACKAGE...
 set -eu
 missing=

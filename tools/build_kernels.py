@@ -70,7 +70,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     if options.output or options.force or not is_current():
-        build_installed(options.output or LIBRARY, options.architecture, afresh=options.force)
+        build_installed(options.output or LIBRARY, options.architecture, rebuild=options.force)
 
 
 def is_current() -> bool:
@@ -81,7 +81,7 @@ def is_current() -> bool:
         return False
 
 
-def build_installed(path: Path, architecture: str | None = None, *, afresh: bool = False) -> None:
+def build_installed(path: Path, architecture: str | None = None, *, rebuild: bool = False) -> None:
     """Build the library that the gateway loads, in a process without other imports.
 
     Parameters
@@ -89,7 +89,7 @@ def build_installed(path: Path, architecture: str | None = None, *, afresh: bool
     path : Path
     architecture : str, optional
         See `build_library`.
-    afresh : bool
+    rebuild : bool
         Do not use an object file of the cache.
     """
     for name in KERNEL_MODULES:
@@ -98,7 +98,7 @@ def build_installed(path: Path, architecture: str | None = None, *, afresh: bool
     names = [name for name in sys.modules if name.startswith("gateway.")]
     files = {sys.modules[name].__file__ for name in names if not name.startswith(NO_KERNELS)}
     stamp = "\n".join(sorted(stamp_of(Path(file)) for file in files if file))
-    cached = None if afresh or architecture else cached_object(stamp)
+    cached = None if rebuild or architecture else cached_object(stamp)
     build_library(
         path, ENTRY_POINTS, stamp=stamp, architecture=architecture, cached=cached, show=True
     )

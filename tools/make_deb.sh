@@ -1,7 +1,7 @@
 #!/bin/sh
-# Build a Debian package that holds mavgate with every locked package it needs: it installs without
-# a network, separate from Debian's own Python packages, and runs with the Python version that it was built
-# with.
+# Build a Debian package that contains mavgate with every locked package it needs: it installs
+# without a network, separate from Debian's own Python packages, and runs with the Python version
+# with which it was built.
 # usage: tools/make_deb.sh OUTPUT_FOLDER
 # PYTHON names the interpreter (with pip and setuptools); LOCK= leaves the dependencies out.
 set -eu
@@ -21,7 +21,7 @@ install() {
     "$python" -m pip install --disable-pip-version-check --no-compile --no-deps --target "$lib" "$@"
 }
 
-# From a copy: setuptools would also pack what an earlier build left in the tree.
+# From a copy, since setuptools would also pack files of an earlier build in the tree.
 mkdir -p "$work/source"
 cp -r gateway config docs tools pyproject.toml setup.py README.md CHANGELOG.md LICENSE "$work/source"
 find "$work/source" -name __pycache__ -prune -exec rm -r {} +
@@ -31,8 +31,8 @@ rm -rf "$lib/bin" "$lib"/mavgate-*.dist-info/direct_url.json
 [ -z "$lock" ] || step "$(grep -c '^[A-Za-z]' "$lock") packages of $lock" \
     install --require-hashes --requirement "$lock"
 rm -rf "$lib/bin" "$lib/share"
-# A third of all that would be installed are the tests of other packages, types, sources of C, and
-# MAVLink dialects that are parts of `all`.
+# A third of the files would be tests of other packages, types, C sources, and MAVLink dialects that
+# `all` includes.
 find "$lib" -type d -name tests -prune -exec rm -r {} +
 find "$lib" -name "*_tests.*.so" -delete
 find "$lib" -type f \( -name "*.pyi" -o -name "*.pyx" -o -name "*.pxd" -o -name "*.[ch]" \) -delete
@@ -40,7 +40,7 @@ dialects=$lib/pymavlink/dialects
 if [ -d "$dialects" ]; then
     find "$dialects" -type f ! -name __init__.py ! -path "$dialects/v20/all.*" -delete
 fi
-# Not those in folders *.libs, which were changed after linking and would break.
+# Not the libraries in folders *.libs, which were changed after linking and would become invalid.
 if command -v strip >/dev/null; then
     find "$lib" -name "*.so" ! -path "*.libs/*" -exec strip --strip-unneeded {} +
 fi
@@ -75,10 +75,10 @@ for shell in bash zsh fish; do
     _MAVGATE_COMPLETE=source_$shell PYTHONPATH=$lib "$python" "$root/usr/bin/mavgate" \
         > "$root/$file"
 done
-# Python wrote it while this script ran the program; the installation writes it for its Python.
+# Bytecode that Python wrote when this script ran the program; the installation writes its own.
 find "$root" -name __pycache__ -prune -exec rm -r {} +
 find "$lib" -type f -exec chmod 644 {} +
-# Modules of some packages begin as programs do, for a Python that Debian does not have.
+# Some modules begin with the path of a Python interpreter that Debian does not have.
 find "$lib" -name "*.py" -exec sed -i '1s|^#!.*python.*$|#!/usr/bin/python3|' {} +
 mkdir -p "$root/usr/share/lintian/overrides"
 cp tools/debian/lintian-overrides "$root/usr/share/lintian/overrides/mavgate"

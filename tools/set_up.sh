@@ -2,8 +2,8 @@
 # Make the virtual environment .venv, install locked packages into it, and compile the kernels.
 # usage: tools/set_up.sh LOCK_FILE...
 # The kernels are compiled while the packages that they do not need are installed.
-# Prints one line a step, and the output of a step only if it fails. Installs Debian's python3-venv
-# if it is missing and this user may install packages.
+# Prints one line per step, and the output of a step only if it fails. Installs Debian's
+# python3-venv if it is missing and this user may install packages.
 set -eu
 
 python=${PYTHON:-}
@@ -27,7 +27,7 @@ compiling=
 kernel_log=$(mktemp) compiler_lock=$(mktemp)
 trap 'rm -f "$step_log" "$kernel_log" "$compiler_lock"; [ -z "$compiling" ] || kill "$compiling" 2>/dev/null || :' EXIT
 
-# The lock lists every package with its hashes: what it leaves out is not installed.
+# The lock lists every package with its hashes; packages that it does not list are not installed.
 install() {
     .venv/bin/python -m pip install --disable-pip-version-check --no-deps "$@"
 }

@@ -1,5 +1,5 @@
 # Sourced by other scripts: `step TEXT COMMAND...` runs a command silently, and prints one line with
-# what it does and how long it took. The output of a command that fails is printed.
+# the text and the duration. The output of a command that fails is printed.
 step_log=$(mktemp)
 
 step() {

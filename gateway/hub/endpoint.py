@@ -279,7 +279,7 @@ def parse_endpoint(url: str) -> Endpoint:
     `not-systems`, `components` (ids, separated by commas), `as` (see `new_ids_from`), and of some
     kinds `origins` (separated by commas), `path`, `site`, `keys` and `config`.
 
-    Raises ValueError if anything in it is not understood; the text says what is allowed.
+    Raises ValueError if a part of it is invalid; the text gives the allowed values.
     """
     address, _, query = url.partition("?")
     try:

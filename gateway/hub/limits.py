@@ -7,8 +7,8 @@ costs, each byte of an answer costs one, and no request is taken from a client w
 negative. All untrusted clients share a single small bucket, because a refused one could return
 from another address.
 
-What a ground station does in a session (a parameter list, files of metadata, a mission of two
-thousand items) fits into a full bucket; the rate matters only after that.
+The requests of a ground station in a session (a parameter list, files of metadata, a mission of
+two thousand items) fit into a full bucket; the rate matters only after that.
 """
 
 from collections import deque

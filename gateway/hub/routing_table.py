@@ -59,7 +59,7 @@ HEARTBEAT_ID, HOME_POSITION_ID = MESSAGE_IDS["HEARTBEAT"], MESSAGE_IDS["HOME_POS
 GREETING: Final = (HEARTBEAT_ID, HOME_POSITION_ID)
 """Messages of a greeting, in this order: the vehicle exists, and its home."""
 OWN_FRESH_US: Final = 5 * US_PER_S
-"""A system whose heartbeat we have not sent for so long is no longer ours: a playback ended."""
+"""Time without a sent heartbeat after which a system is no longer ours: a playback has ended."""
 
 
 @dataclass(slots=True)

@@ -82,7 +82,7 @@ STEPS: Final = 20
 Key = bytes
 """System, component and message of a frame, as in `MavFrame.key`."""
 ANSWER_IDS: Final = ids_of("HEARTBEAT", "COMMAND_INT", "COMMAND_LONG", "COMMAND_ACK", "STATUSTEXT")
-"""Messages of which the next one does not replace a lost one."""
+"""Messages whose loss is not made up by the next one."""
 URGENT_IDS: Final = ids_of(
     *("ATTITUDE", "ATTITUDE_QUATERNION", "ATTITUDE_QUATERNION_COV"),
     *("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"),
@@ -141,7 +141,7 @@ class Bandwidth:
     def plan(
         self, offered: Mapping[Key, tuple[int, int, int]], answered: int, elapsed_s: float
     ) -> None:
-        """Find new intervals from what was offered by kind and answered since the last plan."""
+        """Find new intervals from the frames offered by kind and the answers since the last one."""
         if elapsed_s <= 0:
             return
         for key in self._offered.keys() | offered.keys():

@@ -34,7 +34,7 @@ class ClientCounters:
     sent: int = 0
     dropped: int = 0
     unheard: int = 0
-    """Frames sent to a port on which nobody listens, or withheld from an unproven client."""
+    """Frames sent to a port without a listener, or withheld from an unproven client."""
     bytes_sent: int = 0
     received: int = 0
     bytes_received: int = 0
@@ -73,7 +73,7 @@ class ClientStats:
     reason: str = ""
     """Why nothing is sent: the operating system's error; empty if frames are sent."""
     unheard: int = 0
-    """Frames sent to a port on which nobody listened; they do not count as loss."""
+    """Frames sent to a port without a listener; they do not count as loss."""
     refused: int = 0
     """Frames that could not be renumbered."""
     cached: tuple[str, ...] = ()

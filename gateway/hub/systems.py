@@ -79,7 +79,7 @@ class SystemFilter:
         return self.has(frame.origin) or (from_station and not is_vehicle(sender))
 
     def lets_send(self, message_id: int, target: Origin) -> bool:
-        """Return whether a message addresses only what passes, or commands nothing.
+        """Return whether a message addresses only systems that pass, or is not a command.
 
         Messages without a target component are for the autopilot.
         """
@@ -150,7 +150,7 @@ class SystemTranslation:
     Parameters
     ----------
     new_ids : dict of int to int
-        Ids here by those of the link; the key 0 stands for the first autopilot of the link.
+        Ids here by those of the link; the key 0 means the first autopilot of the link.
     renewal : callable
         Returns the signer of a changed frame; None if no key of the gateway fits its signature.
     on_change : callable

@@ -140,7 +140,7 @@ class PartFiles:
 def close_behind(
     files: PartFiles, written: Future[DiskState], syncing: Future[None] | None
 ) -> None:
-    """Close a part once its end is written and its last sync has ended; log what fails."""
+    """Close a part once its end is written and its last sync has ended; log errors."""
     try:
         try:
             written.result()

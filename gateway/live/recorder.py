@@ -88,7 +88,7 @@ class Recorder:
         self._seen: set[int] = set()
         self._part: Part | None = None
         self._memory: deque[tuple[int, Part]] = deque()
-        """The stretch before arming, in two parts that begin half its length apart."""
+        """The data before arming, in two parts whose begins differ by half its length."""
         self._watch = ArmedWatch() if settings.mode == "armed" else None
         self._files: PartFiles | None = None
         self._disk = DiskState(0, 0)

@@ -54,7 +54,7 @@ RETRY_US: Final = US_PER_S
 OnForeign = Callable[[Sequence[bytes]], None]
 """Called with frames of other systems that are forwarded, in their order."""
 STALE_AFTER_US: Final = 3 * US_PER_S
-"""Three missed heartbeats: a client that has sent nothing for so long may be replaced."""
+"""Time without a frame after which a client may be replaced: three missed heartbeats."""
 SHARE: Final = 4
 """Divisor: one host keeps a quarter of a full port's clients when others connect."""
 FEW: Final = 4
@@ -402,7 +402,7 @@ class Client:
         return 0
 
     def receive(self, events: list[Event], size: int, now_us: int) -> None:
-        """Count received events of so many bytes, and route the frames."""
+        """Count received events of `size` bytes, and route the frames."""
         self.counters.bytes_received += size
         for event in events:
             if isinstance(event, SplitFault):

@@ -76,7 +76,7 @@ def add_endpoint_kind(
     Parameters
     ----------
     word : str
-        The part before the URL's first colon; what follows, up to the options, is `Endpoint.host`.
+        The part before the URL's first colon; the rest, up to the options, is `Endpoint.host`.
     make : callable
         Creates the client of one endpoint from the hub, the client's id and the endpoint; a
         subclass of `Client` has this signature.

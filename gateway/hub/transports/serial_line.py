@@ -47,7 +47,7 @@ class SerialClient(QueuedClient):
         return max(MIN_QUEUE_BYTES, round(bytes_per_s * QUEUE_US / US_PER_S))
 
     def transmit(self, frame: MavFrame) -> None:
-        """Queue one frame and write what the line has room for."""
+        """Queue one frame and write the frames for which the line has room."""
         if self._port is None:
             self.counters.dropped += 1
             return

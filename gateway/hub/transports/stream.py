@@ -26,7 +26,7 @@ CHUNK_BYTES: Final = 4096
 SLOW_CHUNK_BYTES: Final = 512
 """The same for a slow connection: joined frames can no longer be overtaken."""
 USER_TIMEOUT_MS: Final = 30_000
-"""A peer that acknowledges nothing for so long is gone; a paused one may resume sooner."""
+"""Time without an acknowledgement after which a peer is gone; a paused one may resume sooner."""
 SEND_BUFFER_BYTES: Final = 32_768
 """Most bytes that the peer has not acknowledged: those in flight on a long link."""
 UNSENT_BYTES: Final = 2048

@@ -258,7 +258,7 @@ class FtpService(TransferService):
 
 
 def _burst(request: Request, packet: Packet, content: bytes) -> Iterator[Reply]:
-    """Build the packets of a burst that sends what remains of the content."""
+    """Build the packets of a burst with the rest of the content."""
     size = min(max(packet.size or MAX_DATA, MIN_BURST_DATA), MAX_DATA)
     for number, start in enumerate(range(0, len(content), size)):
         asked = packet._replace(sequence=packet.sequence + number, offset=packet.offset + start)

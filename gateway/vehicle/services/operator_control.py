@@ -3,11 +3,11 @@
 | request | while                                  | answer                    |
 | ------- | -------------------------------------- | ------------------------- |
 | control | open                                   | accepted, nothing changes |
-| control | nobody, or the sender, is in control   | accepted                  |
+| control | no other station is in control         | accepted                  |
 | control | another is, and allows a takeover      | accepted                  |
 | control | another is, and does not               | failed; it is notified    |
 | release | the sender is in control, or open      | accepted                  |
-| release | another is, or nobody                  | denied                    |
+| release | another is, or no station              | denied                    |
 | any     | the sender is not trusted              | denied                    |
 
 The station in control is identified by its client and its MAVLink system id, so that frames of

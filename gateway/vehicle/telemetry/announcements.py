@@ -168,7 +168,7 @@ class Announcer:
 
 
 def utf8(text: str, size: int) -> bytes:
-    """Encode a text in at most so many bytes, without a part of a character at its end."""
+    """Encode a text in at most `size` bytes, without a partial character at its end."""
     return text.encode(errors="replace")[:size].decode(errors="ignore").encode()
 
 

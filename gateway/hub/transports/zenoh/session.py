@@ -195,7 +195,7 @@ def _regular_file(file: str) -> Path:
 def open_session(config: "zenoh.Config") -> "zenoh.Session":
     """Open a session; waits, so it is called off the loop.
 
-    Raises OSError if nobody answers at the locator, or a certificate or key cannot be read.
+    Raises OSError without an answer at the locator, or if a certificate or key cannot be read.
     """
     import zenoh
 
@@ -353,7 +353,7 @@ class Subscription:
             if oldest.priority == self._usual:
                 self.dropped += 1
             else:
-                # Commands, parameters, missions, texts: none of them is sent again.
+                # Commands, parameters, missions and texts are not repeated.
                 self._handle(oldest)
         handle_turn(waiting, self._handle, _cost_of)
         if waiting:
