@@ -43,7 +43,7 @@ class RoundTrip:
         self._signer = signer
         self._sender = dialect.MAVLink(None, NOBODY, PROBE_COMPONENT)
         self._reader = dialect.MAVLink(None)
-        self._asked_us: deque[int] = deque(maxlen=MAX_ASKED)
+        self._sent_us: deque[int] = deque(maxlen=MAX_ASKED)
 
     @property
     def origin(self) -> Origin:
@@ -53,7 +53,7 @@ class RoundTrip:
     def ask(self, system: int, now_us: int) -> list[MavFrame]:
         """Build the requests of one round."""
         self._sender.srcSystem = system
-        self._asked_us.append(now_us)
+        self._sent_us.append(now_us)
         return [
             self._encode(message, now_us)
             for message in (
@@ -77,7 +77,7 @@ class RoundTrip:
             sent_us = answer.ts1 // NS_PER_US
         else:
             return None
-        if sent_us not in self._asked_us:
+        if sent_us not in self._sent_us:
             return None
         round_trip_us: int = now_us - sent_us
         return round_trip_us if 0 <= round_trip_us <= LONGEST_US else None

@@ -141,7 +141,7 @@ class Router:
             return
         round_trip_us = self._round_trip.read(frame, now_us)
         measures = round_trip_us is not None or is_of_gateway(frame)
-        if client.endpoint.systems and not (measures or self._lets_in(client, frame, now_us)):
+        if client.endpoint.systems and not (measures or self._admits(client, frame, now_us)):
             self.counters.unroutable += 1
             return
         table = self._table if client.trusted else self._untrusted
@@ -165,7 +165,7 @@ class Router:
         else:
             self._route_broadcast(client, path, frame, table.is_station(origin), now_us)
 
-    def _lets_in(self, client: Client, frame: MavFrame, now_us: int) -> bool:
+    def _admits(self, client: Client, frame: MavFrame, now_us: int) -> bool:
         """Return whether the filter of a client's endpoint passes a frame received from it."""
         tables, own = (self._table, self._untrusted), self._vehicles.systems(now_us)
         from_station = any(table.is_station(frame.origin) for table in tables)
@@ -180,7 +180,7 @@ class Router:
             ),
         )
 
-    def _reaches(self, client: Client, frame: MavFrame, other_id: int) -> bool:
+    def _may_reach(self, client: Client, frame: MavFrame, other_id: int) -> bool:
         """Return whether the filter of its source allows a broadcast to reach another client."""
         allowed = client.endpoint.systems
         if not allowed or not commands(frame.message_id):
@@ -315,7 +315,7 @@ class Router:
         if from_station:
             self._count(frame)
             clients = self._table.clients_with_vehicles(client.client_id)
-            clients = [key for key in clients if self._reaches(client, frame, key)]
+            clients = [key for key in clients if self._may_reach(client, frame, key)]
             self._fanout.deliver(frame, clients, client.client_id)
             return
         source_id, key = client.client_id, frame.key
@@ -327,7 +327,7 @@ class Router:
             path = path or SystemPath(now_us, now_us)
             is_shared = self._table.is_shared(frame.origin, now_us)
             rejects = partial(self._is_rejected, client, path) if is_shared else None
-            reaches = partial(self._reaches, client, frame)
+            reaches = partial(self._may_reach, client, frame)
             route = self._fanout.make_route(frame, client, path, rejects, reaches)
             is_kept = client.endpoint.cache and self._cache.reads(message_id)
             is_plain = self._rejects is None or not client.may_return

@@ -175,11 +175,11 @@ class ClientAlerts:
         self._keep_only({client.client_id for client in clients}, ports)
         alerts = [ClientAlert(True, text) for text in self._limiter.poll(now_us)]
         for listener in listeners:
-            alerts += self._away(listener.endpoint, listener.name, listener.reason, now_us)
+            alerts += self._outage_alerts(listener.endpoint, listener.name, listener.reason, now_us)
         for client in clients:
             state = ALERT_STATES.get(client.state, "")
             trouble = client.reason or state if state else ""
-            found = self._away(client.client_id, client.name, trouble, now_us)
+            found = self._outage_alerts(client.client_id, client.name, trouble, now_us)
             found += self._slow(client, now_us) + self._noted(client, now_us)
             if client.endpoint in ports:
                 found = [
@@ -190,7 +190,7 @@ class ClientAlerts:
             alerts += found
         return alerts
 
-    def _away(self, key: Key, name: str, trouble: str, now_us: int) -> list[ClientAlert]:
+    def _outage_alerts(self, key: Key, name: str, trouble: str, now_us: int) -> list[ClientAlert]:
         if not trouble:
             self._away_since_us.pop(key, None)
             if key in self._away_reported:

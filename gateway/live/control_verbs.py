@@ -232,7 +232,7 @@ class ImuTap:
     ) -> None:
         self._calibration, self._calibrate = calibration, calibrate
         self._vehicle_id = 0
-        self._asked_us: int | None = None
+        self._requested_us: int | None = None
         self._samples: deque[Values] = deque(maxlen=MAX_SAMPLES)
 
     def verbs(self) -> Verbs:
@@ -244,8 +244,8 @@ class ImuTap:
         raw = fused.imu
         if raw is None or fused.vehicle_id != self._vehicle_id:
             return
-        self._asked_us = raw.time_us if self._asked_us is None else self._asked_us
-        if raw.time_us - self._asked_us > IDLE_US:
+        self._requested_us = raw.time_us if self._requested_us is None else self._requested_us
+        if raw.time_us - self._requested_us > IDLE_US:
             self._vehicle_id = 0
             self._samples.clear()
             return
@@ -254,7 +254,7 @@ class ImuTap:
     def _take(self, vehicle_id: VehicleId) -> list[Values]:
         if vehicle_id != self._vehicle_id:
             self._samples.clear()
-        self._vehicle_id, self._asked_us = vehicle_id, None
+        self._vehicle_id, self._requested_us = vehicle_id, None
         found = [*self._samples]
         self._samples.clear()
         return found

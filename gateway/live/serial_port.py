@@ -282,11 +282,11 @@ class SerialPort:
         self._port: serial.Serial | None = None
         self._retry: asyncio.TimerHandle | None = None
         self._delay_s = FIRST_RETRY_S
-        self._last_complaint = ""
+        self._last_warning = ""
         self._search: asyncio.Task[None] | None = None
         self._rejected: set[str] = set()
         """Ports that were tried and are not the receiver."""
-        self._asked_s = 0.0
+        self._tried_s = 0.0
         self._read_us = 0
         self._left_more = False
 
@@ -314,7 +314,7 @@ class SerialPort:
         await self.disconnect()
         self._settings = replace(self._settings, port=wanted)
         self._delay_s = FIRST_RETRY_S
-        self._last_complaint = ""
+        self._last_warning = ""
         self._rejected.clear()
         self._on_lost(wanted)
         self._open()
@@ -337,7 +337,7 @@ class SerialPort:
             "open" if self.connected else state,
             self._settings.port,
             "" if self._port is None else str(self._port.port),
-            self._last_complaint if is_trying else "",
+            self._last_warning if is_trying else "",
             tuple(ports),
         )
 
@@ -354,7 +354,7 @@ class SerialPort:
                 return
             port = open_port(fitting[0], self._settings.baud, ports)
         except PortNotFoundError as error:
-            self._complain(str(error))
+            self._warn_once(str(error))
             self._try_later()
             return
         self._use(port)
@@ -362,7 +362,7 @@ class SerialPort:
     def _candidates(self, ports: list[Port]) -> list[str]:
         """List the ports that may be the receiver, without those that were tried lately."""
         fitting = fitting_ports(self._settings.port, ports)
-        if asyncio.get_running_loop().time() - self._asked_s > ASK_AGAIN_S:
+        if asyncio.get_running_loop().time() - self._tried_s > ASK_AGAIN_S:
             self._rejected.clear()
         self._rejected &= {*fitting}  # one that was unplugged may return as another
         if left := [device for device in fitting if device not in self._rejected]:
@@ -377,14 +377,14 @@ class SerialPort:
             port, data = await search_receiver(devices, self._settings.baud)
         except PortNotFoundError as error:
             self._rejected = {*devices}
-            self._complain(str(error))
+            self._warn_once(str(error))
             self._try_later()
         else:
             self._rejected = {*devices} - {port.port}
             self._use(port)
             self._on_bytes(data, self._now_us())
         self._search = None
-        self._asked_s = asyncio.get_running_loop().time()
+        self._tried_s = asyncio.get_running_loop().time()
 
     def _use(self, port: serial.Serial) -> None:
         self._port, device = port, str(port.port)
@@ -394,7 +394,7 @@ class SerialPort:
         log.info("receiver on %s at %d baud", device, self._settings.baud)
         self._needed = True
         self._delay_s = FIRST_RETRY_S
-        self._last_complaint = ""
+        self._last_warning = ""
         self._on_open(device)
         file = port.fileno()
         asyncio.get_running_loop().add_reader(file, self._read, file)
@@ -423,7 +423,7 @@ class SerialPort:
     def _broke(self, error: OSError) -> None:
         assert self._port is not None
         device = str(self._port.port)
-        self._complain(f"receiver {device} is gone: {reason_of(error)}")
+        self._warn_once(f"receiver {device} is gone: {reason_of(error)}")
         self._release()
         self._on_lost(device)
         self._try_later()
@@ -439,9 +439,9 @@ class SerialPort:
         self._retry = asyncio.get_running_loop().call_later(self._delay_s, self._open)
         self._delay_s = min(2.0 * self._delay_s, LONGEST_RETRY_S)
 
-    def _complain(self, text: str) -> None:
+    def _warn_once(self, text: str) -> None:
         """Log a problem once, even if it is repeated."""
-        if text != self._last_complaint:
+        if text != self._last_warning:
             if self._needed:
                 log.warning("%s; trying again until it works", text)
-            self._last_complaint = text
+            self._last_warning = text

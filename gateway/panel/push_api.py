@@ -23,16 +23,16 @@ class _Tokens:
     def __init__(self, control: ControlClient) -> None:
         self._control = control
         self._known: list[str] = []
-        self._asked_s = -ASK_AGAIN_S
-        self._asking = asyncio.Lock()
+        self._read_s = -ASK_AGAIN_S
+        self._reading = asyncio.Lock()
 
     async def check(self, token: str) -> None:
         """Raise ControlError for a token that is wrong."""
         if self._has(token):
             return
-        async with self._asking:
-            if time.monotonic() - self._asked_s >= ASK_AGAIN_S:
-                self._asked_s = time.monotonic()
+        async with self._reading:
+            if time.monotonic() - self._read_s >= ASK_AGAIN_S:
+                self._read_s = time.monotonic()
                 self._known = [*await self._control.ask("source.tokens")]
                 if not self._has(token):
                     # Sent so that the gateway counts the wrong token.

@@ -28,7 +28,7 @@ class RecordingFacts:
     """Figures and tracks of a folder's recordings, if it has a catalogue."""
 
     def __init__(self) -> None:
-        self._asked: tuple[Path, tuple[int, int] | None, str] | None = None
+        self._searched: tuple[Path, tuple[int, int] | None, str] | None = None
         self._figures: Figures = {}
         self._broken: set[str] = set()
         self._found: frozenset[str] | None = None
@@ -42,9 +42,9 @@ class RecordingFacts:
         A search is a part of a name, or a condition as for `mavgate catalogue list --where`.
         """
         stamp = _stamp(folder)
-        if self._asked == (folder, stamp, search):
+        if self._searched == (folder, stamp, search):
             return
-        self._asked, self.trouble = (folder, stamp, search), "" if stamp else NO_CATALOGUE
+        self._searched, self.trouble = (folder, stamp, search), "" if stamp else NO_CATALOGUE
         is_condition = not OPERATORS.isdisjoint(search)
         try:
             rows = [] if stamp is None else find_flights(folder)

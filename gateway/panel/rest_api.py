@@ -101,7 +101,7 @@ class MessageBook:
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s = now_s
         self._entries: dict[Key, _Entry] = {}
-        self._heard: set[tuple[int, int]] = set()
+        self._received: set[tuple[int, int]] = set()
         self._kinds: Counter[int] = Counter()
         """Entries by system."""
         self.dropped = 0
@@ -111,7 +111,7 @@ class MessageBook:
         """Add one message, received or sent from here."""
         key = (message.get_srcSystem(), message.get_srcComponent(), message.msgname)
         if not is_sent:
-            self._heard.add(key[:2])
+            self._received.add(key[:2])
         now_s = self._now_s()
         entry = self._entries.get(key)
         if entry is not None:
@@ -137,7 +137,7 @@ class MessageBook:
 
     def has_heard(self, system_id: int, component_id: int) -> bool:
         """Return whether a message was received from a component."""
-        return (system_id, component_id) in self._heard
+        return (system_id, component_id) in self._received
 
     def look_up(self, path: str, systems: SystemFilter = NO_FILTER) -> Any:
         """Return the value at a path such as `vehicles/1/components/1/messages/ATTITUDE`.
@@ -191,7 +191,7 @@ class Subscriber:
         self.dropped = 0
         self._waiting: deque[str | bytes] = deque()
         self._bytes = 0
-        self._news = asyncio.Event()
+        self._has_waiting = asyncio.Event()
 
     def push(self, data: str | bytes) -> None:
         """Queue a text or bytes; the oldest entries are dropped to make room."""
@@ -200,13 +200,13 @@ class Subscriber:
         while self._bytes > MAX_WAITING_BYTES:
             self._bytes -= len(self._waiting.popleft())
             self.dropped += 1
-        self._news.set()
+        self._has_waiting.set()
 
     async def next(self) -> str | bytes:
         """Return the next entry to send."""
         while not self._waiting:
-            self._news.clear()
-            await self._news.wait()
+            self._has_waiting.clear()
+            await self._has_waiting.wait()
         data = self._waiting.popleft()
         self._bytes -= len(data)
         return data

@@ -85,7 +85,7 @@ class GatewayWatch:
         self._control = control
         self._fleet = fleet
         self._task: asyncio.Task[None] | None = None
-        self._asking = asyncio.Lock()
+        self._polling = asyncio.Lock()
         """Held during a request, so that an earlier answer cannot arrive after a later one."""
 
     def start(self) -> None:
@@ -99,7 +99,7 @@ class GatewayWatch:
 
     async def refresh(self) -> None:
         """Poll now, so that the status is not older than this call."""
-        async with self._asking:
+        async with self._polling:
             try:
                 status = await self._control.ask("status")
             except ControlError:
@@ -147,7 +147,7 @@ class Uplink:
         self._player_hub = self._make_hub((PLAYBACK_URL,), played=True)
         self._senders: dict[tuple[int, int], Any] = {}
         self._listeners: list[Callable[[Any], None]] = []
-        self._heard_us = -SILENT_US
+        self._received_us = -SILENT_US
         self._local = self._reported = ""
         self._acks: dict[tuple[int, int], asyncio.Queue[int]] = {}
         self._task: asyncio.Task[None] | None = None
@@ -173,7 +173,7 @@ class Uplink:
     @property
     def is_alive(self) -> bool:
         """Whether anything was received in the last seconds."""
-        return self._clock() - self._heard_us < SILENT_US
+        return self._clock() - self._received_us < SILENT_US
 
     def listen(self, listener: Callable[[Any], None]) -> None:
         """Call a listener with every decoded message."""
@@ -246,7 +246,7 @@ class Uplink:
             return
         now_us = self._clock()
         if not played and message.get_srcSystem() != SYSTEM_ID:
-            self._heard_us = now_us
+            self._received_us = now_us
         if message.get_type() == "COMMAND_ACK":
             self._note_ack(message)
         self._fleet.update(message, now_us)

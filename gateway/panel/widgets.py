@@ -345,7 +345,7 @@ class LiveChart:
             return
         self._sent_us = {}
         named = [(name, self._unit(name)[1]) for name in self.fields]
-        self.element.set_fields(named, self._news(), unix_time_us() / 1000)
+        self.element.set_fields(named, self._new_points(), unix_time_us() / 1000)
 
     def refresh(self) -> None:
         """Send the new data."""
@@ -355,7 +355,7 @@ class LiveChart:
             # The unit is known only after the first message of its kind.
             self.reload()
             return
-        self.element.append(self._news(), unix_time_us() / 1000)
+        self.element.append(self._new_points(), unix_time_us() / 1000)
 
     async def table(self) -> str:
         """Return the visible data as CSV."""
@@ -382,7 +382,7 @@ class LiveChart:
     def _zero_unix_us(self) -> int:
         return unix_time_us() - self._context.now_us
 
-    def _news(self) -> list[Points]:
+    def _new_points(self) -> list[Points]:
         zero_us, found = self._zero_unix_us(), []
         for name in self.fields:
             time_us, values = self._series(name, self._sent_us.get(name, -1))

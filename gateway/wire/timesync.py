@@ -87,7 +87,7 @@ class ClockTracker:
         self._buckets: list[_Point] = []
         self._hull: list[_Point] = []
         """Lower hull of all buckets but the newest, which may still get a less delayed packet."""
-        self._line = self._soonest = _Point(0, 0)
+        self._line = self._least_delayed = _Point(0, 0)
         self._bucket_end_us = 0
         """End of the newest bucket on the remote clock."""
         self._skew = 0.0
@@ -105,7 +105,7 @@ class ClockTracker:
         `remote_u32` is the remote clock's time in µs, modulo 2**32, `arrival_us` is on the local
         clock.
         """
-        last_us, line, soonest, skew = self._last_us, self._line, self._soonest, self._skew
+        last_us, line, soonest, skew = self._last_us, self._line, self._least_delayed, self._skew
         remote_us = last_us + (remote_u32 - last_us & WRAP_MASK)
         local_us = remote_us + round(line.delta_us + skew * (remote_us - line.remote_us))
         if (
@@ -136,7 +136,7 @@ class ClockTracker:
             return arrival_us
         if not self._buckets or remote_us > self._last_us:
             self._last_us, self._last_arrival_us = remote_us, arrival_us
-        if self._is_soonest(remote_us, arrival_us - remote_us):
+        if self._is_least_delayed(remote_us, arrival_us - remote_us):
             self._add(_Point(remote_us, arrival_us - remote_us))
             local_us = self._to_local(remote_us)
         return min(local_us, arrival_us)
@@ -156,13 +156,13 @@ class ClockTracker:
             error_us = (remote_u32 - expected_us + HALF_WRAP_US) % WRAP_US - HALF_WRAP_US
             remote_us = expected_us + error_us
             slack_us = RESTART_JUMP_US + MAX_SKEW * elapsed_us
-            if -slack_us <= error_us <= slack_us or self._goes_on(remote_us, arrival_us, slack_us):
+            if -slack_us <= error_us <= slack_us or self._is_next(remote_us, arrival_us, slack_us):
                 return remote_us
             self._reset()
             self.restarts += 1
         return remote_u32
 
-    def _goes_on(self, remote_us: int, arrival_us: int, slack_us: float) -> bool:
+    def _is_next(self, remote_us: int, arrival_us: int, slack_us: float) -> bool:
         """Return whether a time continues the last one on the known line, though read late."""
         late_us = arrival_us - self._to_local(remote_us)
         return remote_us > self._last_us and -slack_us <= late_us <= MAX_STALL_US
@@ -173,11 +173,11 @@ class ClockTracker:
             self._late_since_us = arrival_us
         return arrival_us - self._late_since_us > DRAIN_US
 
-    def _is_soonest(self, remote_us: int, delta_us: int) -> bool:
+    def _is_least_delayed(self, remote_us: int, delta_us: int) -> bool:
         """Return whether a point is the least delayed of its bucket so far, drift removed."""
         if not self._buckets or remote_us >= self._bucket_end_us:
             return True
-        soonest = self._soonest
+        soonest = self._least_delayed
         if remote_us < self._bucket_end_us - BUCKET_US:
             return False
         # If the clock is fast, each packet would seem less delayed than the one before.
@@ -199,7 +199,7 @@ class ClockTracker:
             for each in buckets[:until]:
                 _extend_hull(begun, each)
             hull[:2] = begun
-        self._soonest = point
+        self._least_delayed = point
         self._bucket_end_us = (point.remote_us // BUCKET_US + 1) * BUCKET_US
         self._fit(buckets[0], point)
 

@@ -174,7 +174,7 @@ class CalibrationRun:
         """The present lower side, if it is unambiguous."""
         self._before, self._after = _Samples(), _Samples()
         self._side_means: dict[str, FloatArray] = {}
-        self._began_us = self._heard_us = now_us
+        self._began_us = self._received_us = now_us
         self._done_us = 0
 
     def start_message(self) -> Any:
@@ -199,7 +199,7 @@ class CalibrationRun:
 
     def poll(self, now_us: int) -> None:
         """Fail if an answer is missing; end the evaluation after its time."""
-        if self.state is RunState.ASKED and now_us - self._heard_us > NO_ANSWER_US:
+        if self.state is RunState.ASKED and now_us - self._received_us > NO_ANSWER_US:
             self._fail("the aircraft does not answer")
         elif self.state is RunState.RUNNING and now_us - self._began_us > GIVEN_UP_US:
             self._fail("no result was received")
@@ -248,7 +248,7 @@ class CalibrationRun:
                 return []
 
     def _handle_ack(self, message: Any, now_us: int) -> None:
-        self._heard_us = now_us
+        self._received_us = now_us
         if self.state.is_over or self.state is RunState.CHECKING:
             return
         if message.result == mavlink.MAV_RESULT_IN_PROGRESS:
@@ -270,7 +270,7 @@ class CalibrationRun:
             self.state, self.trouble = RunState.FAILED, match[1]
         if self.state.is_over:
             return
-        self._heard_us = now_us
+        self._received_us = now_us
         if match := _PROGRESS.match(text):
             self.progress = max(self.progress, min(int(match[1]), 100))
         elif match := _SIDE_DONE.match(text):

@@ -74,7 +74,7 @@ class FileClient:
         self._wanted: list[str] = []
         self._reading: _Reading | None = None
         self._sequence = 0
-        self._asked: Packet | None = None
+        self._request: Packet | None = None
         self._attempts = 0
         self._due_us = 0
 
@@ -90,12 +90,12 @@ class FileClient:
 
     def handle(self, message: Any, now_us: int) -> list[Any]:
         """Handle one message of the vehicle; return the messages to send."""
-        if message.get_type() != "FILE_TRANSFER_PROTOCOL" or self._asked is None:
+        if message.get_type() != "FILE_TRANSFER_PROTOCOL" or self._request is None:
             return []
         packet = decode_packet(bytes(message.payload))
-        if packet.sequence != (self._asked.sequence + 1) & 0xFFFF:
+        if packet.sequence != (self._request.sequence + 1) & 0xFFFF:
             return []
-        if packet.request_opcode != self._asked.opcode or self._reading is None:
+        if packet.request_opcode != self._request.opcode or self._reading is None:
             return []
         if packet.opcode == ACK:
             return self._on_ack(self._reading, packet, now_us)
@@ -104,13 +104,13 @@ class FileClient:
 
     def poll(self, now_us: int) -> list[Any]:
         """Repeat a request, or give up; return the messages to send."""
-        if self._asked is None or now_us < self._due_us:
+        if self._request is None or now_us < self._due_us:
             return []
         if self._attempts >= MAX_READS:
             return self._end(now_us, read=False)
         self._due_us = now_us + (RETRY_US << self._attempts)
         self._attempts += 1
-        return [self._message(self._asked)]
+        return [self._message(self._request)]
 
     def _on_ack(self, reading: _Reading, packet: Packet, now_us: int) -> list[Any]:
         if packet.request_opcode == Opcode.OPEN_FILE_RO:
@@ -130,7 +130,7 @@ class FileClient:
         return self._ask(Opcode.READ_FILE, session, offset, b"", now_us, size=size)
 
     def _end(self, now_us: int, *, read: bool) -> list[Any]:
-        reading, self._reading, self._asked = self._reading, None, None
+        reading, self._reading, self._request = self._reading, None, None
         found: list[Any] = []
         if reading is not None:
             if read:
@@ -140,7 +140,7 @@ class FileClient:
             if reading.session is not None:
                 found += self._ask(Opcode.TERMINATE_SESSION, reading.session, 0, b"", now_us)
                 # Not repeated if it is lost: the server closes old sessions by itself.
-                self._asked = None
+                self._request = None
         return found + self._next(now_us)
 
     def _next(self, now_us: int) -> list[Any]:
@@ -154,9 +154,11 @@ class FileClient:
         self, opcode: Opcode, session: int, offset: int, data: bytes, now_us: int, *, size: int = 0
     ) -> list[Any]:
         self._sequence = (self._sequence + 2) & 0xFFFF
-        self._asked = Packet(self._sequence, session, opcode, size or len(data), 0, 0, offset, data)
+        self._request = Packet(
+            self._sequence, session, opcode, size or len(data), 0, 0, offset, data
+        )
         self._attempts, self._due_us = 1, now_us + RETRY_US
-        return [self._message(self._asked)]
+        return [self._message(self._request)]
 
     def _message(self, packet: Packet) -> Any:
         return mavlink.MAVLink_file_transfer_protocol_message(

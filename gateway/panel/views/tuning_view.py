@@ -280,7 +280,7 @@ class TuningView:
         self._rows: dict[str, ParameterRow] = {}
         self._grouped: object = None
         self._drawn: object = None
-        self._asked: int | None = None
+        self._loaded_id: int | None = None
         with ui.element("div").classes("tools"):
             self._search = ui.input(placeholder="Search: gps, cutoff, heading …")
             self._search.props('dense outlined clearable debounce=200 aria-label="Search"')
@@ -326,8 +326,8 @@ class TuningView:
             self._state.set_text("")
             return
         system_id = dialogue.parameters.system_id
-        if self._asked != system_id:
-            self._asked = system_id
+        if self._loaded_id != system_id:
+            self._loaded_id = system_id
             self._context.parts.dialogues.load(system_id)
         self._chart.refresh()
         self._state.set_text(_state_of(dialogue))
