@@ -117,7 +117,7 @@ def test_failed_step_is_reported(config: Path, monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr(calibrate, "capture_from", lambda serial, vehicle: moving)
     output = run(config, "gyro", code=1)
-    assert "still" in output
+    assert "the node was not at rest" in output
     assert "nothing changed" in output
 
 
