@@ -2,9 +2,9 @@
 
 Three checks precede the heading. A reading that does not change during a turn is stuck. The field
 must rotate as the gyroscope measures, or axes are swapped. And its norm and dip must be the usual
-ones; a new field that stays the same while the aircraft turns becomes the usual one [1]_. The hard-
-iron vector is three states of the filter: turns distinguish it from the heading, since it rotates
-with the body and changes the norm.
+ones; a new field that stays the same while the aircraft turns becomes the usual one [1]_. Three
+states of the filter are the hard iron: turns distinguish it from the heading, since it rotates with
+the body and changes the norm.
 
 References
 ----------
