@@ -13,7 +13,7 @@ from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import RowBuilder, TableRow
 from gateway.recordings.recorded_table import Line, ReadOptions, header_for
-from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
+from gateway.recordings.table import TableHeader, TableNote, TableReader, encode_head, encode_line
 from gateway.records import (
     BaroRaw,
     FusedSample,
@@ -28,7 +28,8 @@ from gateway.records import (
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.service import SettingsChange
 from gateway.vehicle.vehicle_settings import VehicleSettings
-from tests.kit.records import fix_at
+from tests.kit.recordings import START_US
+from tests.kit.records import fix_at, status
 
 OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 """Files are read and fused with the default settings."""
@@ -121,6 +122,19 @@ def flown_table(seconds: float) -> bytes:
     """Return the table of a flight with the default settings."""
     rng = np.random.default_rng(20_240_611)
     return fly(GatewaySettings().default_aircraft, make_flight(rng, seconds))[0]
+
+
+@cache
+def commented_table() -> bytes:
+    """Return a table with every kind of line among its rows and after the last."""
+    settings = GatewaySettings().default_aircraft
+    text = flown_table(12).decode()
+    text = text.replace('"unix_us_at_zero":null', f'"unix_us_at_zero":{START_US}')
+    lines = text.splitlines(keepends=True)
+    lines[300:300] = map(encode_line, (TableNote(123, "over the wood"), header_for(settings, 1)))
+    lines.insert(200, encode_line(status(radio_failed=1, chips=("BMP280",))))
+    lines.append(encode_line(TableNote(456, "landed")))
+    return "".join(lines).encode()
 
 
 def read(table: bytes) -> tuple[TableHeader, list[TableRow]]:

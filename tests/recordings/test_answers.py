@@ -101,6 +101,7 @@ def test_complete_download_is_the_mission(day: Day) -> None:
     mission = day.answers().mission(MISSION)
     assert mission is not None
     assert [read_back(frame).x for frame in mission] == [470_000_000, 470_000_001]
+    assert day.answers(START_US).mission(MISSION) == mission, "loaded before the recording"
 
 
 def test_upload_is_the_mission_once_acknowledged(day: Day) -> None:

@@ -3,36 +3,24 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from gateway.config import GatewaySettings
 from gateway.recordings.columns import COLUMNS
 from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.formats import parquet as parquet_file
-from gateway.recordings.recorded_table import header_for
-from gateway.recordings.table import TableNote, encode_line
 from tests.kit.cli import run
 from tests.kit.recordings import START_US, STEP_US, make_records, write_tlog
-from tests.recordings.flights import OPTIONS, fly, make_flight
+from tests.recordings.flights import OPTIONS, commented_table
+from tests.recordings.formats import flown
 
 pytestmark = pytest.mark.io
 
 
 @pytest.fixture
-def table(tmp_path: Path, rng: np.random.Generator) -> Path:
-    """A table with marks and changed settings among its rows, and a mark behind the last."""
-    settings = GatewaySettings().default_aircraft
-    text = fly(settings, make_flight(rng, 12))[0].decode()
-    text = text.replace('"unix_us_at_zero":null', f'"unix_us_at_zero":{START_US}')
-    lines = text.splitlines(keepends=True)
-    lines[300:300] = map(encode_line, (TableNote(123, "over the wood"), header_for(settings, 1)))
-    lines.append(encode_line(TableNote(456, "landed")))
-    path = tmp_path / "flight.csv"
-    path.write_text("".join(lines))
-    return path
+def table(tmp_path: Path) -> Path:
+    return flown.write(tmp_path / "flight.csv", commented_table())
 
 
 def test_columns_have_types_and_units(table: Path, tmp_path: Path) -> None:

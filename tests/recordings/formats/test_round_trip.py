@@ -26,15 +26,12 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.formats import parquet
 from gateway.recordings.formats.maps import tracks_of_messages, tracks_of_table
 from gateway.recordings.reading import open_rows
-from gateway.recordings.recorded_table import aircraft_of, header_for
-from gateway.recordings.table import TableNote, encode_line
+from gateway.recordings.recorded_table import aircraft_of
 from gateway.recordings.tlog import TlogRecord
-from gateway.records import NodeId
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
-from tests.kit.recordings import START_US, make_tlog
-from tests.kit.records import status
-from tests.recordings.flights import OPTIONS, fly, make_flight
+from tests.kit.recordings import make_tlog
+from tests.recordings.flights import OPTIONS, commented_table
 from tests.recordings.formats import flown
 
 pytestmark = pytest.mark.io
@@ -42,19 +39,6 @@ pytestmark = pytest.mark.io
 AIRCRAFT = GatewaySettings().default_aircraft
 SECONDS = 20
 """Of the autopilots' logs."""
-
-
-@cache
-def table() -> bytes:
-    """Write a table with every kind of line among its rows and after the last."""
-    text = fly(AIRCRAFT, make_flight(np.random.default_rng(1), 12))[0].decode()
-    text = text.replace('"unix_us_at_zero":null', f'"unix_us_at_zero":{START_US}')
-    lines = text.splitlines(keepends=True)
-    lines[300:300] = map(encode_line, (TableNote(123, "over the wood"), header_for(AIRCRAFT, 1)))
-    node = status(NodeId(1, 0), radio_failed=1, chips=("BMP280",))
-    lines.insert(200, encode_line(node))
-    lines.append(encode_line(TableNote(456, "landed")))
-    return "".join(lines).encode()
 
 
 def tracker() -> bytes:
@@ -67,9 +51,9 @@ def tracker() -> bytes:
 
 
 SOURCES: dict[str, Callable[[], bytes]] = {
-    "flight.csv": table,
-    "flight.parquet": lambda: convert("flight.csv", table(), ".parquet"),
-    "flight.tlog": lambda: convert("flight.csv", table(), ".tlog"),
+    "flight.csv": commented_table,
+    "flight.parquet": lambda: convert("flight.csv", commented_table(), ".parquet"),
+    "flight.tlog": lambda: convert("flight.csv", commented_table(), ".tlog"),
     "tracker.csv": tracker,
     "new.ulg": lambda: flown.make_ulog(seconds=SECONDS),
     "old.ulg": lambda: flown.make_ulog(old=True, seconds=SECONDS),
@@ -232,7 +216,7 @@ def test_packed_source_gives_the_same_content(folder: Path, name: str) -> None:
 
 
 def test_table_survives_parquet_to_the_byte(folder: Path) -> None:
-    assert written(folder / "flight.parquet", ".csv") == table()
+    assert written(folder / "flight.parquet", ".csv") == commented_table()
 
 
 @pytest.mark.parametrize("seed", range(6))
