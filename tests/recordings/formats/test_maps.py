@@ -29,7 +29,7 @@ from gateway.recordings.positions import TrackPoint
 from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import TableNote, block_of
 from gateway.records import NavFlags
-from tests.kit.recordings import SECOND_US, Sent, messages_of, records_sent
+from tests.kit.recordings import SECOND_US, START_US, Sent, messages_of, records_sent
 from tests.recordings.flights import fly, make_flight, read
 
 POINTS = [
@@ -283,6 +283,7 @@ def test_tracks_of_frames_have_home_marks_and_events() -> None:
 def test_tracks_of_a_table_have_home_and_notes(rng: np.random.Generator) -> None:
     settings = GatewaySettings().default_aircraft
     header, rows = read(fly(settings, make_flight(rng, 12))[0])
+    header = msgspec.structs.replace(header, unix_us_at_zero=START_US)
     for k, row in enumerate(rows):
         if row.gps:
             fix = msgspec.structs.replace(row.gps, h_acc_m=1.0, satellites=12)
@@ -291,5 +292,8 @@ def test_tracks_of_a_table_have_home_and_notes(rng: np.random.Generator) -> None
     (track,) = tracks_of_table(RecordedTable(header, iter([block_of([*rows, mark])])), settings)
     assert markers(track) == [(MarkerKind.HOME, "Home"), (MarkerKind.NOTE, "over the gate")]
     assert len(track.points) > 10
+    times_us = [point.time_us - START_US for point in track.points]
+    assert times_us == sorted(times_us)
+    assert 0 <= times_us[0] <= times_us[-1] <= rows[-1].time_us
     known = [row.state for row in rows if row.state and NavFlags.ATTITUDE_VALID in row.state.flags]
     assert any(point.attitude_deg is not None for point in track.points) == bool(known)
