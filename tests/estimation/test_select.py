@@ -30,13 +30,10 @@ def test_field_norm_tolerance_reaches_the_filter(tolerance: float, disturbed: in
 
 
 def test_former_sections_are_migrated_with_a_remark_each() -> None:
+    eskf = {"mag_bias_ut": 2.0, "gps_position_m": 3.0}
     old = {
         "sensing": {"accel_cutoff_hz": 5.0, "nominal_rate_hz": 50.0},
-        "estimation": {
-            "estimator": "complementary",
-            "rest": {"time_s": 2.0},
-            "eskf": {"mag_bias_ut": 2.0, "gps_position_m": 3.0},
-        },
+        "estimation": {"estimator": "complementary", "rest": {"time_s": 2.0}, "eskf": eskf},
     }
     present, remarks = migrate_sections(old)
     found = {"paper": {"accel_cutoff_hz": 5.0}, "eskf": {"gps_position_m": 3.0}}

@@ -147,6 +147,7 @@ def test_position_battery_and_link_become_records() -> None:
     assert (fix.lat_dege7, fix.lon_dege7, fix.satellites) == (-335_000_000, 1_512_500_000, 11)
     assert fix.vel_n_mps[:2] == pytest.approx((0.0, 5.0), abs=1e-9)
     assert math.isnan(fix.vel_n_mps[2]), "the climb is not reported"
+    assert fix.fix_ok
     assert report.battery.voltage_v == 11.1
     assert math.isnan(report.battery.current_a)
     assert (report.mode, report.armed, report.signal.rssi_dbm) == ("AUTO", True, -80)
@@ -199,10 +200,11 @@ def test_accuracies_come_from_gst_or_else_from_the_dilution() -> None:
     assert fix.h_acc_m == pytest.approx(3.6)
 
 
-def test_sentences_without_a_fix_report_that_there_is_none() -> None:
+def test_lines_without_a_fix_report_that_there_is_none() -> None:
     empty = nmea("GGA", "101530.20", "", "", "", "", "0", "00", "99.9", "", "M", "", "M", "", "")
-    (fix,) = decode(empty)
-    assert (fix.fix_ok, fix.fix_type) == (False, GpsFixType.NONE)
+    for line in (empty, json_line(lat=0, lon=0)):
+        (fix,) = decode(line)
+        assert (fix.fix_ok, fix.fix_type) == (False, GpsFixType.NONE)
 
 
 def test_true_heading_is_reported_without_an_attitude() -> None:

@@ -54,16 +54,6 @@ def test_every_field_that_is_named_like_a_system_id_is_known() -> None:
     assert found == {"system_status", "system_status_summary"}, "states, not ids"
 
 
-def follow(kind: Any, leader: float) -> Any:
-    values = dict.fromkeys(kind.fieldnames, 0) | {
-        "target_system": 2,
-        "command": mavlink.MAV_CMD_DO_FOLLOW,
-        "param1": leader,
-        "param2": 2.0,
-    }
-    return kind(*(values[name] for name in kind.fieldnames))
-
-
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize(
     "kind",
@@ -77,7 +67,9 @@ def follow(kind: Any, leader: float) -> Any:
     ],
 )
 def test_id_in_a_parameter_of_a_command_is_renamed(kind: Any, version: int) -> None:
-    frame = frame_of(packed(follow(kind, 1.0), 1, version=version))
+    follow = {"command": mavlink.MAV_CMD_DO_FOLLOW, "param1": 1.0, "param2": 2.0}
+    values = dict.fromkeys(kind.fieldnames, 0) | {"target_system": 2} | follow
+    frame = frame_of(packed(kind(**values), 1, version=version))
     changed = rename_systems(frame, 11, rename)
     assert changed is not None
     got = mavlink.MAVLink(None).decode(bytearray(changed.data))
