@@ -132,7 +132,7 @@ class InPython:
 
 def test_python_agrees_with_machine_code(estimator: KernelEstimator) -> None:
     """Powers are rounded differently, so the last bits may differ."""
-    items = events(8.0, 5)
+    items = events(4.0, 5)
     in_python = Kernels(ESKF.state, *map(InPython, ESKF[1:]))
     found = feed(CompiledEstimator(in_python, estimator.gains, REFERENCE), items)
     machine = feed(estimator, items)
