@@ -12,11 +12,9 @@ def test_one_g_is_converted_at_every_range(range_g: int, counts: int) -> None:
     assert cal.accel_from_counts((0, 0, counts), range_g) == pytest.approx((0.0, 0.0, 9.80665))
 
 
-@pytest.mark.parametrize(
-    ("range_dps", "lsb"), [(250, 131), (500, 65.5), (1000, 32.8), (2000, 16.4)]
-)
-def test_ten_degrees_a_second_are_read_at_every_range(range_dps: int, lsb: float) -> None:
-    rate = cal.gyro_from_counts((round(10 * lsb), 0, 0), range_dps)
+@pytest.mark.parametrize(("dps", "lsb"), [(250, 131), (500, 65.5), (1000, 32.8), (2000, 16.4)])
+def test_ten_degrees_a_second_are_read_at_every_range(dps: int, lsb: float) -> None:
+    rate = cal.gyro_from_counts((round(10 * lsb), 0, 0), dps)
     assert rate[0] == pytest.approx(math.radians(10.0), rel=1e-3)
 
 
