@@ -10,14 +10,14 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.aircraft import AircraftSettings, Outputs
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import GONE_US, Pipeline, PipelineSettings
-from gateway.records import BaroRaw, FusedSample, GpsFix, GpsFixType, ImuFlags, Incoming, NodeId
+from gateway.records import BaroRaw, FusedSample, GpsFix, GpsFixType, ImuFlags, Incoming
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.plan import Location
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire import payloads
-from gateway.wire.framing import encode_frame
 from gateway.wire.mavlink_signing import EPOCH_2015_US, key_from_passphrase
 from gateway.wire.mavlink_splitter import frame_of
+from tests.kit.payloads import QUALITY, Tracker
 
 UNIX_US = 1_790_000_000_000_000
 LEVEL = payloads.ImuPayload(
@@ -33,26 +33,6 @@ LEVEL = payloads.ImuPayload(
 FIX = payloads.GpsFixPayload(
     1000, -77_656_000, 1_103_728_000, 110_000, (0, 0, 0), GpsFixType.FIX_3D, True, 12
 )
-QUALITY = payloads.GpsQualityPayload(1000, 120, 200, 20, 500, 110, 2_300, None)
-
-
-class Tracker:
-    """One aircraft's nodes and the receiver's framing of them."""
-
-    def __init__(self, vehicle_id: int = 1) -> None:
-        self.vehicle_id = vehicle_id
-        self.seq = [0, 0]
-
-    def frame(self, time_us: int, payload: payloads.Payload, node: int = 0) -> bytes:
-        """Encode a payload; a node's first after another, without which it is not accepted."""
-        first = b"" if self.seq[node] else self.one(time_us, QUALITY, node)
-        return first + self.one(time_us, payload, node)
-
-    def one(self, time_us: int, payload: payloads.Payload, node: int = 0) -> bytes:
-        header = payloads.Header(NodeId(self.vehicle_id, node), self.seq[node], time_us)
-        self.seq[node] += 1
-        packet = payloads.encode_payload(header, payload)
-        return encode_frame(payloads.encode_radio(0, node, time_us, packet))
 
 
 @pytest.fixture

@@ -1,8 +1,14 @@
 """Faults of the operating system."""
 
+import asyncio
+import errno
 import os
+import threading
 from collections.abc import Callable
 from typing import NoReturn
+
+FAR_S = 60.0
+"""After which what waits for a sync makes a test fail."""
 
 
 def refusing(number: int) -> Callable[..., NoReturn]:
@@ -12,3 +18,29 @@ def refusing(number: int) -> Callable[..., NoReturn]:
         raise OSError(number, os.strerror(number))
 
     return refuse
+
+
+class SlowDisk:
+    """Syncs of files and folders end when they may."""
+
+    def __init__(self) -> None:
+        self.begun = threading.Semaphore(0)
+        self.may_end = threading.Event()
+        self.failures = 0
+        """How many of the next syncs fail."""
+        self.syncing = self.most = self.count = 0
+
+    def sync(self, file: int) -> None:
+        self.syncing += 1
+        self.count += 1
+        self.most = max(self.most, self.syncing)
+        self.begun.release()
+        self.may_end.wait(FAR_S)
+        os.fstat(file)
+        self.syncing -= 1
+        if self.failures:
+            self.failures -= 1
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    async def await_sync(self) -> None:
+        assert await asyncio.to_thread(self.begun.acquire, timeout=FAR_S)

@@ -1,12 +1,14 @@
-"""Recorders on a manual clock."""
+"""Recorders on a manual clock, and a disk that syncs slowly."""
 
-from collections.abc import AsyncIterator
+import os
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.conftest import ManualClock
+from tests.kit.faults import SlowDisk
 from tests.kit.recorder import MakeBench, RecorderBench
 
 
@@ -27,3 +29,12 @@ async def make_bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[MakeBe
 @pytest.fixture
 def bench(make_bench: MakeBench) -> RecorderBench:
     return make_bench()
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[SlowDisk]:
+    made = SlowDisk()
+    monkeypatch.setattr(os, "fsync", made.sync)
+    monkeypatch.setattr(os, "fdatasync", made.sync)
+    yield made
+    made.may_end.set()

@@ -1,7 +1,9 @@
 """Calibrating while the gateway runs: its samples out, the result in."""
 
 import asyncio
+import itertools
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -34,17 +36,13 @@ def samples(count: int, begin_us: int = 0) -> list[FusedSample]:
 
 def test_samples_are_collected_only_while_they_are_requested() -> None:
     tap = ImuTap(lambda _: NodeCalibration(), lambda *_: None)
-    for sample in samples(10):
-        tap.add(sample)
-    assert tap._take(3) == []
-    for sample in samples(MAX_SAMPLES + 50):
-        tap.add(sample)
-    found = tap._take(3)
-    assert len(found) == MAX_SAMPLES
-    assert values_of(raw_of(found[0], 3)) == found[0]
-    for sample in samples(3 + IDLE_US // STEP_US):
-        tap.add(sample)
-    assert tap._take(3) == []
+    take: Any = tap.verbs()["imu.samples"]
+    for count, taken in ((10, 0), (MAX_SAMPLES + 50, MAX_SAMPLES), (3 + IDLE_US // STEP_US, 0)):
+        for sample in samples(count):
+            tap.add(sample)
+        found = take(3)
+        assert len(found) == taken
+        assert all(values_of(raw_of(values, 3)) == values for values in found)
 
 
 @pytest.mark.io
@@ -56,26 +54,22 @@ async def test_calibrate_uses_the_samples_of_the_running_gateway(
     monkeypatch.setattr(calibrate, "POLL_S", 0.0)
     kept = [NodeCalibration(mag_hard_iron_ut=(1.0, 2.0, 3.0))]
     tap = ImuTap(lambda _: kept[-1], lambda _, calibration: kept.append(calibration))
-    now = 0
+    take: Any = tap.verbs()["imu.samples"]
+    begins_us = itertools.count(0, 100 * STEP_US)
 
     def taken(vehicle_id: int) -> object:
-        nonlocal now
-        for sample in samples(100, now):
+        for sample in samples(100, next(begins_us)):
             tap.add(sample)
-        now += 100 * STEP_US
-        return tap._take(vehicle_id)
+        return take(vehicle_id)
 
     board = {"sensors_present": 7, "chips": ["MPU6500", "QMC5883L", "BMP280"]}
     status = {"aircraft": [{"vehicle_id": 3, "boards": [board]}]}
     verbs: Verbs = {"imu.samples": taken, "status": lambda: status}
     server = ControlServer(socket_path("run"), tap.verbs(), verbs)
     await server.start()
-    try:
-        words = ["calibrate", "gyro", "--vehicle", "3"]
-        result = await asyncio.to_thread(invoke, *words, answers="\n")
-    finally:
-        server.close()
-    assert result.exit_code == 0, result.output
+    words = ["calibrate", "gyro", "--vehicle", "3"]
+    result = await asyncio.to_thread(invoke, *words, answers="\n", code=0)
+    server.close()
     assert "used and saved by the gateway" in result.output
     assert "sensors: MPU6500, QMC5883L, BMP280" in result.output
     assert kept[-1].gyro_bias_radps[0] == pytest.approx(np.radians(100 / 65.5), rel=0.01)

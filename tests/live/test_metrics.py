@@ -145,7 +145,7 @@ class TestServer:
     ) -> None:
         for name in ("Host", "hOST"):
             request = f"GET / HTTP/1.1\r\nAccept: */*\r\n{name}: {host}\r\n\r\n"
-            answer = await server._respond(request.encode("latin-1"))
+            answer = await self.ask(server.port, request.encode("latin-1"))
             assert answer.startswith(b"HTTP/1.1 " + status)
 
     @pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="needs IPv6")

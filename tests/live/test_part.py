@@ -1,7 +1,5 @@
 """Quotas of what is recorded, and the true times of finished files."""
 
-import errno
-import os
 from pathlib import Path
 
 import pytest
@@ -10,6 +8,7 @@ from gateway.live.recording_budget import BURST_S, TRUSTED_RATE, UNTRUSTED_RATE,
 from gateway.live.restamper import STEP, Restamper, clear_copies
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogScanner
+from tests.kit.faults import SlowDisk
 from tests.kit.recordings import START_US, make_records, make_tlog
 
 pytestmark = pytest.mark.io
@@ -111,23 +110,15 @@ def test_deleted_file_is_not_restored(tlog: Path) -> None:
     assert list(tlog.parent.iterdir()) == []
 
 
-def test_full_disk_leaves_the_file_and_the_next_is_shifted(
-    tlog: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failing_disk_leaves_the_file_and_the_next_is_shifted(tlog: Path, disk: SlowDisk) -> None:
     other = tlog.with_name("a_02.tlog")
     other.write_bytes(make_tlog(RECORDS[:10]))
     before = tlog.read_bytes()
     restamper = Restamper(0)
     restamper.add(tlog, SHIFT_US)
     restamper.add(other, SHIFT_US)
-
-    def refuse(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", refuse)
-        while restamper._waiting[0][0] == tlog:
-            restamper.step()
+    disk.may_end.set()
+    disk.failures = 1
     restamper.finish()
     assert tlog.read_bytes() == before
     (first, *_) = TlogScanner().feed(other.read_bytes(), final=True).records()

@@ -34,9 +34,9 @@ class Reader:
     def __init__(self, path: str) -> None:
         self.events: list[bytes | Fault] = []
         self._decoder = FrameDecoder()
-        self._port = serial.Serial(path, 500_000, timeout=0, exclusive=True)
+        self.port = serial.Serial(path, 500_000, timeout=0, exclusive=True)
         self._waiting: list[tuple[int, asyncio.Future[None]]] = []
-        asyncio.get_running_loop().add_reader(self._port.fileno(), self._read)
+        asyncio.get_running_loop().add_reader(self.port.fileno(), self.read)
 
     async def until(self, count: int) -> None:
         done = asyncio.get_running_loop().create_future()
@@ -45,11 +45,11 @@ class Reader:
         await asyncio.wait_for(done, 60.0)
 
     def close(self) -> None:
-        asyncio.get_running_loop().remove_reader(self._port.fileno())
-        self._port.close()
+        asyncio.get_running_loop().remove_reader(self.port.fileno())
+        self.port.close()
 
-    def _read(self) -> None:
-        self.events += self._decoder.feed(self._port.read(4096))
+    def read(self) -> None:
+        self.events += self._decoder.feed(self.port.read(4096))
         self._wake()
 
     def _wake(self) -> None:
@@ -76,8 +76,8 @@ async def test_every_frame_reaches_the_reader(play: Callable[..., PtyPort]) -> N
         for sent, frame in enumerate(frames(2000)):
             # The kernel keeps some kB only, and hands them over when it has the time.
             while sent > 100 and sent - len(reader.events) > 100:
-                select.select([reader._port], [], [], 60.0)
-                reader._read()
+                select.select([reader.port], [], [], 60.0)
+                reader.read()
             yield frame
 
     port = play(paced())

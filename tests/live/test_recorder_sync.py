@@ -1,57 +1,16 @@
 """The recorder on a disk that syncs slowly or fails to: it writes all the same."""
 
 import asyncio
-import errno
-import os
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from gateway.live.session import RETRY_US
+from tests.kit.faults import FAR_S, SlowDisk
 from tests.kit.process import until
 from tests.kit.recorder import FRAMES, NAME, UNIX_US, MakeBench, RecorderBench, frames_of
 
 pytestmark = pytest.mark.io
-
-FAR_S = 60.0
-"""After which what waits for a sync makes a test fail."""
-
-
-class SlowDisk:
-    """Syncs of files and folders end when they may."""
-
-    def __init__(self) -> None:
-        self.begun = threading.Semaphore(0)
-        self.may_end = threading.Event()
-        self.failures = 0
-        """How many of the next syncs fail."""
-        self.syncing = self.most = self.count = 0
-
-    def sync(self, file: int) -> None:
-        self.syncing += 1
-        self.count += 1
-        self.most = max(self.most, self.syncing)
-        self.begun.release()
-        self.may_end.wait(FAR_S)
-        os.fstat(file)
-        self.syncing -= 1
-        if self.failures:
-            self.failures -= 1
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-    async def await_sync(self) -> None:
-        assert await asyncio.to_thread(self.begun.acquire, timeout=FAR_S)
-
-
-@pytest.fixture
-def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[SlowDisk]:
-    made = SlowDisk()
-    monkeypatch.setattr(os, "fsync", made.sync)
-    monkeypatch.setattr(os, "fdatasync", made.sync)
-    yield made
-    made.may_end.set()
 
 
 @pytest.fixture

@@ -41,12 +41,13 @@ async def test_watchdog_is_notified_at_twice_its_rate(
     systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", "20000")
-    loop, delays = asyncio.get_running_loop(), []
+    loop, delays, handles = asyncio.get_running_loop(), [], []
     call_later = loop.call_later
 
     def note(delay_s: float, *call: Any) -> asyncio.TimerHandle:
         delays.append(delay_s)
-        return call_later(delay_s, *call)
+        handles.append(call_later(delay_s, *call))
+        return handles[-1]
 
     monkeypatch.setattr(loop, "call_later", note)
     notifier = ServiceNotifier()
@@ -55,8 +56,7 @@ async def test_watchdog_is_notified_at_twice_its_rate(
     notified = [await asyncio.wait_for(loop.sock_recv(systemd, 200), 60) for _ in range(4)]
     assert notified == [b"READY=1"] + [b"WATCHDOG=1"] * 3
     notifier.stopping()
-    await asyncio.sleep(0)
-    assert notifier._timer is None
+    assert handles[-1].cancelled()
 
 
 async def test_watchdog_of_another_process_is_not_notified(

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import termios
+import threading
 from collections.abc import Iterator
 from typing import TextIO
 
@@ -24,6 +25,7 @@ from gateway.live.terminal import (
     keys_of,
     on_end_signals,
 )
+from tests.kit.process import until
 
 pytestmark = pytest.mark.io
 
@@ -98,6 +100,10 @@ def pipe() -> Iterator[tuple[TextIO, TextIO]]:
         yield out, into
 
 
+def is_writing() -> bool:
+    return any(thread.name == "output" for thread in threading.enumerate())
+
+
 @pytest.mark.usefixtures("patient")
 def test_written_texts_arrive_in_order(pipe: tuple[TextIO, TextIO]) -> None:
     out, into = pipe
@@ -107,10 +113,11 @@ def test_written_texts_arrive_in_order(pipe: tuple[TextIO, TextIO]) -> None:
         assert stream.write(line) == len(line)
     assert [out.readline() for _ in lines] == lines
     stream.finish()
-    assert not stream._thread.is_alive()
+    assert not is_writing()
     assert (stream.fileno(), stream.isatty(), stream.encoding) == (into.fileno(), False, "utf-8")
 
 
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("blocking", [True, False])
 def test_unread_pipe_does_not_block_the_writer(pipe: tuple[TextIO, TextIO], blocking: bool) -> None:
     """Two texts do not fit into the pipe's 64 kB: a plain stream would wait here for ever."""
@@ -125,8 +132,8 @@ def test_unread_pipe_does_not_block_the_writer(pipe: tuple[TextIO, TextIO], bloc
     assert heard == texts[:MAX_TEXTS]
     # Without a reader the rest is soon gone, and the thread ends before its file is closed.
     out.close()
-    stream._waiting.put(None)
-    stream._thread.join()
+    while is_writing():
+        stream.finish()
 
 
 @pytest.mark.usefixtures("patient")
@@ -137,7 +144,7 @@ def test_closed_reader_is_no_error() -> None:
         stream = DetachedStream(into)
         stream.write("to nobody\n")
         stream.finish()
-        assert not stream._thread.is_alive()
+        assert not is_writing()
 
 
 def test_log_and_prints_are_detached_and_attached_again(
@@ -190,34 +197,22 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
     os.close(theirs)
 
 
-async def until(done: asyncio.Event) -> None:
-    async with asyncio.timeout(LIMIT_S):
-        await done.wait()
-
-
 async def test_keys_come_one_by_one_and_are_not_echoed(terminal: tuple[int, int]) -> None:
     ours, theirs = terminal
     before = termios.tcgetattr(theirs)
     found: list[str] = []
-    done = asyncio.Event()
-
-    def take(key: str) -> None:
-        found.append(key)
-        if key == "q":
-            done.set()
-
-    board = Keyboard(take, theirs)
+    board = Keyboard(found.append, theirs)
     board.start()
     assert not termios.tcgetattr(theirs)[LOCAL_FLAGS] & termios.ECHO
     os.write(ours, b" \x1b[Cq")
-    await until(done)
+    await until(lambda: "q" in found)
     assert found == ["space", "right", "q"]
     board.close()
     assert termios.tcgetattr(theirs) == before
     board.close()
 
 
-async def test_keyboard_leaves_a_pipe_unchanged(tmp_path: object) -> None:
+async def test_keyboard_leaves_a_pipe_unchanged() -> None:
     read, write = os.pipe()
     board = Keyboard(lambda _: None, read)
     board.start()
