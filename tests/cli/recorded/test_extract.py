@@ -142,9 +142,10 @@ def test_plan_follows_the_rules_of_qgroundcontrol(tlog: Path, tmp_path: Path) ->
         assert len(each["params"]) == 7
         assert each["params"][3] is None
     (polygon,) = plan["geoFence"]["polygons"]
-    assert (len(polygon["polygon"]), polygon["inclusion"], polygon["version"]) == (3, True, 1)
+    assert (polygon["inclusion"], polygon["version"]) == (True, 1)
+    assert polygon["polygon"] == [pytest.approx([LAT + k * 1e-7, LON], abs=1e-9) for k in range(3)]
     (circle,) = plan["geoFence"]["circles"]
-    assert circle["circle"]["radius"] == 120.0
+    assert circle["circle"] == {"center": pytest.approx([LAT, LON]), "radius": 120.0}
     assert plan["rallyPoints"]["points"] == [[pytest.approx(LAT), pytest.approx(LON), 30.0]]
 
 
