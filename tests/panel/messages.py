@@ -6,6 +6,11 @@ from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.recordings.tlog import TlogRecord
+from gateway.units import US_PER_S
+from tests.kit.mavlink import Sender
+from tests.kit.recordings import make_tlog, records_of
+
 BEGIN_US = 1_750_000_000_000_000
 HOSTILE_TEXT = "</script><script>window.ran = 1</script><img src=x onerror=window.ran=1>"
 
@@ -39,9 +44,9 @@ def fix(lat_deg: float, lon_deg: float, kind: int = 3, satellites: int = 12) -> 
     )  # fmt: skip
 
 
-def flight_frames(seconds: int, hz: int = 10) -> Iterator[tuple[int, bytes]]:
+def flight_records(seconds: int, hz: int = 10) -> Iterator[TlogRecord]:
     """Make the messages of a flight in circles, with a little noise."""
-    sender = mavlink.MAVLink(None, 3, 1)
+    sender = Sender(3)
     for step in range(seconds * hz):
         time_us, turn = BEGIN_US + step * 1_000_000 // hz, step / hz / 20
         wobble = math.sin(step * 12.9898) * 0.03
@@ -64,14 +69,9 @@ def flight_frames(seconds: int, hz: int = 10) -> Iterator[tuple[int, bytes]]:
             text = HOSTILE_TEXT.encode()[:50]
             messages.append(mavlink.MAVLink_statustext_message(2, text))
         for message in messages:
-            yield time_us, bytes(message.pack(sender))
+            yield TlogRecord(time_us, sender.pack(message))
 
 
 def short_tlog() -> bytes:
     """Return a tlog of five heartbeats, one a second."""
-    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-    frame = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3).pack(sender)
-    return b"".join(
-        (1_700_000_000_000_000 + second * 1_000_000).to_bytes(8, "big") + frame
-        for second in range(5)
-    )
+    return make_tlog(records_of([Sender().heartbeat()] * 5, US_PER_S))

@@ -33,8 +33,8 @@ HERE = "http://127.0.0.1:14590"
 
 async def grants_all(scope: Scope, receive: Receive, send: Send) -> None:
     body = await Request(scope, receive).body()
-    text = f"{scope[ROLE]} {len(body)}"
-    await PlainTextResponse(text)(scope, receive, send)
+    answer = PlainTextResponse(f"{scope[ROLE]} {len(body)}", headers={"x-method": scope["method"]})
+    await answer(scope, receive, send)
 
 
 def guarded(
@@ -49,12 +49,39 @@ def client_of(guard: ASGIApp, base: str = HERE) -> httpx.AsyncClient:
     return httpx.AsyncClient(transport=httpx.ASGITransport(app=guard), base_url=base)
 
 
+def get_scope(path: str, port: int = 1) -> Scope:
+    headers = [(b"host", b"127.0.0.1")]
+    client = ("10.0.0.1", port)
+    return {"type": "http", "method": "GET", "path": path, "headers": headers, "client": client}
+
+
+async def sent_by(
+    app: ASGIApp, scope: Scope, received: str = "http.request", on_send: Any = None
+) -> list[str]:
+    """Pass a request and what is received; return the types of the messages that are sent."""
+    sent: list[str] = []
+
+    async def receive() -> Message:
+        return {"type": received}
+
+    async def send(message: Message) -> None:
+        sent.append(message["type"])
+        if on_send is not None:
+            await on_send(message)
+
+    await app(scope, receive, send)
+    return sent
+
+
+def network_client(**settings: Any) -> httpx.AsyncClient:
+    """Return a client of a panel that is open to the network."""
+    opened = PanelSettings(address="0.0.0.0", password=OPERATOR, insecure=True, **settings)
+    return client_of(guarded(opened), "http://192.168.1.7:14590")
+
+
 @pytest.fixture
 async def locked() -> AsyncIterator[httpx.AsyncClient]:
-    settings = PanelSettings(
-        address="0.0.0.0", password=OPERATOR, viewer_password=VIEWER, insecure=True
-    )
-    async with client_of(guarded(settings), "http://192.168.1.7:14590") as client:
+    async with network_client(viewer_password=VIEWER) as client:
         yield client
 
 
@@ -83,13 +110,9 @@ async def test_foreign_host_and_origin_are_refused(
 
 async def test_head_is_answered_as_get() -> None:
     """Its body is left out by the server in front of the guard."""
-
-    async def answers_with_the_method(scope: Scope, receive: Receive, send: Send) -> None:
-        await PlainTextResponse(scope["method"])(scope, receive, send)
-
-    async with client_of(guarded(app=answers_with_the_method)) as client:
+    async with client_of(guarded()) as client:
         answer = await client.head("/")
-    assert answer.headers["content-length"] == str(len("GET"))
+    assert answer.headers["x-method"] == "GET"
 
 
 async def says_nothing(scope: Scope, receive: Receive, send: Send) -> None:
@@ -115,15 +138,9 @@ PASSED_ON = BaseHTTPMiddleware(says_nothing, lambda request, call_next: call_nex
 async def test_early_disconnect_is_no_error(
     app: ASGIApp, method: str, received: str, is_error: bool
 ) -> None:
-    async def receive() -> Message:
-        return {"type": received}
-
-    async def send(message: Message) -> None:
-        raise AssertionError(message)
-
-    scope = get_scope("/recordings/a", 1) | {"method": method}
+    scope = get_scope("/recordings/a") | {"method": method}
     with pytest.raises(RuntimeError) if is_error else contextlib.nullcontext():
-        await guarded(app=app)(scope, receive, send)
+        assert await sent_by(guarded(app=app), scope, received) == []
 
 
 FOREIGN = "http://cockpit.example:8080"
@@ -156,41 +173,30 @@ async def test_listed_origin_may_use_the_api_only(path: str, origin: str, is_all
 
 
 @pytest.mark.parametrize(
-    ("settings", "path", "host", "origin", "answer"),
+    ("settings", "path", "host", "origin", "is_accepted"),
     [
-        (PanelSettings(), "/telemetry", "127.0.0.1:14590", HERE, "accept"),
-        (PanelSettings(), "/telemetry", "127.0.0.1:14590", "http://evil.example", "close"),
-        (PanelSettings(), "/telemetry", "evil.example", HERE, "close"),
-        (PanelSettings(password=OPERATOR), "/telemetry", "127.0.0.1:14590", HERE, "close"),
-        (ALLOWED, "/v1/ws/mavlink", "127.0.0.1:14590", FOREIGN, "accept"),
-        (ALLOWED, "/v1/ws/mavlink", "evil.example", FOREIGN, "close"),
+        (PanelSettings(), "/telemetry", "127.0.0.1:14590", HERE, True),
+        (PanelSettings(), "/telemetry", "127.0.0.1:14590", "http://evil.example", False),
+        (PanelSettings(), "/telemetry", "evil.example", HERE, False),
+        (PanelSettings(password=OPERATOR), "/telemetry", "127.0.0.1:14590", HERE, False),
+        (ALLOWED, "/v1/ws/mavlink", "127.0.0.1:14590", FOREIGN, True),
+        (ALLOWED, "/v1/ws/mavlink", "evil.example", FOREIGN, False),
     ],
 )
 async def test_websocket_needs_host_origin_and_password(
-    settings: PanelSettings, path: str, host: str, origin: str, answer: str
+    settings: PanelSettings, path: str, host: str, origin: str, is_accepted: bool
 ) -> None:
-    said: list[str] = []
-
-    async def receive() -> Message:
-        return {"type": "websocket.connect"}
-
-    async def send(message: Message) -> None:
-        said.append(message["type"])
-
     async def accept(scope: Scope, receive: Receive, send: Send) -> None:
         await send({"type": "websocket.accept"})
 
     headers = [(b"host", host.encode()), (b"origin", origin.encode())]
-    scope = {"type": "websocket", "path": path, "headers": headers, "client": ("127.0.0.1", 1)}
-    await guarded(settings, accept)(scope, receive, send)
-    assert said[0] == f"websocket.{answer}"
+    scope = get_scope(path) | {"type": "websocket", "headers": headers}
+    sent = await sent_by(guarded(settings, accept), scope, "websocket.connect")
+    assert sent[0] == ("websocket.accept" if is_accepted else "websocket.close")
 
 
 async def test_listed_origin_needs_the_login_too() -> None:
-    settings = PanelSettings(
-        address="0.0.0.0", password=OPERATOR, insecure=True, origins=(FOREIGN,)
-    )
-    async with client_of(guarded(settings), "http://192.168.1.7:14590") as client:
+    async with network_client(origins=(FOREIGN,)) as client:
         answer = await client.get("/v1/mavlink", headers={"origin": FOREIGN})
     assert answer.status_code == HTTPStatus.UNAUTHORIZED
 
@@ -395,19 +401,6 @@ def test_request_with_invalid_text_is_one_line_in_the_log(error: Exception, is_k
     assert (record.exc_info is not None) == is_kept
 
 
-def get_scope(path: str, port: int) -> Scope:
-    headers = [(b"host", b"127.0.0.1")]
-    client = ("10.0.0.1", port)
-    return {"type": "http", "method": "GET", "path": path, "headers": headers, "client": client}
-
-
-async def answer_to(guard: AccessControl, path: str, send: Send, *, port: int = 1) -> None:
-    async def receive() -> Message:
-        return {"type": "http.request"}
-
-    await guard(get_scope(path, port), receive, send)
-
-
 @pytest.mark.parametrize(
     ("path", "is_large"),
     [
@@ -426,13 +419,10 @@ async def test_large_answers_to_a_client_are_sent_one_by_one(path: str, is_large
         await asyncio.sleep(0.01)
         running.pop()
 
-    async def send(_: Message) -> None:
-        pass
-
     guard = guarded(app=answers)
-    await asyncio.gather(*(answer_to(guard, path, send) for _ in range(3)))
+    await asyncio.gather(*(sent_by(guard, get_scope(path)) for _ in range(3)))
     assert max(peak) == (1 if is_large else 3)
-    await asyncio.gather(*(answer_to(guard, path, send, port=port) for port in range(3)))
+    await asyncio.gather(*(sent_by(guard, get_scope(path, port)) for port in range(3)))
     assert max(peak) == 3, "others are not waited for"
 
 
@@ -444,17 +434,17 @@ async def test_client_that_takes_no_answer_is_disconnected(monkeypatch: pytest.M
     async def answers(scope: Scope, receive: Receive, send: Send) -> None:
         await Response(bytes(3 * access.PIECE + 1))(scope, receive, send)
 
-    async def send(message: Message) -> None:
+    async def on_send(message: Message) -> None:
         sizes.append(len(message.get("body", b"")))
         if len(sizes) == 3:
             await asyncio.Event().wait()
 
     guard = guarded(app=answers, on_stuck=stuck.append)
-    await answer_to(guard, "/", send)
+    await sent_by(guard, get_scope("/"), on_send=on_send)
     assert sizes == [0, access.PIECE, access.PIECE]
     assert stuck == [("10.0.0.1", 1)]
     sizes.append(0)
-    await answer_to(guard, "/", send)
+    await sent_by(guard, get_scope("/"), on_send=on_send)
     assert sizes[4:] == [0, access.PIECE, access.PIECE, access.PIECE, 1]
 
 

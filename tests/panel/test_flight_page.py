@@ -23,26 +23,26 @@ from gateway.panel.flight_page import (
     render_page,
 )
 from gateway.recordings.files import FlightError
-from gateway.recordings.tlog import encode_record
+from gateway.recordings.tlog import TlogRecord
 from tests.kit.cli import invoke
+from tests.kit.mavlink import packed
+from tests.kit.recordings import write_tlog
 from tests.panel.browsing import FEW_FRAMES, needs_chromium
-from tests.panel.messages import BEGIN_US, HOSTILE_TEXT, flight_frames
+from tests.panel.messages import BEGIN_US, HOSTILE_TEXT, flight_records
 
 pytestmark = pytest.mark.io
 GOLDEN = Path(__file__).parents[1] / "golden" / "take_off.csv.gz"
 OPTIONS = read_options(GatewaySettings())
 
 
-def flight_of(folder: Path, records: Iterable[tuple[int, bytes]]) -> PageFlight:
-    path = folder / "day_01.tlog"
-    path.write_bytes(b"".join(encode_record(*record) for record in records))
-    return read_flight([path], OPTIONS, HOSTILE_TEXT)
+def flight_of(folder: Path, records: Iterable[TlogRecord]) -> PageFlight:
+    return read_flight([write_tlog(folder / "day_01.tlog", records)], OPTIONS, HOSTILE_TEXT)
 
 
 def flight_with(folder: Path, messages: list[tuple[float, Any]]) -> PageFlight:
     """Return the flight of messages with their times in s."""
-    link = mavlink.MAVLink(None, 3, 1)
-    return flight_of(folder, ((BEGIN_US + round(s * 1e6), m.pack(link)) for s, m in messages))
+    sent = ((BEGIN_US + round(s * 1e6), packed(message, 3)) for s, message in messages)
+    return flight_of(folder, (TlogRecord(*record) for record in sent))
 
 
 def unpacked(page: str, name: str) -> Any:
@@ -52,7 +52,7 @@ def unpacked(page: str, name: str) -> Any:
 
 
 def test_page_contains_the_states_and_texts_of_a_flight(tmp_path: Path) -> None:
-    page = render_page(flight_of(tmp_path, flight_frames(60)))
+    page = render_page(flight_of(tmp_path, flight_records(60)))
     assert HOSTILE_TEXT not in page
     data = unpacked(page, "data")
     (aircraft,) = data["aircraft"]
@@ -94,9 +94,9 @@ def test_page_of_gps_fixes_alone_has_a_track_and_its_interruption(tmp_path: Path
 
 @pytest.mark.slow
 def test_page_of_a_quarter_of_an_hour_is_small(tmp_path: Path) -> None:
-    empty = len(render_page(flight_of(tmp_path, flight_frames(10))).encode())
+    empty = len(render_page(flight_of(tmp_path, flight_records(10))).encode())
     assert empty <= 3_000_000
-    size = len(render_page(flight_of(tmp_path, flight_frames(900))).encode())
+    size = len(render_page(flight_of(tmp_path, flight_records(900))).encode())
     assert size - empty <= 500_000 / 4
 
 
@@ -106,7 +106,7 @@ def test_recording_without_a_position_is_refused(tmp_path: Path) -> None:
 
 
 def test_page_of_the_last_recording_has_its_name_and_overwrites_none(tmp_path: Path) -> None:
-    flight_of(tmp_path, flight_frames(30))
+    flight_of(tmp_path, flight_records(30))
     config, output = tmp_path / "gateway.toml", tmp_path / "flight.html"
     config.write_text(f'[recording]\nfolder = "{tmp_path}"\n')
     words = ("page", "last", "-o", output, "--no-compare", "-c", config)
@@ -119,7 +119,7 @@ def test_page_of_the_last_recording_has_its_name_and_overwrites_none(tmp_path: P
 
 
 def test_estimators_are_compared_in_another_process(tmp_path: Path) -> None:
-    tlog = flight_of(tmp_path, flight_frames(30))
+    tlog = flight_of(tmp_path, flight_records(30))
     add_comparison(tlog, begin_comparison([tmp_path / "day_01.tlog"], OPTIONS))
     assert "The estimators are not compared: " in tlog.remarks[-1]
     flight = read_flight([GOLDEN], OPTIONS, "take-off")
@@ -135,7 +135,7 @@ def test_estimators_are_compared_in_another_process(tmp_path: Path) -> None:
 def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of a flight of two minutes."""
     path = tmp_path_factory.mktemp("page") / "flight.html"
-    path.write_text(render_page(flight_of(path.parent, flight_frames(120))))
+    path.write_text(render_page(flight_of(path.parent, flight_records(120))))
     return path
 
 

@@ -15,8 +15,8 @@ from gateway.live.control_socket import request
 from gateway.recordings.antenna import AntennaStation, pointing_of
 from gateway.recordings.newest import NewestState
 from gateway.recordings.positions import Position
-from gateway.recordings.tlog import encode_record
 from tests.kit.process import wait_for
+from tests.kit.recordings import write_tlog
 from tests.panel.browsing import (
     START_LIMIT_MS,
     WAIT_MS,
@@ -29,7 +29,7 @@ from tests.panel.browsing import (
     opened,
     show,
 )
-from tests.panel.messages import flight_frames
+from tests.panel.messages import flight_records
 from tests.panel.test_map_tiles import write_pmtiles
 
 pytestmark = [pytest.mark.io, pytest.mark.slow, needs_chromium]
@@ -43,8 +43,9 @@ def page(browser: Browser, demo: Process) -> Iterator[Page]:
         yield page
 
 
-def test_several_aircraft_are_distinguished_and_selected(page: Page) -> None:
+def test_several_simulated_aircraft_are_distinguished_and_selected(page: Page) -> None:
     view = show(page, "map")
+    expect(page.locator(".chips").get_by_text("simulation")).to_be_visible()
     page.wait_for_function("Object.keys(mavgate.vehicles).length === 2")
     expect(view.locator(".craft")).to_have_count(2)
     for number in (2, 1):
@@ -188,10 +189,6 @@ def test_marked_position_is_sent_and_shown_with_its_distance(page: Page, demo: P
     canvas.click(position={"x": 400, "y": 300})
     view.locator(".map-ask").get_by_text("Clear the mark").click()
     expect(view.locator("[data-role='way']")).to_have_count(0)
-
-
-def test_simulated_receiver_is_shown_as_simulation(page: Page) -> None:
-    expect(page.locator(".chips").get_by_text("simulation")).to_be_visible()
 
 
 def test_recording_is_saved_loaded_cut_played_and_deleted(page: Page, tmp_path: Path) -> None:
@@ -356,7 +353,7 @@ def test_flight_view_seeks_back_and_returns_to_the_present(page: Page) -> None:
 def test_recording_is_hidden_on_another_page(browser: Browser, page: Page, demo: Process) -> None:
     folder = demo.log.parent / "recordings"
     folder.mkdir(exist_ok=True)
-    (folder / "mine_01.tlog").write_bytes(b"".join(encode_record(*f) for f in flight_frames(60)))
+    write_tlog(folder / "mine_01.tlog", flight_records(60))
     view = show(page, "recordings")
     view.locator("tr[data-key='mine']").get_by_label("Open").click()
     expect(page.locator(".playback-bar")).to_be_visible(timeout=START_LIMIT_MS)

@@ -11,32 +11,23 @@ from gateway.config import GatewaySettings
 from gateway.panel.playback import FUSED_AGAIN, RECORDED, free_ids, look_into
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.table import encode_head
-from gateway.recordings.tlog import encode_record
 from gateway.units import US_PER_S
-from tests.kit.mavlink import packed
+from tests.kit.messages import at, beat
+from tests.kit.recordings import records_sent, write_tlog
 from tests.recordings.flights import fly, make_flight, read
 
 pytestmark = pytest.mark.io
 
 
-def flown(system_id: int, second: int, alt_m: int) -> bytes:
-    position = mavlink.MAVLink_global_position_int_message(
-        0, 470_000_000, 80_000_000, alt_m * 1000, 0, 0, 0, 0, 0
-    )
-    return encode_record((1000 + second) * US_PER_S, packed(position, system_id))
-
-
 def test_heights_of_each_aircraft_in_a_tlog_are_read(tmp_path: Path) -> None:
-    station = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
-    tlog = tmp_path / "two_01.tlog"
-    tlog.write_bytes(
-        encode_record(1000 * US_PER_S, packed(station, 42))
-        + b"".join(flown(1, n, 100 + n) + flown(7, n, 300) for n in range(5))
-    )
+    sent = [((42, 190), beat(mavlink.MAV_TYPE_GCS))]
+    for n in range(5):
+        sent += [((1, 1), at(alt_m=100 + n)), ((7, 1), at(alt_m=300))]
+    tlog = write_tlog(tmp_path / "two_01.tlog", records_sent(sent, US_PER_S // 2))
     ((first, second),) = look_into([tlog])
     assert (first.recorded_id, second.recorded_id) == (1, 7)
     assert {first.origin, second.origin} == {RECORDED}
-    assert first.profile.time_s == (0.0, 1.0, 2.0, 3.0, 4.0)
+    assert first.profile.time_s == (0.5, 1.5, 2.5, 3.5, 4.5)
     assert first.profile.alt_amsl_m == (100.0, 101.0, 102.0, 103.0, 104.0)
     assert second.profile.alt_amsl_m == (300.0,) * 5
 

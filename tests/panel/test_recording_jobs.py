@@ -13,8 +13,8 @@ from gateway.panel.admission import Holder, Role
 from gateway.panel.recording_jobs import FORMATS, ExportError, Order, RecordingJobs
 from gateway.panel.recording_search import RecordingFacts
 from gateway.recordings.index import RecordingError, list_recordings
-from gateway.recordings.tlog import encode_record
-from tests.panel.messages import flight_frames
+from tests.kit.recordings import write_tlog
+from tests.panel.messages import flight_records
 from tests.panel.web_client import client_of
 
 pytestmark = pytest.mark.io
@@ -26,7 +26,7 @@ NAME = "a day's --flight"
 def exported(tmp_path: Path) -> Path:
     path = tmp_path / 'with "quotes"'
     path.mkdir()
-    (path / f"{NAME}_01.tlog").write_bytes(b"".join(encode_record(*f) for f in flight_frames(40)))
+    write_tlog(path / f"{NAME}_01.tlog", flight_records(40))
     return path
 
 

@@ -19,10 +19,9 @@ from gateway.panel.recording_transfer import add_recording_files
 from gateway.panel.rest_api import RestApi
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.telemetry_feed import GRANTS, MAX_HISTORY, TelemetryFeed, add_tracks
+from tests.kit.process import START_LIMIT_S, until
 from tests.panel.messages import position
 from tests.panel.web_client import client_of
-
-LIMIT_S = 60.0
 
 
 class Browser:
@@ -31,7 +30,6 @@ class Browser:
     def __init__(self) -> None:
         self.frames: list[dict[str, Any]] = []
         self.grants: asyncio.Queue[str | None] = asyncio.Queue()
-        self.arrived = asyncio.Event()
         self.query_params: dict[str, str] = {}
 
     async def accept(self) -> None:
@@ -45,13 +43,9 @@ class Browser:
 
     async def send_text(self, text: str) -> None:
         self.frames.append(json.loads(text))
-        self.arrived.set()
 
     async def until(self, count: int) -> None:
-        async with asyncio.timeout(LIMIT_S):
-            while len(self.frames) < count:
-                self.arrived.clear()
-                await self.arrived.wait()
+        await until(lambda: len(self.frames) >= count)
 
 
 @asynccontextmanager
@@ -61,8 +55,7 @@ async def served() -> AsyncIterator[tuple[FleetState, Browser]]:
     serving = asyncio.create_task(feed.serve(cast(WebSocket, browser)))
     yield fleet, browser
     await browser.grants.put(None)
-    async with asyncio.timeout(LIMIT_S):
-        await serving
+    await asyncio.wait_for(serving, START_LIMIT_S)
 
 
 async def test_slow_browser_gets_only_the_newest_state() -> None:
