@@ -67,8 +67,8 @@ class World:
         """Send frames of every vehicle and the station, and read those that the station gets."""
         for name, hub in self.sites.items():
             self.rig.tick(hub)
-            hub.send(self.rig.out(self.vehicles[name].heartbeat()))
-            hub.send(self.rig.out(self.vehicles[name].attitude()))
+            vehicle = self.vehicles[name]
+            self.rig.publish(hub, vehicle.heartbeat(), vehicle.attitude())
         self.station.send(self.station.sender.heartbeat())
         reader = mavlink.MAVLink(None)
         for data in self.station.received():

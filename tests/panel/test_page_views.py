@@ -89,8 +89,7 @@ class Desk:
     @property
     def kept(self) -> str:
         """Stored settings of all aircraft."""
-        files = sorted((self.folder / "aircraft").glob("*.toml"))
-        return "".join(file.read_text() for file in files)
+        return "".join(p.read_text() for p in sorted((self.folder / "aircraft").glob("*.toml")))
 
 
 def start_gateway(folder: Path, receiver: BenchReceiver, panel_settings: str = "") -> Process:
@@ -303,10 +302,7 @@ def test_client_is_added_and_removed(desk: Desk) -> None:
         row.get_by_label("Remove this client").click()
         assert name in [client["name"] for client in desk.status["clients"]]
         desk.page.locator(".asks").get_by_role("button", name="Remove").click()
-        wait_for(
-            lambda: name not in [client["name"] for client in desk.status["clients"]],
-            lambda: f"{name} is still there",
-        )
+        wait_for(lambda: name not in [client["name"] for client in desk.status["clients"]])
         expect(row).to_have_count(0)
 
 
@@ -393,7 +389,6 @@ def viewers_page(browser: Browser, desk: Desk) -> Iterator[Page]:
 
 
 def write_certificate(certificate: Path, key: Path) -> None:
-    """Make a certificate that vouches for itself."""
     command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"]
     command += ["-nodes", "-days", "1", "-subj", "/CN=127.0.0.1"]
     subprocess.run([*command, "-out", certificate, "-keyout", key], check=True, capture_output=True)
