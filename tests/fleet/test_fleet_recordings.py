@@ -2,6 +2,7 @@
 
 import asyncio
 import base64
+import fcntl
 import hashlib
 import json
 import os
@@ -311,6 +312,12 @@ class TestFetch:
         (tmp_path / f".{NAME}.part").write_bytes(b"x" * 5000)
         assert self.fetch(tmp_path, Site())
         assert (tmp_path / NAME).read_bytes() == CONTENT[:10_000]
+
+    def test_file_that_another_program_fetches_is_an_error(self, tmp_path: Path) -> None:
+        with (tmp_path / f".{NAME}.part").open("w") as part:
+            fcntl.flock(part, fcntl.LOCK_EX)
+            with pytest.raises(FetchError, match="is being fetched by another program"):
+                self.fetch(tmp_path, Site())
 
     def test_shortened_file_is_an_error(self, tmp_path: Path) -> None:
         with pytest.raises(FetchError, match="shorter"):

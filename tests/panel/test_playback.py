@@ -108,6 +108,12 @@ async def test_answer_after_closing_is_ignored(playback: Playback, player: Playe
     assert playback.status is None
 
 
+async def test_player_that_has_ended_is_closed(playback: Playback, player: Player) -> None:
+    player.returncode = 1
+    await playback.refresh()
+    assert (playback.status, playback.name) == (None, "")
+
+
 async def test_opening_waits_for_a_late_player(player: Player, tmp_path: Path) -> None:
     """A socket is in its folder before its process listens to it."""
     player.refusals = 3

@@ -46,6 +46,10 @@ def emit(element: ui.element, kind: str, arguments: Any = None) -> None:
     asyncio.run(handle())
 
 
+def labels() -> list[str]:
+    return [label.text for label in ElementFilter(kind=ui.label)]
+
+
 def test_button_of_a_row_acts_only_while_the_row_is_shown() -> None:
     pressed: list[str] = []
     table = DataTable(("Name",), "None.", buttons=[RowButton("close", "Remove", pressed.append)])
@@ -153,6 +157,7 @@ class Page:
 
     def _fail(self, _: int) -> None:
         assert not self.button.enabled
+        assert "Fusing …" in labels()
         raise self.failures.pop(0)
 
 
@@ -171,8 +176,7 @@ def test_failed_comparison_reports_the_reason_and_can_be_repeated(
     card.failures = [error, ComparisonError("no samples")]
     for text in (reason, "no samples"):
         emit(card.button, "click")
-        shown = [label.text for label in ElementFilter(kind=ui.label)]
-        assert f"Cannot be compared: {text}." in shown
+        assert f"Cannot be compared: {text}." in labels()
         assert card.button.enabled
     assert card.failures == []
     assert [record.exc_info[1] for record in caplog.records if record.exc_info] == [error]
@@ -184,6 +188,7 @@ def test_opened_view_collects_samples_if_the_user_may_change_things(*, may_chang
     assert card.asked == [1] * may_change
     assert not card.button.enabled
     assert card.button.props["title"] == "Collecting samples: 40%"
+    assert "Collecting samples: 40%" in labels()
     card.share = 1.0
     for refresh in card.refreshes:
         refresh()
