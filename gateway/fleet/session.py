@@ -105,11 +105,6 @@ class FleetSession:
         self._trouble = ""
 
     @property
-    def is_open(self) -> bool:
-        """Whether there is a session, with a router or without."""
-        return self._connection is not None
-
-    @property
     def is_linked(self) -> bool:
         """Whether sites can be reached."""
         connection = self._connection
