@@ -12,6 +12,7 @@ from gateway.live.control_socket import ControlError
 from gateway.panel import playback as playback_module
 from gateway.panel.playback import MAX_PLAYERS, RECORDED, Playback, PlaybackError
 from gateway.panel.state.fleet import FleetState, Origin
+from tests.kit.process import until
 from tests.panel.messages import heartbeat, short_tlog
 
 
@@ -70,6 +71,10 @@ async def opened(folder: Path, fleet: FleetState, page: str) -> Playback:
 @pytest.fixture
 async def playback(player: Player, tmp_path: Path) -> AsyncIterator[Playback]:
     made = await opened(tmp_path, FleetState(), "page")
+    # The page's own question follows at once, the next one after a while.
+    await until(lambda: len(player.asked) > 1)
+    for _ in range(3):
+        await asyncio.sleep(0)
     player.asked.clear()
     yield made
     made.close()
