@@ -295,5 +295,6 @@ def test_tracks_of_a_table_have_home_and_notes(rng: np.random.Generator) -> None
     times_us = [point.time_us - START_US for point in track.points]
     assert times_us == sorted(times_us)
     assert 0 <= times_us[0] <= times_us[-1] <= rows[-1].time_us
+    assert 0 <= track.markers[0].at.time_us - START_US <= rows[-1].time_us
     known = [row.state for row in rows if row.state and NavFlags.ATTITUDE_VALID in row.state.flags]
     assert any(point.attitude_deg is not None for point in track.points) == bool(known)
