@@ -42,11 +42,15 @@ async def send_untrusted(world: Any, *frames: bytes) -> None:
 
 async def test_untrusted_requests_reach_our_vehicles_only(world: Any) -> None:
     foreign, unroutable = len(world.foreign), world.world.counters().unroutable
+    monitor = world.station()
+    world.world.add(f"udp:127.0.0.1:{monitor.port}?monitor=yes")
+    await world.until_open(world.world)
     request = world.untrusted.sender.command(1, 1)
     await send_untrusted(world, request, world.untrusted.sender.command(255, 190))
     assert [(each.frame, each.trusted) for each in world.incoming[-1:]] == [(request, False)]
     assert world.world.counters().unroutable == unroutable + 1
     assert (world.station_.is_empty(), len(world.foreign)) == (True, foreign)
+    assert monitor.received() == [request]
 
 
 async def test_heartbeat_forged_by_an_untrusted_client_does_not_stop_telemetry(world: Any) -> None:

@@ -1,6 +1,7 @@
 """Requests in turns, answers within quotas, and room in full ports; on the manual clock."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 
@@ -115,6 +116,8 @@ def test_removed_client_leaves_neither_requests_nor_a_quota() -> None:
 
 S = US_PER_S
 GCS = (255, 190)
+UNPROVEN_CLIENT = [("a", 0, GCS), ("b", 0, GCS, False)]
+"""The second has not proven that it receives."""
 
 
 @dataclass
@@ -136,19 +139,15 @@ class Present:
         pytest.param([("a", 0, GCS), ("a", S, GCS)], STALE_AFTER_US - 1, [], id="both alive"),
         pytest.param([("a", 0, GCS), ("a", S, (254, 190))], 6 * S, [], id="another system"),
         pytest.param([("a", 0, GCS), ("b", S, GCS)], 6 * S, [], id="another host"),
+        pytest.param(UNPROVEN_CLIENT, UNPROVEN_IDLE_US - 1, [], id="before it must be proven"),
+        pytest.param(UNPROVEN_CLIENT, UNPROVEN_IDLE_US, [1], id="not proven"),
     ],
 )
 def test_clients_go_after_a_timeout_or_when_they_return_on_another_port(
-    clients: list[tuple[str, int, tuple[int, int]]], now_us: int, gone: list[int]
+    clients: list[tuple[Any, ...]], now_us: int, gone: list[int]
 ) -> None:
     present = [Present(*each) for each in clients]
     assert gone_clients(present, 30 * S, now_us) == [present[number] for number in gone]
-
-
-def test_client_that_has_not_proven_that_it_receives_goes_earlier() -> None:
-    present = [Present("a"), Present("b", is_proven=False)]
-    assert gone_clients(present, 30 * S, UNPROVEN_IDLE_US - 1) == []
-    assert gone_clients(present, 30 * S, UNPROVEN_IDLE_US) == [present[1]]
 
 
 def removed(hosts: list[str], newcomer: str) -> int | None:
