@@ -117,6 +117,7 @@ async def test_untrusted_client_that_leaves_while_it_waits_is_not_read_again(
     hub.remove("tcp-listen:127.0.0.1:0")
     assert not hub.clients()
     # The pause is over.
+    rig.clock.now_us += 10_000_000
     monkeypatch.setattr(loop, "time", lambda: begin_s + 3600.0)
     await rig.quiet()
     assert errors == []

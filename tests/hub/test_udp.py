@@ -77,10 +77,13 @@ async def refused(rig: Any) -> tuple[Any, Any]:
     return hub, station
 
 
-async def test_client_is_removed_after_its_host_refuses(rig: Any) -> None:
-    hub, _ = await refused(rig)
+async def test_client_is_removed_after_its_host_refuses_and_may_return(rig: Any) -> None:
+    hub, station = await refused(rig)
     rig.clock.now_us = 4_000_000
     await rig.until(lambda: not hub.clients())
+    with listening_again(station) as again:
+        again.sendto(station.sender.heartbeat(), station.target)
+        await rig.until(lambda: hub.clients())
 
 
 def listening_again(station: Any) -> socket.socket:
