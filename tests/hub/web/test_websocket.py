@@ -112,8 +112,8 @@ class TestTrouble:
     ) -> None:
         hub = rig.hub(LISTEN, max_clients=3)
         port = hub.listening_ports()[0]
-        for _ in range(20):
-            await rig.connect(port)
+        idle = [await rig.connect(port) for _ in range(20)]
+        assert await hung_up(idle[0])
         pages = [await visit(hub) for _ in range(3)]
         assert all(page.is_open for page in pages)
         assert len(hub.clients()) == 3
