@@ -1,235 +1,292 @@
 """The composition root: start, recording of clients, saving and reloading of settings."""
 
 import asyncio
-import errno
-import os
+import itertools
+import shutil
+import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 from msgspec.structs import replace
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
-import gateway.live.daemon
-from gateway.aircraft import Outputs
+from gateway import config
 from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings
 from gateway.hub.settings import HubSettings
+from gateway.live import daemon as daemon_module
+from gateway.live.control_socket import ControlError, request, socket_path
 from gateway.live.daemon import Daemon
+from gateway.live.kept_files import TIMESTAMPS_NAME
 from gateway.live.recording_budget import BURST_S, UNTRUSTED_RATE
-from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
-from gateway.vehicle.service import Request, SaveSettings
+from gateway.live.serial_port import SerialSettings
+from gateway.live.service import ServiceNotifier
+from gateway.live.session import RecordingSettings
+from gateway.pipeline import Pipeline
+from gateway.simulator.timed_frame import TimedFrame
 from gateway.vehicle.vehicle_settings import VehicleSettings
-from gateway.wire.mavlink_signing import EPOCH_2015_US, key_from_passphrase
-from gateway.wire.mavlink_splitter import MavFrame
-from tests.kit.mavlink import packed
+from gateway.wire.mavlink_signing import EPOCH_2015_US, TICK_US, key_from_passphrase
+from gateway.wire.payloads import BaroPayload
+from tests.kit.faults import SlowDisk
+from tests.kit.ground_station import command, ftp_request
+from tests.kit.hub import Station
+from tests.kit.mavlink import STATION, Sender, frames_in, packed, read_back
+from tests.kit.payloads import Tracker
+from tests.kit.process import START_LIMIT_S, until
+from tests.kit.recorder import frames_of
+from tests.ports import free_port
+
+pytestmark = pytest.mark.io
 
 PING = mavlink.MAVLink_ping_message(0, 1, 0, 0)
-HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
-STORE = mavlink.MAVLink_command_long_message(
-    1, 1, mavlink.MAV_CMD_PREFLIGHT_STORAGE, 0, 1, 0, 0, 0, 0, 0, 0
-)
+BIAS = mavlink.MAVLink_param_set_message(1, 1, b"CAL_GYRO_BIAS_X", 0.01, 9)
+STORE = command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1)
+PASSPHRASE = "correct horse"
 
 
-def make_daemon(folder: Path, passphrase: str = "") -> Daemon:
-    settings = GatewaySettings(
-        aircraft_folder=str(folder),
-        hub=HubSettings(endpoints=()),
-        vehicle=VehicleSettings(signing_passphrase=passphrase),
-    )
-    made = Daemon(settings, {}, lambda: settings)
-    made._perform(made._pipeline.feed_record(BaroRaw(0, NodeId(1, 0), 0, 1e5, 20.0), 0))
-    return made
+def board() -> Iterator[TimedFrame]:
+    """Send pressures, which make an aircraft appear."""
+    tracker = Tracker()
+    for k in itertools.count():
+        yield TimedFrame(0.02 * k, tracker.frame(20_000 * k, BaroPayload(10_000_000, 250)))
 
 
-@pytest.fixture
-def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemon:
-    monkeypatch.setenv("HOME", str(tmp_path))
+class Running:
+    """A daemon in a folder, by default with an aircraft, and a station that it sends to."""
+
+    def __init__(
+        self, folder: Path, *, trusted: str = "yes", flies: bool = True, passphrase: str = ""
+    ) -> None:
+        self.station = Station(None, socket.SOCK_DGRAM, (255, STATION))
+        self.port = free_port()
+        self.recordings, self.flies = folder / "recordings", flies
+        self.settings = GatewaySettings(
+            aircraft_folder=str(folder / "aircraft"),
+            hub=HubSettings(
+                endpoints=(
+                    f"udp:127.0.0.1:{self.station.port}?trusted={trusted}",
+                    f"udp-listen:127.0.0.1:{self.port}",
+                )
+            ),
+            recording=RecordingSettings(folder=str(self.recordings), mode="always"),
+            serial=SerialSettings(port="none"),
+            vehicle=VehicleSettings(signing_passphrase=passphrase),
+        )
+        self.read: Callable[[], GatewaySettings] = lambda: self.settings
+        line = board() if flies else None
+        self.daemon = Daemon(self.settings, {}, lambda: self.read(), line)
+
+    async def __aenter__(self) -> Self:
+        self.daemon.start()
+        self.threads = {*threading.enumerate()}
+        await self.daemon.control_socket()
+        if self.flies:
+            await until(lambda: self.daemon.snapshot().aircraft)
+            # From then on it has the address of the gateway.
+            await self.station.receive()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.daemon.close()
+        self.station.socket.close()
+        # The event loop ends the readers of what was closed.
+        await asyncio.sleep(0)
+
+    async def receive(self, *kinds: str) -> Any:
+        """Return the next message of some kinds that the station is sent."""
+        async with asyncio.timeout(START_LIMIT_S):
+            while True:
+                (frame,) = frames_in(await self.station.receive())
+                if (message := read_back(frame)).get_type() in kinds:
+                    return message
+
+    async def text(self, begin: str) -> str:
+        """Return the next text that begins so."""
+        async with asyncio.timeout(START_LIMIT_S):
+            while not (text := (await self.receive("STATUSTEXT")).text).startswith(begin):
+                pass
+        return str(text)
+
+    def recorded(self, *kinds: str) -> list[bytes]:
+        """Return the recorded frames of some kinds."""
+        found = frames_of(self.recordings)
+        return [frame for frame in found if not kinds or read_back(frame).get_type() in kinds]
+
+    async def ask(self, verb: str, **params: object) -> Any:
+        return await asyncio.to_thread(request, socket_path("run"), verb, params)
+
+
+@pytest.fixture(autouse=True)
+def _own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    return make_daemon(tmp_path)
 
 
 @pytest.mark.parametrize("orderly", [True, False])
-def test_signed_frame_is_not_accepted_again_after_a_restart(tmp_path: Path, orderly: bool) -> None:
-    # First, since it may compile for more than the minute in which a timestamp is new.
-    first = make_daemon(tmp_path, "correct horse")
-    signing = (key_from_passphrase("correct horse"), 0, (unix_time_us() - EPOCH_2015_US) // 10)
-    signed = Incoming(5, packed(PING, 255, 190, signing=signing), True)
-    first._on_frame(signed)
-    first._timestamps.close(first._pipeline.newest_timestamps() if orderly else {})
-    assert first._pipeline.forged == 0
-    second = make_daemon(tmp_path, "correct horse")
-    second._on_frame(signed)
-    assert second._pipeline.forged == 1
-
-
-@pytest.fixture
-def recorded(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
-    frames: list[bytes] = []
-    monkeypatch.setattr(daemon._recorder, "frame", frames.append)
-    return frames
-
-
-def frame(message: mavlink.MAVLink_message, sequence: int = 0) -> bytes:
-    return packed(message, 255, 190, sequence=sequence)
-
-
-def test_untrusted_requests_are_recorded_only_with_an_effect(
-    daemon: Daemon, recorded: list[bytes]
+async def test_signed_frame_is_not_accepted_again_after_a_restart(
+    tmp_path: Path, orderly: bool
 ) -> None:
-    daemon._on_frame(Incoming(5, frame(HEARTBEAT), False))
-    assert recorded == []
-    daemon._on_frame(Incoming(5, frame(PING), False))
-    question, answer = recorded
-    assert question == frame(PING)
-    assert answer != question
-    recorded.clear()
-    daemon._on_frame(Incoming(6, frame(HEARTBEAT), True))
-    assert recorded == [frame(HEARTBEAT)]
+    timestamp = (unix_time_us() - EPOCH_2015_US) // TICK_US
+    key = key_from_passphrase(PASSPHRASE)
+    signed, later = (
+        packed(PING, 255, STATION, sequence=k, signing=(key, 0, timestamp + k)) for k in (0, 1)
+    )
+    folders = tmp_path / "first", tmp_path / "second"
+    async with Running(folders[0], passphrase=PASSPHRASE) as first:
+        first.station.send(signed)
+        await first.receive("PING")
+        assert first.daemon.snapshot().forged == 0
+        if not orderly:
+            await until((folders[0] / "aircraft" / TIMESTAMPS_NAME).exists)
+            shutil.copytree(*folders)
+    if orderly:
+        shutil.copytree(*folders)
+    async with Running(folders[1], passphrase=PASSPHRASE) as second:
+        second.station.send(signed)
+        await until(lambda: second.daemon.snapshot().forged == 1)
+        if orderly:
+            second.station.send(later)
+            await second.receive("PING")
 
 
-def test_requests_of_a_flooding_untrusted_client_are_recorded_up_to_a_quota(
-    daemon: Daemon, recorded: list[bytes], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("trusted", ["yes", "no"])
+async def test_untrusted_requests_are_recorded_only_with_an_effect(
+    tmp_path: Path, trusted: str
 ) -> None:
-    monkeypatch.setattr(daemon, "now_us", lambda: 1_000_000)
-    for n in range(2500):
-        daemon._on_frame(Incoming(5, frame(PING, n % 256), False))
-    assert sum(map(len, recorded)) <= UNTRUSTED_RATE * (BURST_S + 1)
-    telemetry = Outgoing(b"telemetry", 30, None)
-    daemon._perform(Outputs(frames=[telemetry]))
-    assert recorded[-1] == b"telemetry", "all the same"
+    async with Running(tmp_path, trusted=trusted) as running:
+        sender = running.station.sender
+        heartbeat, ping = sender.heartbeat(), sender.pack(PING)
+        running.station.send(heartbeat, ping)
+        await running.receive("PING")
+    assert (heartbeat in running.recorded()) == (trusted == "yes")
+    assert ping in running.recorded("PING")
+    assert len(running.recorded("PING")) == 2, "the request and its answer"
 
 
-def test_note_without_an_own_aircraft_is_sent_by_the_hub(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+async def test_requests_of_a_flooding_untrusted_client_are_recorded_up_to_a_quota(
+    tmp_path: Path,
 ) -> None:
-    said: list[bytes] = []
+    message = ftp_request(200, bytes(239 * b"x"))
+    async with Running(tmp_path, trusted="no") as running:
+        for _ in range(600):
+            running.station.send(running.station.sender.pack(message))
+            running.station.received()
+            await asyncio.sleep(0)
+        text = "after it: " * 20
+        running.daemon.announce(text)
+        for _ in range(len(text) // 50):
+            await running.text("after it")
+        seconds = running.daemon.now_us() / 1e6
+    size = sum(map(len, running.recorded("FILE_TRANSFER_PROTOCOL")))
+    assert size <= UNTRUSTED_RATE * (BURST_S + seconds)
+    texts = (read_back(each).text for each in running.recorded("STATUSTEXT"))
+    assert text in "".join(texts), "telemetry all the same"
 
-    def say(messages: list[mavlink.MAVLink_message]) -> bool:
-        said.extend(bytes(message.text.encode()) for message in messages)
-        return True
 
-    monkeypatch.setattr(daemon._hub, "say", say)
-    daemon._announce(False, "to the aircraft")
-    daemon._pipeline.aircraft.clear()
-    daemon._announce(False, "Note: " + "x" * 50)
-    assert b"".join(said).startswith(b"Note: xxx")
-    assert len(said) == 2
-    assert daemon._has_vehicle()
+async def test_note_without_an_own_aircraft_is_sent_by_the_hub(tmp_path: Path) -> None:
+    async with Running(tmp_path, flies=False) as running:
+        with pytest.raises(ControlError, match="no vehicle is received"):
+            await running.ask("record.note", text="x")
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+            vehicle.sendto(Sender(7).heartbeat(), ("127.0.0.1", running.port))
+            assert (await running.receive("HEARTBEAT")).get_srcSystem() == 7
+            await running.ask("record.note", text="x" * 50)
+            chunks = [await running.receive("STATUSTEXT") for _ in range(2)]
+    assert {chunk.get_srcSystem() for chunk in chunks} == {7}
+    assert "".join(chunk.text for chunk in chunks) == "Note: " + "x" * 50
 
 
 @pytest.mark.parametrize("due_us", [0, 999_000_000])
 async def test_due_time_is_polled_neither_without_pause_nor_too_late(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, due_us: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, due_us: int
 ) -> None:
     """Something that stays due must not turn the loop into a busy one."""
     delays: list[float] = []
-    monkeypatch.setattr(daemon, "now_us", lambda: 1_000_000)
-    monkeypatch.setattr(daemon._pipeline, "next_due_us", lambda: due_us)
-    loop = asyncio.get_running_loop()
+    running, loop = Running(tmp_path), asyncio.get_running_loop()
     call_later = loop.call_later
 
-    def note(delay_s: float, *call: Any) -> asyncio.TimerHandle:
-        delays.append(delay_s)
-        return call_later(3600.0, *call)
+    def note(delay_s: float, callback: Any, *words: Any) -> asyncio.TimerHandle:
+        if getattr(callback, "__self__", None) is running.daemon:
+            delays.append(delay_s)
+        return call_later(delay_s, callback, *words)
 
+    monkeypatch.setattr(Pipeline, "next_due_us", lambda _: due_us)
     monkeypatch.setattr(loop, "call_later", note)
-    daemon._poll()
-    assert 0.001 <= delays[-1] <= 0.1
-    assert daemon._timer is not None
-    daemon._timer.cancel()
+    async with running:
+        assert 0.001 <= delays[-1] <= 0.1
 
 
 async def test_ready_is_notified_once_the_control_socket_listens(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ready: list[bool] = []
-    control = daemon._control.path
-    monkeypatch.setattr(daemon._notifier, "ready", lambda: ready.append(control.is_socket()))
-    daemon.start()
-    await daemon.control_socket()
-    daemon.close()
-    assert ready == [True]
+    control = socket_path("run")
+    monkeypatch.setattr(ServiceNotifier, "ready", lambda _: ready.append(control.is_socket()))
+    async with Running(tmp_path):
+        assert ready == [True]
 
 
-async def test_thread_of_look_ups_is_started_before_the_first_one(daemon: Daemon) -> None:
-    others = set(threading.enumerate())
-    daemon.start()
-    begun = {thread for thread in set(threading.enumerate()) - others if "lookups" in thread.name}
-    await daemon.control_socket()
-    daemon.close()
-    assert len(begun) == 1
+async def test_thread_of_look_ups_is_started_before_the_first_one(tmp_path: Path) -> None:
+    others = {*threading.enumerate()}
+    async with Running(tmp_path) as running:
+        begun = running.threads - others
+    assert sum("lookups" in thread.name for thread in begun) == 1
 
 
 @pytest.mark.parametrize("estimator", ["eskf", "paper"])
-async def test_reload_reports_settings_that_need_a_restart(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, estimator: str
-) -> None:
-    now = daemon._settings
+async def test_reload_reports_settings_that_need_a_restart(tmp_path: Path, estimator: str) -> None:
+    running = Running(tmp_path)
+    now = running.settings
     changed = replace(now, estimation=replace(now.estimation, estimator=estimator))
-    monkeypatch.setattr(daemon, "_read", lambda: changed)
-    status = await daemon.reload()
+    running.read = lambda: changed
+    async with running:
+        status = await running.ask("reload")
     assert status.startswith("settings of the hub and of signing applied")
     assert ("others need a new start" in status) == (estimator != now.estimation.estimator)
 
 
-@pytest.mark.parametrize("is_full", [False, True])
+@pytest.mark.parametrize("failures", [0, 9])
 async def test_settings_are_reported_as_stored_once_the_file_is_whole(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_full: bool
+    tmp_path: Path, disk: SlowDisk, failures: int
 ) -> None:
-    file, seen = tmp_path / "1.toml", []
-    over = asyncio.get_running_loop().create_future()
-
-    def fail(*_: Any, **__: Any) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    def note(sent: MavFrame, *_: object) -> None:
-        message = mavlink.MAVLink(None).decode(bytearray(sent.data))
-        if message.get_type() == "COMMAND_ACK":
-            seen.append((message.result, file.read_text() if file.exists() else ""))
-        elif message.get_type() == "STATUSTEXT" and message.text.startswith("Settings"):
-            over.set_result(message.text)
-
-    if is_full:
-        monkeypatch.setattr("gateway.config.write_new", fail)
-    monkeypatch.setattr(daemon._hub, "_pass_on", note)
-    bias = mavlink.MAVLink_param_set_message(1, 1, b"CAL_GYRO_BIAS_X", 0.01, 9)
-    for message in (bias, STORE):
-        daemon._on_frame(Incoming(5, frame(message), True))
-    assert seen == [(mavlink.MAV_RESULT_IN_PROGRESS, "")]
-    text = await over
-    [(result, stored)] = seen[1:]
-    if is_full:
-        assert (result, stored) == (mavlink.MAV_RESULT_FAILED, "")
-        assert text == "Settings not saved: No space left on device"
+    """And they are written off the loop, which answers meanwhile."""
+    disk.failures = failures
+    async with Running(tmp_path) as running:
+        sender = running.station.sender
+        running.station.send(*map(sender.pack, (BIAS, STORE)))
+        await disk.await_sync()
+        running.station.send(sender.pack(PING))
+        results = []
+        while (message := await running.receive("COMMAND_ACK", "PING")).get_type() != "PING":
+            results.append(message.result)
+        assert results == [mavlink.MAV_RESULT_IN_PROGRESS]
+        disk.may_end.set()
+        result = (await running.receive("COMMAND_ACK")).result
+        file = tmp_path / "aircraft" / "1.toml"
+        text = file.read_text() if file.exists() else ""
+        report = await running.text("Settings")
+    if failures:
+        assert (result, text) == (mavlink.MAV_RESULT_FAILED, "")
+        assert report == "Settings not saved: Input/output error"
     else:
-        assert (result, text) == (mavlink.MAV_RESULT_ACCEPTED, "Settings saved: 1.toml")
-        assert "gyro_bias" in stored
+        assert (result, report) == (mavlink.MAV_RESULT_ACCEPTED, "Settings saved: 1.toml")
+        assert "gyro_bias" in text
 
 
-async def test_files_of_settings_are_read_and_written_off_the_loop(
-    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+async def test_files_of_settings_are_read_off_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     threads: list[int] = []
 
     def noting(call: Callable[..., Any]) -> Callable[..., Any]:
-        def noted(*arguments: Any) -> Any:
-            threads.append(threading.get_ident())
-            return call(*arguments)
+        return lambda *words: (threads.append(threading.get_ident()), call(*words))[1]
 
-        return noted
-
-    for name in ("load_aircraft", "save_aircraft"):
-        monkeypatch.setattr(
-            f"gateway.live.daemon.{name}", noting(getattr(gateway.live.daemon, name))
-        )
-    monkeypatch.setattr(daemon, "_read", noting(daemon._read))
-    outcome = asyncio.get_running_loop().create_future()
-    monkeypatch.setattr(daemon, "_on_saved", lambda *_: outcome.set_result(_[-1]))
-    daemon._perform(Outputs(orders=[SaveSettings(1, Request(5, 255, 190, STORE, True))]))
-    await daemon.reload()
-    assert (await outcome).result() == tmp_path / "1.toml"
-    assert len(threads) == 3
+    monkeypatch.setattr(daemon_module, "load_aircraft", noting(config.load_aircraft))
+    running = Running(tmp_path)
+    running.read = noting(running.read)
+    async with running:
+        await running.ask("reload")
+    assert len(threads) == 2
     assert threading.get_ident() not in threads
