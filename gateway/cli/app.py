@@ -292,7 +292,7 @@ def _options(
         typer.Option(
             "--socket",
             envvar="MAVGATE_SOCKET",
-            help="Control socket of the gateway to ask, if several run.",
+            help="Control socket of the gateway to use, if several run.",
         ),
     ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log details too.")] = False,

@@ -10,6 +10,7 @@ Velocity and Euler angles on a 50 Hz grid are interpolated by quintic splines. P
 integral of the velocity spline and acceleration its derivative; the body rate follows from the
 derivatives of the angles. So the truth is closed form at any time: integrating one quantity gives
 the other to machine precision.
+
 The lengths of seven straight legs are solved for, so that in any wind the aircraft comes to rest
 where it started, after exactly `FLIGHT_S`, and the flight can be repeated without a jump. The earth
 does not rotate in this model, and is flat around home (a few centimetres of error at 1 km).

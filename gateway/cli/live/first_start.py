@@ -81,7 +81,7 @@ def setup(
     """Guide through the first start: receiver, sensors, radio, GPS, calibration.
 
     Each calibration is saved when it is done; the exit code is 1 if one is not. The gateway
-    must not run meanwhile: the receiver's port is read by one program at a time.
+    must not run at the same time: the receiver's port is read by one program at a time.
     """
     settings = read_settings()
     serial = settings.serial if port is None else replace(settings.serial, port=port)

@@ -103,7 +103,7 @@ def play(
     recording. A table is fused again while it plays, so what was recorded and what other settings
     make of it can be compared on one map. An autopilot's own log is played with its own estimates,
     parameters and mission, unless --fuse or --beside is given. The parts of a recording are one
-    flight. `mavgate seek` and `mavgate player` control it meanwhile.
+    flight. `mavgate seek` and `mavgate player` control the running player.
     """
     gateway = with_endpoints(read_settings(), endpoint)
     if with_commands and not yes:

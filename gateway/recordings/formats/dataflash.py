@@ -440,7 +440,7 @@ def _each(log: Any, damage: PrintedDamage, names: set[str]) -> Iterator[Any]:
 def open_log(path: Path, options: ReadOptions, damage: PrintedDamage) -> Any:
     """Open a temporary copy of a log, unpacked.
 
-    pymavlink memory-maps a log; if the file shrank meanwhile, the process would be killed.
+    pymavlink memory-maps a log; if the file shrank, the process would be killed.
     """
     whole = read_chunks(path, options.progress, options.unpacked_limit)
     content, damage.before = skip_to(DATAFLASH_BEGIN, whole)
