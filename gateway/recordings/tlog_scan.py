@@ -1,19 +1,19 @@
 """Find the records of a tlog in bytes, at memory speed.
 
 Theory of operation. A tlog is a sequence of records: eight bytes of time, most significant first,
-then one MAVLink frame, whose own length byte gives the begin of the next record. While the file is
+then one MAVLink frame, whose length byte gives the start of the next record. While the file is
 intact, each record is confirmed by the header of the next one, and no checksum is needed:
 
-| state     | the record here                                      | what is done                |
-| --------- | ---------------------------------------------------- | --------------------------- |
-| in step   | is followed by another record's header or the end    | kept                        |
-| in step   | is not, but its checksum holds                       | kept: the damage comes next |
-| in step   | neither                                              | damage begins: out of step  |
-| out of step | has a good checksum, or (unknown message) a successor | kept: in step again      |
-| out of step | has not                                            | one byte on                 |
+| state       | condition                                           | action                     |
+| ----------- | --------------------------------------------------- | -------------------------- |
+| in step     | followed by the header of a record, or by the end   | kept                       |
+| in step     | not so, but its checksum is valid or its id unknown | kept; damage follows       |
+| in step     | neither                                             | damage starts: out of step |
+| out of step | valid checksum, or unknown id and a header follows  | kept: in step again        |
+| out of step | neither                                             | continue at the next byte  |
 
-A header is a time before the year 4253 (its first byte is zero) followed by a frame's first byte.
-A strict scan checks every checksum, also in step.
+A header is a time before the year 4253 (its first byte is zero) followed by the first byte of a
+frame. A strict scan verifies every checksum, also in step.
 """
 
 from typing import Final
@@ -31,12 +31,12 @@ ExtraArray = NDArray[np.int16]
 
 TIME_SIZE: Final = 8
 HEADER_SIZE: Final = 9
-"""Size of a record's time and the first byte of its frame, which are checked of the next record."""
+"""Size of a record's time and the first byte of its frame, by which the next record is checked."""
 SMALLEST_RECORD: Final = 16
 LARGEST_RECORD: Final = 8 + 12 + 255 + 13
 
 COLUMNS: Final = 5
-"""Start, size of the frame, time in µs, origin (system << 8 | component), message id."""
+"""Rows of `records`: start, frame size, time in µs, origin (system << 8 | component), message."""
 
 KNOWN_IDS: Final = 1 << 16
 _YES: Final = 1
@@ -69,7 +69,7 @@ def _frame_size(data: ByteArray, at: int) -> int:
 
 
 def lacks_end(data: ByteArray) -> bool:
-    """Return whether these bytes are the first of a record whose others are missing."""
+    """Return whether these bytes are the start of an incomplete record."""
     if len(data) < HEADER_SIZE:
         return len(data) > 0 and data[0] == 0
     if _is_header(data, 0, True) != _YES:
@@ -86,7 +86,7 @@ def _message_id(data: ByteArray, at: int) -> int:
 
 @compiled
 def _checksum(data: ByteArray, at: int, extra: ExtraArray) -> int:
-    """Return whether a complete frame's checksum holds: yes, no, or an unknown message."""
+    """Return whether the checksum of a complete frame is valid: yes, no, or `_WAIT` if unknown."""
     message_id = _message_id(data, at)
     seed = int(extra[message_id]) if message_id < extra.shape[0] else -1
     if seed < 0:
@@ -99,7 +99,7 @@ def _checksum(data: ByteArray, at: int, extra: ExtraArray) -> int:
 def _judge(
     data: ByteArray, at: int, final: bool, strict: bool, in_step: bool, extra: ExtraArray
 ) -> int:
-    """Return the size of the frame of the record at `at`, 0 for none, -1 if more must be seen."""
+    """Return the frame size of the record at `at`; 0 if there is none, -1 if bytes are missing."""
     header = _is_header(data, at, final)
     if header != _YES:
         return header
@@ -132,11 +132,11 @@ def scan(
     records: IntArray,
     damage: IntArray,
 ) -> tuple[int, int, int, bool]:
-    """Walk over bytes that begin at a record (`in_step`), or anywhere.
+    """Find the records in bytes that start with a record (`in_step`), or anywhere.
 
     Fills `records`, shape (COLUMNS, m) with m at least `data.size // SMALLEST_RECORD + 1`, and
-    `damage`, shape (2, m + 1), with begin and end of each run of bytes that belong to no record.
-    Returns the first byte that was not consumed, the columns filled of both, and `in_step`.
+    `damage`, shape (2, m + 1), with start and end of each run of bytes that belong to no record.
+    Returns the first byte that was not consumed, the numbers of columns filled, and `in_step`.
     """
     found = np.zeros(4, np.int64)
     arrays = (extra, records, damage, found)
@@ -158,7 +158,7 @@ def scan_at(
     damage_at: int,
     found_at: int,
 ) -> None:
-    """Do `scan` on arrays by their addresses; writes its result as four numbers."""
+    """Do `scan` on arrays given by their addresses; the result is written as four numbers."""
     data = array_at(data_at, (size,), _BYTE)
     extra = array_at(extra_at, (KNOWN_IDS,), _EXTRA)
     records = array_at(records_at, (COLUMNS, room), _INT)
