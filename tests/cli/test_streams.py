@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from typer.testing import Result
 
+from gateway.cli import app
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
@@ -62,25 +62,23 @@ class Terminal(io.StringIO):
         return True
 
 
-def run_first(monkeypatch: pytest.MonkeyPatch, *words: str) -> Result:
-    """Run the first command of a program, which sets up its log."""
-    monkeypatch.setattr(logging.root, "handlers", [])
-    monkeypatch.setattr(logging.root, "level", logging.WARNING)
-    return invoke(*words, code=0)
-
-
 def test_log_lines_stay_above_a_progress_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     """It takes the place of `sys.stderr` while it is shown."""
-    above_the_bar = Terminal()
-    before = run_first(monkeypatch, "check-config")
+    before, above_the_bar = Terminal(), Terminal()
+    monkeypatch.setattr(logging.root, "handlers", [])
+    monkeypatch.setattr(logging.root, "level", logging.WARNING)
+    monkeypatch.setattr(sys, "stderr", before)
+    app._begin_logging(verbose=False)
     monkeypatch.setattr(sys, "stderr", above_the_bar)
     logging.getLogger("gateway").warning("the port has gone")
     assert "the port has gone" in above_the_bar.getvalue()
-    assert before.stderr == ""
+    assert before.getvalue() == ""
 
 
 def test_found_fonts_are_not_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first report of a machine collects them."""
-    run_first(monkeypatch, "--verbose", "check-config")
+    monkeypatch.setattr(logging.root, "handlers", [])
+    monkeypatch.setattr(logging.root, "level", logging.WARNING)
+    invoke("--verbose", "check-config", code=0)
     assert logging.getLogger("gateway").isEnabledFor(logging.DEBUG)
     assert not logging.getLogger("matplotlib.font_manager").isEnabledFor(logging.INFO)
