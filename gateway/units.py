@@ -15,6 +15,8 @@ UT_PER_GAUSS: Final = 100.0
 M_PER_MM: Final = 1e-3
 M_PER_CM: Final = 1e-2
 PA_PER_HPA: Final = 100.0
+BITS_PER_BYTE: Final = 10
+"""Bits that a serial line transfers for a byte: 8 data bits, no parity, a start and a stop bit."""
 
 
 def counted(number: int, noun: str) -> str:

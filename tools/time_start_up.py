@@ -44,6 +44,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
+from gateway.units import BITS_PER_BYTE
 from gateway.vehicle.services.ftp import ACK, Opcode, Packet, decode_packet
 from tests.end_to_end.processes import Client, Gateway, MavProxy
 from tests.end_to_end.station import Station
@@ -54,7 +55,6 @@ from tests.kit.process import START_LIMIT_S
 REPEATS = 5
 START_UNIX_US = 1_781_187_930_000_000
 BAUD = 57_600
-BITS_PER_BYTE = 10
 FTP_DATA_BYTES = 239
 LOST_S = 1.0
 RADIO_CONFIG = """

@@ -42,7 +42,7 @@ from gateway.hub.systems import (
     system_filter_from,
 )
 from gateway.printable import unknown_choice
-from gateway.units import US_PER_S
+from gateway.units import BITS_PER_BYTE, US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 _HOST: Final = re.compile(r"[\w.-]+")
@@ -53,8 +53,6 @@ MAX_MESSAGE_ID: Final = (1 << 24) - 1
 MIN_RATE_HZ: Final = 0.001
 NO_MESSAGES: Final = -1
 """An interval that stops a message."""
-BITS_PER_BYTE: Final = 10
-"""Bits per byte on a serial line: start bit, eight data bits, stop bit."""
 MAX_BUDGET: Final = 1_000_000_000
 MS_PER_S: Final = 1000
 MAX_WAIT_MS: Final = 1000

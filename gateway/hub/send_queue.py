@@ -32,9 +32,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as dialect
 
-from gateway.hub.endpoint import BITS_PER_BYTE
 from gateway.hub.routing_table import MAX_ORIGINS, Origin
-from gateway.units import US_PER_S
+from gateway.units import BITS_PER_BYTE, US_PER_S
 from gateway.wire.mavlink_messages import ids_of
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame

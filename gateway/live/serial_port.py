@@ -25,7 +25,7 @@ from serial.tools import list_ports
 
 from gateway.printable import UserError, reason_of
 from gateway.settings import Settings, setting
-from gateway.units import US_PER_S
+from gateway.units import BITS_PER_BYTE, US_PER_S
 from gateway.wire.framing import Fault, FrameDecoder
 
 log = logging.getLogger(__name__)
@@ -37,8 +37,6 @@ READ_SIZE: Final = 48
 """Bytes of one read; a sample of the IMU has 42. So a backlog, of which the kernel keeps 4096
 bytes, takes several turns of the loop: clients need not wait, and the hub's queue drains. With 256
 bytes it does not, and telemetry that has waited too long is dropped."""
-BITS_PER_BYTE: Final = 10
-"""Bits per byte on the line, with start and stop bit."""
 
 ASK_S: Final = 6.0
 """Time for which adapters are tried: opening a port resets a board, whose bootloader waits up to

@@ -24,6 +24,7 @@ from gateway.simulator.node import Node, Sent, nodes_of
 from gateway.simulator.sensors import Chance, DeviceClock, generator
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
+from gateway.units import BITS_PER_BYTE
 from gateway.wire.framing import encode_frame
 from gateway.wire.payloads import (
     PIPES,
@@ -49,7 +50,6 @@ HANDLING_S: Final = 0.0001
 LINE_BUFFER_BYTES: Final = 512
 REPORT_ROOM_BYTES: Final = 80
 """Bytes of the queue reserved for the status frame, so that a full line can still be reported."""
-BITS_PER_BYTE: Final = 10
 STATUS_S: Final = 1.0
 LAST_VEHICLE_ID: Final = 31
 CHANNEL: Final = 76

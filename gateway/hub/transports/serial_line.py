@@ -13,10 +13,9 @@ from typing import Final
 import serial
 
 from gateway.hub import forwarding_step as kernel
-from gateway.hub.endpoint import BITS_PER_BYTE
 from gateway.hub.send_queue import RADIO_STATUS, Pacer
 from gateway.hub.transports.stream import QueuedClient
-from gateway.units import US_PER_S
+from gateway.units import BITS_PER_BYTE, US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
 
 log = logging.getLogger(__name__)
