@@ -10,6 +10,7 @@ US_PER_S: Final = 1_000_000
 NS_PER_US: Final = 1000
 MV_PER_V: Final = 1000
 DEGE7_PER_DEG: Final = 1e7
+DEG_PER_CDEG: Final = 1e-2
 DEG_PER_DEGE7: Final = 1 / DEGE7_PER_DEG
 UT_PER_GAUSS: Final = 100.0
 M_PER_MM: Final = 1e-3

@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.recordings.files import LAST_CIVIL_US
 from gateway.recordings.status_texts import text_of
 from gateway.recordings.tlog import DAY_US, Batch, fields_of
 from gateway.recordings.tlog_scan import TIME_SIZE
@@ -116,8 +117,7 @@ WEEK_MS: Final = 7 * 86_400_000
 DRONE_ID_TIMES: Final = frozenset({"OPEN_DRONE_ID_SYSTEM", "OPEN_DRONE_ID_SYSTEM_UPDATE"})
 """Messages whose timestamp counts seconds since 2019."""
 FIRST_CIVIL_S: Final = 946_684_800
-LAST_CIVIL_S: Final = 4_102_444_800
-"""2100 in s since 1970; times are dates from 2000 up to it."""
+"""The year 2000; earlier times are not civil time."""
 MAX_NAMES: Final = 60_000
 """Identifiers that get a number of their own; all later ones share one number."""
 MAX_PLACE_DEG: Final = 80.0
@@ -346,7 +346,7 @@ class Anonymiser:
         moved = {
             field: fields[field] + days * 86_400 * per_s
             for field, per_s in plan.times
-            if FIRST_CIVIL_S < fields[field] / per_s < LAST_CIVIL_S
+            if FIRST_CIVIL_S < fields[field] / per_s < LAST_CIVIL_US / US_PER_S
         }
         if name in DRONE_ID_TIMES and fields["timestamp"]:
             moved["timestamp"] = max(fields["timestamp"] + days * 86_400, 1)

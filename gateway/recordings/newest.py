@@ -24,7 +24,7 @@ from gateway.recordings.positions import (
 from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION
 from gateway.recordings.tlog import fields_of
 from gateway.records import NAN, UNKNOWN_VEC3, Quat, Vec3
-from gateway.units import M_PER_CM, M_PER_MM, MV_PER_V, US_PER_S
+from gateway.units import DEG_PER_CDEG, M_PER_CM, M_PER_MM, MV_PER_V, US_PER_S
 from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAMES, ids_of
 from gateway.wire.mavlink_splitter import MavFrame
@@ -162,13 +162,13 @@ class NewestState:
         """Return the heading from true north; NaN if unknown."""
         position, hud = self.fields.get("GLOBAL_POSITION_INT"), self.fields.get("VFR_HUD")
         if position is not None and position["hdg"] != UNKNOWN_U16:
-            return float(position["hdg"] * M_PER_CM)
+            return float(position["hdg"] * DEG_PER_CDEG)
         return float(hud["heading"] % 360) if hud is not None else NAN
 
     def true_heading_deg(self, now_us: int) -> float:
         """Return the present heading as its sender reports it; NaN if unknown or old."""
         for name, field, unit_deg in (
-            ("GLOBAL_POSITION_INT", "hdg", M_PER_CM),
+            ("GLOBAL_POSITION_INT", "hdg", DEG_PER_CDEG),
             ("VFR_HUD", "heading", 1.0),
             ("HIGH_LATENCY2", "heading", 2.0),
         ):
@@ -222,7 +222,7 @@ class NewestState:
             self.satellites(),
             NAN if found["eph"] == UNKNOWN_U16 else found["eph"] * M_PER_CM,
             (ellipsoid_mm - found["alt"]) * M_PER_MM if ellipsoid_mm else NAN,
-            NAN if course == UNKNOWN_U16 else course * M_PER_CM,
+            NAN if course == UNKNOWN_U16 else course * DEG_PER_CDEG,
             *(_accuracy_m(found.get(name, 0)) for name in ("h_acc", "v_acc")),
         )
 

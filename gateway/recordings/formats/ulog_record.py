@@ -75,7 +75,7 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
     for data in reversed(log.data_list):
         counts[data.name] += len(data.data["timestamp"])
         if data.name in table().topics:
-            columns = _sound_columns(data.data)
+            columns = _used_columns(data.data)
             topics[data.name, data.multi_id], count = in_order(columns)
             dropped += count
     present = {name for (name, _), topic in topics.items() if len(topic["timestamp"])}
@@ -114,7 +114,7 @@ def _named(kind: str) -> tuple[str, ...]:
     return GPS_TOPICS if kind == "GPS" else ()
 
 
-def _sound_columns(topic: Mapping[str, Any]) -> Topic:
+def _used_columns(topic: Mapping[str, Any]) -> Topic:
     """Leave out columns that are not numeric, or that no message uses."""
     used = _used()
     return {
