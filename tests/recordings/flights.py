@@ -132,7 +132,7 @@ def commented_table() -> bytes:
     text = text.replace('"unix_us_at_zero":null', f'"unix_us_at_zero":{START_US}')
     lines = text.splitlines(keepends=True)
     lines[300:300] = map(encode_line, (TableNote(123, "over the wood"), header_for(settings, 1)))
-    lines.insert(200, encode_line(status(radio_failed=1, chips=("BMP280",))))
+    lines.insert(200, encode_line(status(supply_mv=3300, chips=("BMP280",))))
     lines.append(encode_line(TableNote(456, "landed")))
     return "".join(lines).encode()
 

@@ -242,20 +242,20 @@ def test_fixed_yaw_calibration_has_its_location_in_other_parameters() -> None:
     assert abs(fields["param4"]) < 1e-5
 
 
-def test_same_identifier_gets_the_same_number() -> None:
+def test_same_identifier_gets_the_same_number_and_an_unknown_one_none() -> None:
     def aircraft(icao: int, call: bytes) -> bytes:
         at = (round(LAT * 1e7), round(LON * 1e7))
         return packed(
             mavlink.MAVLink_adsb_vehicle_message(icao, *at, 0, 1, 2, 3, 4, call, 1, 1, 1, 7000)
         )
 
-    frames = anonymised(
-        [aircraft(0x4B1234, b"SWR1"), aircraft(7, b"B"), aircraft(0x4B1234, b"SWR1")]
-    )
-    first, other, again = (fields_of(frame) for frame in frames if frame)
+    known = aircraft(0x4B1234, b"SWR1")
+    frames = anonymised([known, aircraft(7, b"B"), known, aircraft(0, b"")])
+    first, other, again, unknown = (fields_of(frame) for frame in frames if frame)
     assert first["ICAO_address"] == again["ICAO_address"] != other["ICAO_address"]
     assert first["callsign"] == again["callsign"] != other["callsign"]
     assert first["squawk"] != 7000
+    assert (unknown["ICAO_address"], unknown["callsign"]) == (0, b"")
 
 
 def test_dates_are_moved_by_whole_days_and_times_since_boot_stay() -> None:
