@@ -125,10 +125,11 @@ def _check_port(device: str) -> Iterator[Diagnosis]:
 
 
 def _membership(path: Path) -> str:
-    owner, user = path.stat().st_gid, pwd.getpwuid(os.getuid()).pw_name
+    owner = path.stat().st_gid
     try:
-        group = grp.getgrgid(owner)
+        group, user = grp.getgrgid(owner), pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
+        # Neither need have a name, as for an arbitrary user of a container.
         return f"it is accessible to the group {owner}"
     if user in group.gr_mem:
         return f"{user} is in the group {group.gr_name} only from the next log-in on"

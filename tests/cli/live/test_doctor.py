@@ -21,6 +21,9 @@ from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
+NAMELESS = 3_999_999_999
+"""A user id without a name."""
+
 
 @pytest.fixture
 def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> GatewaySettings:
@@ -42,11 +45,19 @@ def one(check: doctor.Check, settings: GatewaySettings) -> Diagnosis:
 
 
 @pytest.mark.parametrize(
-    ("members", "text"),
-    [([], "`sudo usermod -aG dialout"), ([getuser()], "is in the group dialout only from the")],
+    ("user", "members", "text"),
+    [
+        (os.getuid(), [], "`sudo usermod -aG dialout"),
+        (os.getuid(), [getuser()], "is in the group dialout only from the"),
+        (NAMELESS, [], "accessible to the group"),
+    ],
 )
 def test_port_is_wrong_with_a_hint_if_missing_or_without_rights(
-    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, members: list[str], text: str
+    settings: GatewaySettings,
+    monkeypatch: pytest.MonkeyPatch,
+    user: int,
+    members: list[str],
+    text: str,
 ) -> None:
     missing = one(doctor.check_receiver, settings)
     assert (missing.grade, "`mavgate ports`" in missing.text) == (Grade.FAIL, True)
@@ -55,6 +66,7 @@ def test_port_is_wrong_with_a_hint_if_missing_or_without_rights(
     monkeypatch.setattr(os, "access", lambda *_: False)
     dialout = SimpleNamespace(gr_name="dialout", gr_mem=members)
     monkeypatch.setattr(grp, "getgrgid", lambda _: dialout)
+    monkeypatch.setattr(os, "getuid", lambda: user)
     found = one(doctor.check_receiver, settings)
     assert (found.grade, text in found.text) == (Grade.FAIL, True)
 
