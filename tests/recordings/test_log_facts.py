@@ -99,4 +99,4 @@ def test_every_command_smooths_with_the_latency_that_contradicts_the_one_set(
     assert case.smoothed_latency_s == latency_s
     section = estimators(case)
     assert section is not None
-    assert f"0.40 s: `smoothed` uses the {latency_s:.2f} s" in section.lead
+    assert f"0.40 s: `smoothed` uses {latency_s:.2f} s" in section.lead
