@@ -110,6 +110,12 @@ class GroupFar(UdpFar):
 class TcpFar(Far):
     peer: socket.socket | None = None
 
+    def use(self, peer: socket.socket) -> None:
+        peer.setblocking(False)
+        # A small write would wait for the acknowledgement of the one before, 40 ms.
+        peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.peer = peer
+
     def open(self) -> None:
         self.port = getattr(self, "port", 0) or free_port()
         self.server = socket.create_server(("127.0.0.1", self.port))
@@ -118,8 +124,7 @@ class TcpFar(Far):
 
     def read(self) -> bytes:
         if self.peer is None:
-            self.peer, _ = self.server.accept()
-            self.peer.setblocking(False)
+            self.use(self.server.accept()[0])
         return self.peer.recv(65535)
 
     def write(self, data: bytes) -> None:
@@ -137,8 +142,7 @@ class TcpCaller(TcpFar):
         self.url, self.peer = "tcp-listen:127.0.0.1:0", None
 
     def arrive(self, hub: Hub) -> None:
-        self.peer = socket.create_connection(("127.0.0.1", hub.listening_ports()[0]))
-        self.peer.setblocking(False)
+        self.use(socket.create_connection(("127.0.0.1", hub.listening_ports()[0])))
 
     def shut(self) -> None:
         if self.peer is not None:
