@@ -239,7 +239,7 @@ class DaskCluster:
         other = {name: version for name, version in versions.items() if version != __version__}
         if other:
             listed = ", ".join(f"{name} has {version}" for name, version in sorted(other.items()))
-            raise ClusterError(f"this is mavgate {__version__}, but {listed};  {_SAME}")
+            raise ClusterError(f"this is mavgate {__version__}, but {listed}; {_SAME}")
 
 
 def prepare_worker() -> str:
