@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import NodeId
 from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_splitter import message_id_of
 
 TUNNEL_ID: Final = MESSAGE_IDS["TUNNEL"]
 FIRST_TYPE: Final = 0x8000
@@ -32,7 +33,9 @@ class TunnelWriter:
 
 
 def tunnelled(frame: bytes, node: NodeId) -> bytes:
-    """Return the bytes in a TUNNEL frame; empty if it is of another source, or damaged."""
+    """Return the bytes in a frame; empty if it is no TUNNEL, of another source, or damaged."""
+    if message_id_of(frame) != TUNNEL_ID:
+        return b""
     try:
         message = mavlink.MAVLink(None).decode(bytearray(frame))
     except mavlink.MAVError:

@@ -93,7 +93,7 @@ def test_noise_on_the_channel_is_reported_and_own_packets_are_not(imu_rig: MakeR
 
 
 class Radio(NamedTuple):
-    """A board's radio, and what its recovery may take."""
+    """A board's radio, and the limit of its recovery."""
 
     parts: Parts
     rate_hz: float

@@ -229,7 +229,7 @@ class HubMachine(RuleBasedStateMachine):
         sender = self.rig.sender(*name)
         sender.link.seq = data.draw(st.integers(0, 255))
         for kind in kinds * times:
-            # Whoever has listened knows the next number of the good client.
+            # A listener can know the next number of the good client.
             link = self.good.sender.link
             guessed = self.good.sender.command(*AUTOPILOT)
             link.seq = (link.seq - 1) % 256

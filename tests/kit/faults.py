@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import NoReturn
 
 FAR_S = 60.0
-"""After which what waits for a sync makes a test fail."""
+"""Timeout of waiting for a sync, s."""
 
 
 def refusing(number: int) -> Callable[..., NoReturn]:
@@ -21,13 +21,13 @@ def refusing(number: int) -> Callable[..., NoReturn]:
 
 
 class SlowDisk:
-    """Syncs of files and folders end when they may."""
+    """Syncs of files and folders, which end only when the test allows it."""
 
     def __init__(self) -> None:
         self.begun = threading.Semaphore(0)
         self.may_end = threading.Event()
         self.failures = 0
-        """How many of the next syncs fail."""
+        """Number of the next syncs that fail."""
         self.syncing = self.most = self.count = 0
 
     def sync(self, file: int) -> None:

@@ -1,4 +1,4 @@
-"""A pipeline with no hub: what its sources or the test give it, and what it sends."""
+"""A pipeline without a hub: it takes bytes of sources or records, and keeps the sent messages."""
 
 from typing import Any
 

@@ -13,7 +13,7 @@ ROUTER = """
 import sys
 from gateway.hub.transports.zenoh.session import open_session, session_config
 config = session_config(sys.argv[1], "", "router")
-# Whoever is linked with it waits for ever for a router that has stalled.
+# Clients keep their link to a router that has stalled.
 config.insert_json5("transport/link/tx/lease", "3600000")
 session = open_session(config)
 print("open", flush=True)

@@ -21,3 +21,5 @@ def test_bytes_of_other_sources_and_damaged_frames_are_left_out() -> None:
     assert tunnelled(frame, NodeId(7, 8)) == b""
     assert tunnelled(frame, NodeId(6, 9)) == b""
     assert tunnelled(frame[:-1] + bytes([frame[-1] ^ 1]), NODE) == b""
+    heartbeat = bytes([0xFD, 9, 0, 0, 0, 7, 1, 0, 0, 0]) + bytes(11)
+    assert tunnelled(heartbeat, NODE) == b""

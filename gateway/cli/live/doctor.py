@@ -129,7 +129,7 @@ def _membership(path: Path) -> str:
     try:
         group, user = grp.getgrgid(owner), pwd.getpwuid(os.getuid()).pw_name
     except KeyError:
-        # Neither need have a name, as for an arbitrary user of a container.
+        # In a container, groups and users often have no name.
         return f"it is accessible to the group {owner}"
     if user in group.gr_mem:
         return f"{user} is in the group {group.gr_name} only from the next log-in on"

@@ -33,7 +33,7 @@ def test_best_settings_are_written_as_a_settings_file(recording: Path, tmp_path:
     estimation = load(best).estimation
     assert estimation.estimator == "paper"
     assert estimation.paper.alpha_accel == trials["estimation.paper.alpha_accel"][0]
-    # Only what was varied, and what that needs.
+    # Only the varied settings, and those that they require.
     [(section, written)] = tomllib.loads(best.read_text()).items()
     assert (section, written.keys()) == ("estimation", {"estimator", "paper"})
     assert written["paper"].keys() == {"alpha_accel", "beta_velocity"}

@@ -148,7 +148,7 @@ def test_scale_and_offset_are_applied() -> None:
     ],
 )
 def test_file_without_needed_columns_is_refused(names: str, lenient: bool, missing: str) -> None:
-    """Without a map of the user's own, only those are needed that give a sample."""
+    """Without a column map, only the columns of a sample are required."""
     with pytest.raises(ValueError, match=f"no column {missing}"):
         rows_of(CsvReader(TRACKER, lenient=lenient), names, "1,2")
 
