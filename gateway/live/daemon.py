@@ -169,6 +169,8 @@ class Daemon:
             lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
             self._introduction,
             self._locations,
+            # A simulated time begins with the machine's, and is late by the start-up.
+            gps_time=self._receiver is None,
         )
 
     def _make_control(self) -> ControlServer:

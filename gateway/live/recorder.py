@@ -63,7 +63,8 @@ class Recorder:
     a vehicle's fusion after all records passed to `flight`; `introduction_of` the frames of a
     vehicle that every part begins with: version, modes, parameters, missions, home; `vehicles_of`
     latitude and longitude of the homes of own aircraft, or None, by id. `announce` is called with
-    whether it is a problem, and a text for the user.
+    whether it is a problem, and a text for the user. Without `gps_time`, the time of GPS is ignored
+    and the machine's is used.
     """
 
     def __init__(
@@ -76,6 +77,8 @@ class Recorder:
         state_of: Callable[[int], FusionState | None] = lambda _: None,
         introduction_of: Callable[[int], list[bytes]] = lambda _: [],
         vehicles_of: Callable[[], VehicleLocations] = dict,
+        *,
+        gps_time: bool = True,
     ) -> None:
         self._settings = settings
         self._clock, self._machine_us = now_us, unix_us
@@ -83,6 +86,7 @@ class Recorder:
         self._announce = announce
         self._state_of, self._introduction_of = state_of, introduction_of
         self._vehicles_of = vehicles_of
+        self._gps_time = gps_time
         self._session = Session(settings)
         self._civil = CivilClock()
         self._seen: set[int] = set()
@@ -231,7 +235,7 @@ class Recorder:
             vehicle_id = record.vehicle_id
         else:
             vehicle_id = record.node.vehicle_id
-            if isinstance(record, GpsFix) and record.utc_us is not None:
+            if self._gps_time and isinstance(record, GpsFix) and record.utc_us is not None:
                 self._civil.update_gps(vehicle_id, record.utc_us, record.time_us)
         for part in self._parts():
             if self._settings.tlog and part.introduces(vehicle_id):

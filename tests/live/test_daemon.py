@@ -26,10 +26,14 @@ from gateway.live.serial_port import SerialSettings
 from gateway.live.service import ServiceNotifier
 from gateway.live.session import RecordingSettings
 from gateway.pipeline import Pipeline
+from gateway.simulator.flight import START_UNIX_US
+from gateway.simulator.receiver import simulate
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_signing import EPOCH_2015_US, TICK_US, key_from_passphrase
 from gateway.wire.payloads import BaroPayload
+from gateway.wire.timesync import ENOUGH
 from tests.kit.faults import SlowDisk
 from tests.kit.ground_station import command, ftp_request
 from tests.kit.hub import Station
@@ -37,6 +41,7 @@ from tests.kit.mavlink import STATION, Sender, frames_in, packed, read_back
 from tests.kit.payloads import Tracker
 from tests.kit.process import START_LIMIT_S, until
 from tests.kit.recorder import frames_of
+from tests.kit.recordings import read_tlog
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io
@@ -54,11 +59,22 @@ def board() -> Iterator[TimedFrame]:
         yield TimedFrame(0.02 * k, tracker.frame(20_000 * k, BaroPayload(10_000_000, 250)))
 
 
+def receiver_of_another_day() -> Iterator[TimedFrame]:
+    """Send an aircraft whose GPS time is not that of this machine."""
+    return simulate(SimulatorSettings(gps_first_fix_s=0.0), START_UNIX_US).frames()
+
+
 class Running:
     """A daemon in a folder, by default with an aircraft, and a station that it sends to."""
 
     def __init__(
-        self, folder: Path, *, trusted: str = "yes", flies: bool = True, passphrase: str = ""
+        self,
+        folder: Path,
+        *,
+        trusted: str = "yes",
+        flies: bool = True,
+        passphrase: str = "",
+        line: Callable[[], Iterator[TimedFrame]] = board,
     ) -> None:
         self.station = Station(None, socket.SOCK_DGRAM, (255, STATION))
         self.port = free_port()
@@ -76,8 +92,8 @@ class Running:
             vehicle=VehicleSettings(signing_passphrase=passphrase),
         )
         self.read: Callable[[], GatewaySettings] = lambda: self.settings
-        line = board() if flies else None
-        self.daemon = Daemon(self.settings, {}, lambda: self.read(), line)
+        receiver = line() if flies else None
+        self.daemon = Daemon(self.settings, {}, lambda: self.read(), receiver)
 
     async def __aenter__(self) -> Self:
         self.daemon.start()
@@ -183,6 +199,22 @@ async def test_requests_of_a_flooding_untrusted_client_are_recorded_up_to_a_quot
     assert size <= UNTRUSTED_RATE * (BURST_S + seconds)
     texts = (read_back(each).text for each in running.recorded("STATUSTEXT"))
     assert text in "".join(texts), "telemetry all the same"
+
+
+async def test_simulated_time_does_not_split_a_recording(tmp_path: Path) -> None:
+    """It is late by the start-up of a busy machine, and no better than the machine's."""
+
+    def fixes() -> int:
+        return len(running.recorded("GPS_RAW_INT"))
+
+    async with Running(tmp_path, line=receiver_of_another_day) as running:
+        await until(lambda: fixes() > ENOUGH)
+        found = fixes()
+        # The recorder decides after it has written, so before it writes again.
+        await until(lambda: fixes() > found)
+    (part,) = running.recordings.glob("*.tlog")
+    age_us = unix_time_us() - read_tlog(part)[0].time_us
+    assert 0 < age_us < 60_000_000
 
 
 async def test_note_without_an_own_aircraft_is_sent_by_the_hub(tmp_path: Path) -> None:
