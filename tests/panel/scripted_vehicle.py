@@ -14,6 +14,7 @@ RATE_HZ = 20
 HOSTILE_EVERY = 4
 HOSTILE_NAMES = ["B :a=q=1", 'B :a="q=1"', '"onload=q=1 ', "<img/onerror=q>", "`${q=1}`",
                  "'+(q=1)+'", "{{q=1}}", "x :style=q=1", "' :id='q=1'", "\u202edoog"]  # fmt: skip
+HOME_DEG = 46.99, 8.01
 HOSTILE_MARKUP = '<img src=x onerror=q=1><script>q=1</script>`${q=1}` :a="q=1" {{q=1}}'
 
 
@@ -59,6 +60,10 @@ class ScriptedVehicle(threading.Thread):
             mavlink.MAVLink_global_position_int_message(
                 0, 470_000_000, 80_000_000, round(alt_m * 1e3), round(self.alt_home_m * 1e3),
                 0, 0, 0, heading * 100,
+            ),
+            mavlink.MAVLink_home_position_message(
+                *(round(angle * 1e7) for angle in HOME_DEG), round(self.home_alt_m * 1e3),
+                *[0.0] * 3, [1.0, 0.0, 0.0, 0.0], *[0.0] * 3,
             ),
             mavlink.MAVLink_vfr_hud_message(
                 self.airspeed_mps, self.groundspeed_mps, heading, 50, alt_m, self.climb_mps

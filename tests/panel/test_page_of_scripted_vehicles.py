@@ -10,6 +10,9 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import to_euler
+from gateway.recordings.antenna import AntennaStation, pointing_of
+from gateway.recordings.newest import NewestState
+from gateway.recordings.positions import Position
 from tests.panel.browsing import (
     CONFIG_WITHOUT_MAP,
     WAIT_MS,
@@ -20,7 +23,7 @@ from tests.panel.browsing import (
     show,
 )
 from tests.panel.messages import short_tlog
-from tests.panel.scripted_vehicle import HOSTILE_MARKUP, HOSTILE_NAMES, ScriptedVehicle
+from tests.panel.scripted_vehicle import HOME_DEG, HOSTILE_MARKUP, HOSTILE_NAMES, ScriptedVehicle
 
 pytestmark = [pytest.mark.io, pytest.mark.slow, needs_chromium]
 expect.set_options(timeout=WAIT_MS)
@@ -137,6 +140,22 @@ def test_altitude_and_climb_are_drawn(page: Page, vehicle: ScriptedVehicle) -> N
     expect(display_of(page)).to_have_attribute(
         "aria-label", re.compile(r"altitude 123.0 m, climb -2.5 m/s$")
     )
+
+
+def test_direction_from_home_is_that_of_an_antenna(page: Page, vehicle: ScriptedVehicle) -> None:
+    vehicle.alt_home_m = 317.0
+    strip = page.locator(".number-strip")
+    expect(strip.locator("[data-item='Above home'] b")).to_have_text("317.0")
+    here = NewestState()
+    here.position = Position(47.0, 8.0, vehicle.home_alt_m + vehicle.alt_home_m)
+    here.position_us = 0
+    home = AntennaStation(Position(*HOME_DEG, vehicle.home_alt_m))
+    found = pointing_of(home, here, {}, 0)
+    assert found is not None
+    text = strip.locator("[data-item='From home']").inner_text()
+    azimuth, elevation = map(float, re.findall(r"(-?[\d.]+)°", text))
+    assert azimuth == pytest.approx(found.azimuth_deg, abs=0.6)
+    assert elevation == pytest.approx(found.elevation_deg, abs=0.06)
 
 
 def test_airspeed_is_drawn_unless_it_is_the_ground_speed(
