@@ -37,7 +37,7 @@ from tests.recordings.formats import flown
 pytestmark = pytest.mark.io
 
 AIRCRAFT = GatewaySettings().default_aircraft
-SECONDS = 20
+SECONDS = 8
 """Of the autopilots' logs."""
 
 
