@@ -153,7 +153,11 @@ class MavProxy:
 async def mavsdk_system(
     port: int, kind: ComponentType = ComponentType.GROUND_STATION
 ) -> AsyncIterator[System]:
-    """Connect MAVSDK to a port; yield the first vehicle, to be used within the time limit."""
+    """Connect MAVSDK to a port; yield the first vehicle, to be used within the time limit.
+
+    Plugins need a name in the test: a thread of MAVSDK frees the object of an expression, perhaps
+    while this frees MAVSDK, which aborts Python.
+    """
     configuration = Configuration.create_with_component_type(kind)
     async with Mavsdk(configuration) as mavsdk:
         await mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")

@@ -180,9 +180,10 @@ async def test_mavsdk_companion_with_the_same_system_id_is_answered(gateway: Gat
     """A companion computer is 1/191: the vehicle answers it as any other client."""
 
     async with mavsdk_system(gateway.port, ComponentType.COMPANION_COMPUTER) as system:
-        version = await answered(InfoAsync(system).get_version)
+        info, telemetry = InfoAsync(system), TelemetryAsync(system)
+        version = await answered(info.get_version)
         assert version.flight_sw_minor > 0
-        await answered(TelemetryAsync(system).set_rate_altitude, 5.0)
+        await answered(telemetry.set_rate_altitude, 5.0)
 
 
 def test_dronekit_uploads_and_downloads_a_mission(gateway: Gateway) -> None:
@@ -212,9 +213,9 @@ def test_dronekit_uploads_and_downloads_a_mission(gateway: Gateway) -> None:
 
 async def test_mavsdk_reads_and_sets_parameters_within_their_ranges(gateway: Gateway) -> None:
     async with mavsdk_system(gateway.port) as system:
-        version = await answered(InfoAsync(system).get_version)
+        info, param = InfoAsync(system), ParamAsync(system)
+        version = await answered(info.get_version)
         assert version.flight_sw_minor > 0
-        param = ParamAsync(system)
         names: set[str] = set()
         while not {"PAPER_ACC_CUTOFF", "RATE_ATT_QUAT"} <= names:
             everything = await param.get_all_params()
@@ -231,7 +232,8 @@ async def test_mavsdk_reads_and_sets_parameters_within_their_ranges(gateway: Gat
 async def test_mavsdk_moves_home_by_a_parameter(gateway: Gateway) -> None:
     async with mavsdk_system(gateway.port) as system:
         param = ParamAsync(system)
-        homes = TelemetryAsync(system).subscribe_home()
+        telemetry = TelemetryAsync(system)
+        homes = telemetry.subscribe_home()
         before = await anext(homes)
         await answered(param.set_param_float, "HOME_ALT", 432.5)
         async for home in homes:
