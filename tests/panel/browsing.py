@@ -142,7 +142,8 @@ def box_of(element: Locator) -> FloatRect:
 
 def download(page: Page, button: Locator, folder: Path) -> Path:
     """Click a button; return the file that is downloaded, under the name that the page gives it."""
-    with page.expect_download(timeout=START_LIMIT_MS) as waiting:
+    # The command of an export has a lower priority than all other tests.
+    with page.expect_download(timeout=5 * START_LIMIT_MS) as waiting:
         button.click()
     path = folder / waiting.value.suggested_filename
     waiting.value.save_as(path)
