@@ -1,12 +1,13 @@
 """Fixtures for every test: seeded chance, a manual clock, real flights where there are any."""
 
+import asyncio
 import gc
 import os
 import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,21 @@ class ManualClock:
         return self.now_us
 
 
+class LoopTime:
+    """The time of an event loop: ahead by `ahead_s`, and standing still from `stop` on."""
+
+    def __init__(self, running: Callable[[], float]) -> None:
+        self.ahead_s = 0.0
+        self._running = running
+
+    def __call__(self) -> float:
+        return self._running() + self.ahead_s
+
+    def stop(self) -> None:
+        now_s = self._running()
+        self._running = lambda: now_s
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _own_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Give the tests a home that nobody has used: no settings, recordings or gateways of a user."""
@@ -91,6 +107,14 @@ def _own_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture
 def clock() -> ManualClock:
     return ManualClock()
+
+
+@pytest.fixture
+async def loop_time(monkeypatch: pytest.MonkeyPatch) -> LoopTime:
+    loop = asyncio.get_running_loop()
+    time = LoopTime(loop.time)
+    monkeypatch.setattr(loop, "time", time)
+    return time
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gateway.cli import app
-from tests.kit.cli import invoke
+from tests.kit.cli import invoke, reset_logging
 
 pytestmark = pytest.mark.io
 
@@ -65,8 +65,7 @@ class Terminal(io.StringIO):
 def test_log_lines_stay_above_a_progress_bar(monkeypatch: pytest.MonkeyPatch) -> None:
     """It takes the place of `sys.stderr` while it is shown."""
     before, above_the_bar = Terminal(), Terminal()
-    monkeypatch.setattr(logging.root, "handlers", [])
-    monkeypatch.setattr(logging.root, "level", logging.WARNING)
+    reset_logging(monkeypatch)
     monkeypatch.setattr(sys, "stderr", before)
     app._begin_logging(verbose=False)
     monkeypatch.setattr(sys, "stderr", above_the_bar)
@@ -77,8 +76,7 @@ def test_log_lines_stay_above_a_progress_bar(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_found_fonts_are_not_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first report of a machine collects them."""
-    monkeypatch.setattr(logging.root, "handlers", [])
-    monkeypatch.setattr(logging.root, "level", logging.WARNING)
+    reset_logging(monkeypatch)
     invoke("--verbose", "check-config", code=0)
     assert logging.getLogger("gateway").isEnabledFor(logging.DEBUG)
     assert not logging.getLogger("matplotlib.font_manager").isEnabledFor(logging.INFO)

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import itertools
 import socket
-import time
 from typing import Any
 
 import msgspec
@@ -13,6 +12,7 @@ import pytest
 from gateway.hub.forwarding_step import MAX_DATAGRAM
 from gateway.hub.hub import Hub
 from gateway.hub.transports.base import READ_BYTES, UNTRUSTED_READ_BURST, UNTRUSTED_READ_RATE
+from tests.conftest import LoopTime
 from tests.kit.process import START_LIMIT_S
 
 pytestmark = pytest.mark.io
@@ -108,16 +108,16 @@ async def test_client_that_becomes_trusted_is_read_at_once(
 
 
 async def test_untrusted_client_that_leaves_while_it_waits_is_not_read_again(
-    rig: Any, paused: tuple[Hub, socket.socket], monkeypatch: pytest.MonkeyPatch
+    rig: Any, paused: tuple[Hub, socket.socket], loop_time: LoopTime
 ) -> None:
     hub, _ = paused
     errors: list[Any] = []
-    loop, begin_s = asyncio.get_running_loop(), time.monotonic()
-    loop.set_exception_handler(lambda _, context: errors.append(context))
+    handler = asyncio.get_running_loop().set_exception_handler
+    handler(lambda _, context: errors.append(context))
     hub.remove("tcp-listen:127.0.0.1:0")
     assert not hub.clients()
     # The pause is over.
     rig.clock.now_us += 10_000_000
-    monkeypatch.setattr(loop, "time", lambda: begin_s + 3600.0)
+    loop_time.ahead_s = 3600.0
     await rig.quiet()
     assert errors == []

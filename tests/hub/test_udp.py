@@ -10,6 +10,7 @@ from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.forwarding_step import MAX_DATAGRAM
 from gateway.hub.transports.udp import UdpClient
 from gateway.records import Incoming
+from tests.conftest import LoopTime
 from tests.kit.hub import receive
 
 pytestmark = pytest.mark.io
@@ -190,7 +191,7 @@ async def test_changed_address_of_a_name_is_followed(rig: Any, names: Any) -> No
 
 
 async def test_packing_without_a_wait_joins_only_frames_of_one_wake_up(
-    rig: Any, monkeypatch: pytest.MonkeyPatch
+    rig: Any, loop_time: LoopTime
 ) -> None:
     """Two datagrams that are read at one wake-up go on as one, without a timer."""
     station = rig.station()
@@ -199,28 +200,22 @@ async def test_packing_without_a_wait_joins_only_frames_of_one_wake_up(
     source.send(source.sender.heartbeat())
     assert (await station.receive())[5] == 42
     frames = [source.sender.attitude() for _ in range(3)]
-    loop = asyncio.get_running_loop()
-    now_s = loop.time()
-    monkeypatch.setattr(loop, "time", lambda: now_s)
+    loop_time.stop()
     source.send(*frames)
     assert await station.receive() == b"".join(frames)
 
 
-async def test_packing_with_a_wait_joins_later_frames(
-    rig: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_packing_with_a_wait_joins_later_frames(rig: Any, loop_time: LoopTime) -> None:
     station = rig.station()
     hub = await rig.open(f"udp:127.0.0.1:{station.port}?pack=1100&wait=20")
-    loop = asyncio.get_running_loop()
-    now_s = [loop.time()]
-    monkeypatch.setattr(loop, "time", lambda: now_s[0])
+    loop_time.stop()
     frames = [rig.vehicle.attitude() for _ in range(3)]
     for frame in frames:
         rig.publish(hub, frame)
-        now_s[0] += 0.006
+        loop_time.ahead_s += 0.006
         await asyncio.sleep(0)
         assert station.is_empty()
-    now_s[0] += 0.003
+    loop_time.ahead_s += 0.003
     assert await station.receive() == b"".join(frames)
 
 

@@ -1,5 +1,8 @@
 """The command line in process."""
 
+import logging
+
+import pytest
 from typer.testing import CliRunner, Result
 
 from gateway.cli.app import app
@@ -18,3 +21,9 @@ def invoke(*words: object, answers: str = "", code: int | None = None) -> Result
 def run(*words: object, code: int = 0) -> str:
     """Return the output of `mavgate` with one space for each run of white space."""
     return " ".join(invoke(*words, code=code).output.split())
+
+
+def reset_logging(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the root logger be that of a new process until the end of the test."""
+    monkeypatch.setattr(logging.root, "handlers", [])
+    monkeypatch.setattr(logging.root, "level", logging.WARNING)

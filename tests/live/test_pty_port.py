@@ -12,6 +12,7 @@ import serial
 from gateway.live.pty_port import PtyPort
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.wire.framing import Fault, FrameDecoder, encode_frame
+from tests.conftest import LoopTime
 
 pytestmark = pytest.mark.io
 
@@ -159,37 +160,32 @@ async def test_closing_removes_the_terminal(play: Callable[..., PtyPort]) -> Non
 
 
 async def test_frames_continue_at_their_rate_after_a_standstill(
-    play: Callable[..., PtyPort], monkeypatch: pytest.MonkeyPatch
+    play: Callable[..., PtyPort], loop_time: LoopTime
 ) -> None:
     port = play(frames(1000, rate_hz=100.0))
     reader = Reader(port.path)
     port.start()
     await reader.until(3)
     # An hour passes for the loop's clock: only the frame that is late comes at once.
-    loop = asyncio.get_running_loop()
-    clock = loop.time
-    begin_s = clock()
-    monkeypatch.setattr(loop, "time", lambda: clock() + 3600.0)
+    begin_s = loop_time()
+    loop_time.ahead_s = 3600.0
     await reader.until(6)
     reader.close()
     port.close()
     # On a busy machine more of them have become due meanwhile.
-    assert port.written <= 20 + 100 * (clock() - begin_s)
+    assert port.written <= 20 + 100 * (loop_time() - loop_time.ahead_s - begin_s)
 
 
 async def test_frames_that_are_made_too_slowly_are_not_all_dropped(
-    play: Callable[..., PtyPort], monkeypatch: pytest.MonkeyPatch
+    play: Callable[..., PtyPort], loop_time: LoopTime
 ) -> None:
     """Each takes twice its interval to be made, as on a computer without processor time."""
-    loop = asyncio.get_running_loop()
-    clock, made_s = loop.time, [0.0]
 
     def slowly() -> Iterator[TimedFrame]:
         for frame in frames(2000, rate_hz=100.0):
-            made_s[0] += 0.02
+            loop_time.ahead_s += 0.02
             yield frame
 
-    monkeypatch.setattr(loop, "time", lambda: clock() + made_s[0])
     port = play(slowly())
     reader = Reader(port.path)
     port.start()

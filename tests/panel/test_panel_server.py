@@ -11,7 +11,7 @@ import pytest
 from gateway.panel import panel_server
 from gateway.panel.panel_server import PanelError
 from gateway.panel.panel_settings import PanelSettings
-from tests.kit.cli import invoke
+from tests.kit.cli import invoke, reset_logging
 
 pytestmark = pytest.mark.io
 
@@ -40,8 +40,7 @@ def test_log_lines_of_an_attached_panel_have_no_time(monkeypatch: pytest.MonkeyP
         logging.getLogger("gateway").info("a page was opened")
         logging.getLogger("gateway").warning("the port is taken")
 
-    monkeypatch.setattr(logging.root, "handlers", [])
-    monkeypatch.setattr(logging.root, "level", logging.WARNING)
+    reset_logging(monkeypatch)
     monkeypatch.setattr(panel_server, "run_panel", run_panel)
     monkeypatch.setattr(os, "nice", lambda _: 0)
     attached = invoke("panel", "--attached", answers="run.sock\n")
