@@ -2,7 +2,6 @@
 
 import asyncio
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -40,13 +39,6 @@ def exports(tmp_path: Path) -> Iterator[Exports]:
     write_tlog(made.folder / f"{NAME}_01.tlog", flight_records(40))
     yield made
     made.jobs.close()
-
-
-@pytest.fixture
-def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a folder, not made yet, in which the exports are."""
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
-    return tmp_path / "temporary"
 
 
 @pytest.mark.slow

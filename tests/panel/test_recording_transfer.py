@@ -1,7 +1,6 @@
 """Recordings to the browser and from it."""
 
 import os
-import tempfile
 from collections.abc import AsyncIterator
 from functools import partial
 from http import HTTPStatus
@@ -106,12 +105,12 @@ async def test_links_and_pipes_are_not_downloaded(client: httpx.AsyncClient, fol
         assert packed.namelist() == ["link_02.tlog"]
 
 
+@pytest.mark.usefixtures("temporary")
 def test_archive_is_packed_piece_by_piece_without_a_file_or_an_open_descriptor(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     large = tmp_path / "large_01.tlog"
     large.write_bytes(os.urandom(4 * CHUNK))
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
     before = sum(1 for _ in Path("/proc/self/fd").iterdir())
     stream = zip_stream([large, tmp_path / "gone_01.tlog"])
     first = next(stream)

@@ -125,10 +125,8 @@ def test_full_disk_of_a_copy_is_reported_with_its_folder(
     assert caught.value.filename == tempfile.gettempdir()
 
 
-def test_copy_has_no_name_so_that_nothing_is_left_of_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+def test_copy_has_no_name_so_that_nothing_is_left_of_it(tmp_path: Path, temporary: Path) -> None:
+    temporary.mkdir()
     with temporary_copy(tmp_path / "a.bin", [b"content"]) as copy:
-        assert list(tmp_path.iterdir()) == []
+        assert list(temporary.iterdir()) == []
         assert Path(recording_streams.name_of(copy)).read_bytes() == b"content"

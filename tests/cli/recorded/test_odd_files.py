@@ -3,7 +3,6 @@
 import gzip
 import os
 import struct
-import tempfile
 import time
 import tracemalloc
 from collections.abc import Callable
@@ -172,13 +171,12 @@ def test_overlong_line_is_refused_within_bounded_memory(tmp_path: Path) -> None:
     ],
 )
 def test_packed_log_beyond_the_unpacked_limit_is_refused_and_fills_neither_memory_nor_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, head: bytes
+    tmp_path: Path, temporary: Path, command: str, head: bytes
 ) -> None:
-    path, temporary = packed(tmp_path / "bomb.gz", head, bytes(1 << 20), 128), tmp_path / "new"
+    path = packed(tmp_path / "bomb.gz", head, bytes(1 << 20), 128)
     config = tmp_path / "gateway.toml"
     config.write_text("[recording]\nunpacked_limit_mb = 8\n")
     temporary.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     words = ["-o", tmp_path / "out.csv"] if command in ("fuse", "convert") else []
     printed = run_within(48, command, path, *words, "--config", config)
     # To play it, all of it is read to find its format.
