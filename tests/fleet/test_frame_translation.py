@@ -169,7 +169,8 @@ class TestSigned:
     def test_forged_frame_is_dropped_and_counted(self, offset: int) -> None:
         there = translation(KEY)
         assert from_site(there, changed(packed(attitude(), 1, key=KEY), offset, 1)) is None
-        assert there.counters["forged"] == 1
+        assert to_site(there, changed(packed(command(2), 255, key=KEY), offset, 1)) is None
+        assert there.counters["forged"] == 2
 
 
 def changed(frame: bytes, offset: int, bits: int) -> bytes:

@@ -140,12 +140,13 @@ def test_number_of_waiting_vehicles_is_bounded() -> None:
 
 def test_id_assigned_by_the_operator_is_swapped() -> None:
     ids = IdMap()
-    for site in "abc":
+    for site in "abcd":
         ids.id_of(site, 1)
-    ids.set_by_hand("c", 1, 1)
-    assert [ids.id_of(site, 1) for site in "abc"] == [3, 2, 1]
-    ids.set_by_hand("d", 1, 9)
-    assert ids.id_of("d", 1) == 9
+    ids.leave_out("b", 1)
+    ids.set_by_hand("d", 1, 1)
+    assert [ids.known_id(site, 1) for site in "acd"] == [4, 3, 1]
+    ids.set_by_hand("e", 1, 3)
+    assert [ids.known_id(site, 1) for site in "ce"] == [2, 3]
     for wrong in (0, 250):
         with pytest.raises(ValueError, match="1 to 249"):
             ids.set_by_hand("a", 1, wrong)

@@ -54,6 +54,7 @@ def test_newcomer_takes_a_place_of_its_kind(
         waiting.admit(number, each)
     assert places.admit(99, newcomer)
     assert gone == evicted
+    assert places.items() == [*({*range(len(before))} - {*evicted}), 99]
     assert waiting.admit(99, newcomer) == (not evicted)
 
 
