@@ -19,7 +19,7 @@ def settings(settings: FleetSettings, router: Router) -> FleetSettings:
 
 
 async def test_router_outage_loses_old_frames_and_recovers(world: World, router: Router) -> None:
-    # By TCP, on which silence is allowed: the clock of the test is faster than the reconnection.
+    # By TCP, which has no timeout: the clock of the test is faster than the reconnection.
     site = world.open_site("field-a", extra="tcp-listen:127.0.0.1:0")
     await world.rig.connect(site.listening_ports()[0])
     await world.until(lambda: bool(world.systems()))

@@ -155,6 +155,16 @@ def test_pages_that_are_loaded_and_abandoned_delete_no_others() -> None:
     assert [page.is_deleted for page in loaded].count(False) == PENDING_OF_SESSION
 
 
+def test_deleted_page_leaves_its_place_to_others() -> None:
+    pages = OpenPages()
+    loaded: list[Any] = [Page(number) for number in range(PENDING_OF_SESSION + 1)]
+    for page in loaded:
+        pages.add(page, holder(VIEWER, "v"))
+        if page is loaded[1]:
+            page.delete()
+    assert [page for page in loaded if page.is_deleted] == [loaded[1]]
+
+
 def test_page_takes_messages_of_its_own_session_and_ends_with_it() -> None:
     pages = OpenPages()
     page: Any = Page(1)

@@ -12,10 +12,12 @@ from gateway.panel.state.samples import SPAN_US, SampleMemory
 from gateway.units import US_PER_S
 from tests.panel.messages import decoded
 
+UNIX_US = 1_781_187_930_000_000
+
 
 def imu(time_us: int) -> Any:
-    """A message as it comes off the line: with its frame."""
-    values = (0, 0, -9.8, 0, 0, 0, 0.2, 0, 0.4, 0, 0, 0, 20, 0xFFFF)
+    """A message of a level aircraft that faces east, as it comes off the line: with its frame."""
+    values = (0, 0, -9.8, 0, 0, 0, 0, -0.2, 0.4, 0, 0, 0, 20, 0xFFFF)
     return decoded(mavlink.MAVLink_highres_imu_message(time_us, *values))
 
 
@@ -68,6 +70,17 @@ def test_samples_with_repeated_times_are_fused() -> None:
     assert {len(each.time_us) for each in found} == {120}
     # NaN until they have started.
     assert all(np.isfinite(each.roll_deg[10:]).all() for each in found)
+
+
+def test_estimates_have_the_civil_times_and_angles_of_the_samples() -> None:
+    memory = SampleMemory()
+    for time_us in range(0, 24 * US_PER_S, 20_000):
+        memory.add(1, imu(time_us), UNIX_US + time_us)
+    for found in compare(memory.frames(1), {}):
+        ages_s = (found.time_us - UNIX_US) / US_PER_S
+        assert (ages_s[0], ages_s[-1]) == pytest.approx((0.0, 24.0), abs=0.3)
+        angles = found.roll_deg[-1], found.pitch_deg[-1], found.yaw_deg[-1]
+        assert angles == pytest.approx((0.0, 0.0, 90.0), abs=2.0), found.name
 
 
 def test_only_the_newest_minutes_of_sensor_frames_are_stored() -> None:

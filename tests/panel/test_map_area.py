@@ -1,5 +1,6 @@
 """An area of a map, cut out of a larger file by ranges of bytes."""
 
+import math
 from pathlib import Path
 
 import httpx
@@ -8,6 +9,7 @@ from pmtiles.tile import TileType, zxy_to_tileid
 
 from gateway.panel import map_area
 from gateway.panel.map_area import (
+    EARTH_M,
     MapAreaError,
     box_around,
     extract_area,
@@ -43,6 +45,21 @@ def test_length_is_read_in_metres_kilometres_and_nautical_miles() -> None:
     for text in ("", "km", "-5km", "5 parsec"):
         with pytest.raises(ValueError, match=f"{text!r} is no length"):
             length_m(text)
+
+
+@pytest.mark.parametrize(
+    ("positions", "box"),
+    [
+        ([(60.0, 20.0)], (59.0, 18.0, 61.0, 22.0)),
+        ([(-60.0, 20.0), (0.0, 30.0), (math.nan, 0.0)], (-61.0, 18.0, 1.0, 32.0)),
+        ([(84.5, -179.0)], (83.5, -180.0, 85.0, -168.57)),
+    ],
+)
+def test_box_has_the_margin_on_every_side(
+    positions: list[tuple[float, float]], box: tuple[float, ...]
+) -> None:
+    degree_m = math.radians(1.0) * EARTH_M
+    assert box_around(positions, degree_m) == pytest.approx(box, abs=0.01)
 
 
 async def test_extracted_area_is_a_map_style(world: Path, tmp_path: Path) -> None:
