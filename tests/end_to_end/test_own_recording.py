@@ -70,7 +70,7 @@ def station_of(port: int, version: int) -> Station | None:
 def record(gateway: Gateway) -> None:
     """Record a station that uploads a mission, one of MAVLink 1, and a companion.
 
-    It begins at known positions, since the time of GPS may end the part that is written.
+    It begins at known positions, so that every output has a track of both aircraft.
     """
     port = gateway.listen_port
     stations = [wait_for(lambda v=version: station_of(port, v)) for version in (2, 1)]

@@ -112,8 +112,8 @@ async def test_untrusted_client_that_leaves_while_it_waits_is_not_read_again(
 ) -> None:
     hub, _ = paused
     errors: list[Any] = []
-    handler = asyncio.get_running_loop().set_exception_handler
-    handler(lambda _, context: errors.append(context))
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(lambda _, context: errors.append(context))
     hub.remove("tcp-listen:127.0.0.1:0")
     assert not hub.clients()
     # The pause is over.

@@ -214,7 +214,7 @@ async def test_simulated_time_does_not_split_a_recording(tmp_path: Path) -> None
         await until(lambda: fixes() > found)
     (part,) = running.recordings.glob("*.tlog")
     age_us = unix_time_us() - read_tlog(part)[0].time_us
-    assert 0 < age_us < 60_000_000
+    assert 0 < age_us < 3_600_000_000
 
 
 async def test_note_without_an_own_aircraft_is_sent_by_the_hub(tmp_path: Path) -> None:
