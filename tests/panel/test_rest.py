@@ -1,6 +1,7 @@
 """The REST API as scripts use it: a server, a hub with a vehicle, and HTTP between them."""
 
 import asyncio
+import gc
 import json
 import math
 import re
@@ -334,6 +335,15 @@ class TestFollowing:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(stream.recv(), 0.05)
                     return
+
+    async def test_queue_of_a_client_that_leaves_is_freed(self, world: World) -> None:
+        def queues() -> int:
+            return sum(type(each) is Subscriber for each in gc.get_objects())
+
+        async with websockets.connect(f"ws://{world.url}/v1/ws/mavlink") as stream:
+            await self.until_followed(world, stream)
+            assert queues() == 1
+        await until(lambda: not queues(), 0.05)
 
     @pytest.mark.parametrize(
         ("pattern", "word"),
