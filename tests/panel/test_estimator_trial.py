@@ -52,7 +52,8 @@ SHARES = [(50, 10, 0.5), (10, 40, 0.5), (25, 21, 1.0), (50, 60, 1.0)]
 @pytest.mark.parametrize(("rate_hz", "seconds", "share"), SHARES)
 def test_share_of_the_needed_samples_is_reported(rate_hz: int, seconds: int, share: float) -> None:
     assert SampleMemory().collected(1, LEAST_S, LEAST_HZ) == 0.0
-    memory = collected(n * US_PER_S // rate_hz for n in range(rate_hz * seconds + 1))
+    times_us = (7 * US_PER_S + n * US_PER_S // rate_hz for n in range(rate_hz * seconds + 1))
+    memory = collected(times_us)
     assert memory.collected(1, LEAST_S, LEAST_HZ) == pytest.approx(share, abs=0.03)
 
 
