@@ -254,6 +254,20 @@ async def test_hanging_disk_stops_recording_and_bounds_the_buffer(bench: Recorde
     assert 0 <= file.stat().st_size - PENDING_LIMIT < len(PIECE)
 
 
+async def test_each_part_begins_with_the_introduction_of_its_aircraft(
+    make_bench: MakeBench, rng: np.random.Generator
+) -> None:
+    bench = make_bench(rotate_min=1, table=False, introduction_of=lambda _: FRAMES[:3])
+    await bench.turn()
+    for seconds in (1.0, 100.0, 1.0, 1.0):
+        bench.fly([make_fused(rng, bench.clock())])
+        bench.send(FRAMES[3:4])
+        await bench.turn(seconds)
+    bench.recorder.close()
+    parts = [read_tlog(path) for path in sorted(bench.recorder.folder.glob("*.tlog"))]
+    assert [[record.frame for record in part] for part in parts] == [[*FRAMES[:4], FRAMES[3]]] * 2
+
+
 async def test_gps_time_corrects_the_times_of_a_recording_and_its_name_stays(
     make_bench: MakeBench, rng: np.random.Generator
 ) -> None:

@@ -52,6 +52,7 @@ def test_tlog_is_summarised() -> None:
     (vehicle,) = info.vehicles
     assert (vehicle.system_id, vehicle.mav_type, vehicle.autopilot) == (7, 1, 3)
     assert vehicle.distance_m == pytest.approx(1000, rel=0.01)
+    assert vehicle.positions == "GLOBAL_POSITION_INT"
     assert vehicle.rates == (Rate("HEARTBEAT", 101, 1.01), Rate("GLOBAL_POSITION_INT", 101, 1.01))
     assert info.gaps == ()
     assert info.damaged_bytes == 0
@@ -128,7 +129,7 @@ def test_table_is_summarised(rng: np.random.Generator) -> None:
     rates = {rate.name: rate.count for rate in info.vehicles[0].rates}
     assert rates["imu"] == rates["state"] == 100
     assert rates["baro"] == 10
-    assert info.vehicles[0].system_id == 3
+    assert (info.vehicles[0].system_id, info.vehicles[0].positions) == (3, "states")
     assert [note.text for note in info.notes] == ["here"]
     assert (info.damaged_runs, info.damaged_bytes) == (1, 12)
 
