@@ -147,6 +147,8 @@ def test_id_assigned_by_the_operator_is_swapped() -> None:
     assert [ids.known_id(site, 1) for site in "acd"] == [4, 3, 1]
     ids.set_by_hand("e", 1, 3)
     assert [ids.known_id(site, 1) for site in "ce"] == [2, 3]
+    ids.set_by_hand("f", 1, 9)
+    assert ids.id_of("f", 1) == 9
     for wrong in (0, 250):
         with pytest.raises(ValueError, match="1 to 249"):
             ids.set_by_hand("a", 1, wrong)

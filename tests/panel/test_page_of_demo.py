@@ -329,6 +329,7 @@ def test_flight_view_seeks_back_and_returns_to_the_present(page: Page) -> None:
     past_us = page.evaluate("mavgate.state.time_us")
     page.wait_for_function(f"mavgate.now_us > {past_us} + 6e6")
     assert page.evaluate("mavgate.state.time_us") == past_us
+    expect(view.locator(".number-strip [data-item='Ground speed'] b")).not_to_be_empty()
     # A page that was busy shows the present for a moment.
     state = page.evaluate("mavgate.state")
     spot = view.locator(".number-strip [data-item='Latitude, longitude'] b")

@@ -338,6 +338,7 @@ class TestFollowing:
 
     async def test_queue_of_a_client_that_leaves_is_freed(self, world: World) -> None:
         def queues() -> int:
+            gc.collect()
             return sum(type(each) is Subscriber for each in gc.get_objects())
 
         async with websockets.connect(f"ws://{world.url}/v1/ws/mavlink") as stream:

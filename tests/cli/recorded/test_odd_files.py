@@ -109,7 +109,7 @@ def packed(path: Path, head: bytes, piece: bytes, mb: int) -> Path:
 
 
 def bomb(path: Path) -> None:
-    packed(path, NAMES.encode() + b"\n", (b"#" * 31 + b"\n") * (1 << 15), 34)
+    packed(path, NAMES.encode() + b"\n", b"#\n" * (1 << 19), 34)
 
 
 def run_within(peak_mb: int, *words: object) -> str:
