@@ -155,8 +155,8 @@ async def mavsdk_system(
 ) -> AsyncIterator[System]:
     """Connect MAVSDK to a port; yield the first vehicle, to be used within the time limit.
 
-    Plugins need a name in the test: a thread of MAVSDK frees the object of an expression, perhaps
-    while this frees MAVSDK, which aborts Python.
+    A test must keep a reference to each plugin: otherwise a worker thread frees it, possibly while
+    MAVSDK itself is freed, which aborts Python.
     """
     configuration = Configuration.create_with_component_type(kind)
     async with Mavsdk(configuration) as mavsdk:

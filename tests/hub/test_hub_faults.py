@@ -58,7 +58,7 @@ async def test_garbage_of_a_tcp_client_costs_others_no_frame(rig: Any, garbage: 
     assert client.received == 0
     heartbeat = rig.sender(200, 190).heartbeat()
     while not hub.clients()[-1].received:
-        # Bytes that look like the head of a frame swallow the first ones.
+        # After bytes that look like the head of a frame, the first ones are read as its payload.
         with contextlib.suppress(BlockingIOError):
             rude.send(heartbeat)
         await fly(1)

@@ -52,7 +52,7 @@ def records_sent(sent: Sent, step_us: int = STEP_US) -> list[TlogRecord]:
 
 
 def with_jump(records: list[TlogRecord], at: int, by_us: int) -> list[TlogRecord]:
-    """Let the clock jump by some time before the record of a number."""
+    """Shift the times from a record on, as if the clock had been set before it."""
     return records[:at] + [TlogRecord(r.time_us + by_us, r.frame) for r in records[at:]]
 
 

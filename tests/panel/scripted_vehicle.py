@@ -11,10 +11,10 @@ from pymavlink.dialects.v20 import all as mavlink
 from tests.ports import free_port
 
 RATE_HZ = 20
+HOME_DEG = 46.99, 8.01
 HOSTILE_EVERY = 4
 HOSTILE_NAMES = ["B :a=q=1", 'B :a="q=1"', '"onload=q=1 ', "<img/onerror=q>", "`${q=1}`",
                  "'+(q=1)+'", "{{q=1}}", "x :style=q=1", "' :id='q=1'", "\u202edoog"]  # fmt: skip
-HOME_DEG = 46.99, 8.01
 HOSTILE_MARKUP = '<img src=x onerror=q=1><script>q=1</script>`${q=1}` :a="q=1" {{q=1}}'
 
 

@@ -10,9 +10,8 @@ from gateway.estimation.select import ESTIMATORS
 from gateway.panel.estimator_trial import LEAST_HZ, LEAST_S, ComparisonError, compare, settings_of
 from gateway.panel.state.samples import SPAN_US, SampleMemory
 from gateway.units import US_PER_S
+from tests.kit.recordings import START_US
 from tests.panel.messages import decoded
-
-UNIX_US = 1_781_187_930_000_000
 
 
 def imu(time_us: int) -> Any:
@@ -76,9 +75,9 @@ def test_samples_with_repeated_times_are_fused() -> None:
 def test_estimates_have_the_civil_times_and_angles_of_the_samples() -> None:
     memory = SampleMemory()
     for time_us in range(0, 24 * US_PER_S, 20_000):
-        memory.add(1, imu(time_us), UNIX_US + time_us)
+        memory.add(1, imu(time_us), START_US + time_us)
     for found in compare(memory.frames(1), {}):
-        ages_s = (found.time_us - UNIX_US) / US_PER_S
+        ages_s = (found.time_us - START_US) / US_PER_S
         assert (ages_s[0], ages_s[-1]) == pytest.approx((0.0, 24.0), abs=0.3)
         angles = found.roll_deg[-1], found.pitch_deg[-1], found.yaw_deg[-1]
         assert angles == pytest.approx((0.0, 0.0, 90.0), abs=2.0), found.name
