@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from gateway.aircraft import Aircraft
+from gateway.answers.log_answers import VehicleAnswers
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings
 from gateway.hub.endpoint import parse_endpoint, stays_here
@@ -20,12 +21,11 @@ from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlServer, socket_path
 from gateway.live.other_gateways import identity_verb
 from gateway.live.player_edge import PlayerEdge
-from gateway.recordings.answers import VehicleAnswers
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, time_us_of
 from gateway.recordings.opening import PlayedFlight
 from gateway.recordings.play import Player
-from gateway.recordings.trimming import NOTHING_WITHIN
+from gateway.recordings.workshop.trimming import NOTHING_WITHIN
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle

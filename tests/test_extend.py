@@ -23,11 +23,11 @@ from gateway.hub.settings import HubSettings
 from gateway.hub.transports.registry import CLIENTS
 from gateway.panel.added_views import ADDED_VIEWS, add_view
 from gateway.recordings.columns import TableRow, row_to_line
-from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.files import OTHER_FORMATS
 from gateway.recordings.reading import READERS
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import encode_head
+from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
 from gateway.records import ImuRaw, Incoming, NavState
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.sources.kinds import SOURCE_KINDS, make_sources

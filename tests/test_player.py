@@ -19,10 +19,10 @@ from gateway.hub.hub import SENDS_AT_ONCE
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import lay_out, open_flights
-from gateway.recordings.tlog import TlogRecord
 from gateway.records import Outgoing
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_splitter import frame_of
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.hub import Station
 from tests.kit.mavlink import STATION, Sender
 from tests.kit.process import until
@@ -36,7 +36,7 @@ PARAMETERS = 26
 LIMIT_S = 60
 
 
-def recording(step_us: int = 1) -> list[TlogRecord]:
+def recording(step_us: int = 1) -> list[RecordedFrame]:
     """Vehicle 3 sends its parameters, and station 255 arms it."""
     vehicle, station = Sender(3), Sender(255, STATION)
     beat = mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)
@@ -81,7 +81,9 @@ async def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     with ExitStack() as opened:
 
-        def make(*urls: str, records: list[TlogRecord] | None = None, **plan: Any) -> PlayerDaemon:
+        def make(
+            *urls: str, records: list[RecordedFrame] | None = None, **plan: Any
+        ) -> PlayerDaemon:
             path = write_tlog(tmp_path / "a.tlog", records or recording())
             flights = open_flights([path], OPTIONS, opened)
             played = lay_out(flights, with_commands=plan.get("with_commands", False))

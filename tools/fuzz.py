@@ -48,13 +48,10 @@ from gateway.recordings.formats.maps import (
 )
 from gateway.recordings.formats.ulog import TOPICS
 from gateway.recordings.moment import parse_moment
-from gateway.recordings.positions import ORIGIN_ID, POSITION_SOURCES
 from gateway.recordings.reading import has_record, open_record
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.senders import ATTITUDE_ID, ATTITUDE_QUATERNION_ID, Senders
-from gateway.recordings.status_texts import STATUSTEXT_ID
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
-from gateway.recordings.tlog import HEARTBEAT_ID, TlogScanner, encode_record
+from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.records import BaroRaw, Incoming, NodeId
 from gateway.settings import Field, Settings, fields_of
@@ -64,10 +61,13 @@ from gateway.sources.lines import KEYS as LINE_KEYS
 from gateway.sources.phone import BUFFERS, LOGGED
 from gateway.sources.settings import SourceSettings
 from gateway.vehicle.plan import Location
+from gateway.vehicle_state.positions import ORIGIN_ID, POSITION_SOURCES
+from gateway.vehicle_state.senders import ATTITUDE_ID, ATTITUDE_QUATERNION_ID, Senders
+from gateway.vehicle_state.status_texts import STATUSTEXT_ID
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 from gateway.wire.link import Link
-from gateway.wire.mavlink_messages import CRC_EXTRA
+from gateway.wire.mavlink_messages import CRC_EXTRA, HEARTBEAT_ID
 from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter, message_id_of
 
 NUMBERS: Final = (

@@ -33,8 +33,9 @@ from gateway.live.recorder import Recorder
 from gateway.live.session import RecordingSettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.table import TableFault, TableHeader, TableReader
-from gateway.recordings.tlog import Batch, TlogScanner
+from gateway.recordings.tlog import TlogScanner
 from gateway.records import FusedSample, ImuFlags, ImuRaw, ImuSample, NavFlags, NavState, NodeId
+from gateway.wire.recorded_frames import Batch
 
 RATE_HZ = 200
 """Fused samples a second, each with two frames."""

@@ -25,9 +25,9 @@ from gateway.analysis.pilot_figures import PilotFigures, pilot_figures
 from gateway.analysis.signals import apply
 from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
 from gateway.recordings.fuse import FusionSettings, with_estimator
-from gateway.recordings.positions import ground_distance_m
 from gateway.settings import Settings, fields_of
 from gateway.units import US_PER_S
+from gateway.vehicle_state.positions import ground_distance_m
 
 ESTIMATORS: Final[tuple[str, ...]] = tuple(
     name for name in OWN_ESTIMATORS if name in EstimationSettings.__struct_fields__

@@ -30,11 +30,11 @@ from gateway.recordings.fuse import (
     samples_of,
     with_estimator,
 )
-from gateway.recordings.joining import joined_tables
 from gateway.recordings.reading import is_table, open_rows
 from gateway.recordings.recorded_fusion import aircraft_for, check_latency
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable
 from gateway.recordings.table import TableBlock
+from gateway.recordings.workshop.joining import joined_tables
 from gateway.records import BaroSample, GpsFix, NavFlags
 from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut
 from gateway.sensing.chain import ImuLog

@@ -35,12 +35,12 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.formats.maps import track_feature
 from gateway.recordings.index import as_text, recording_name
-from gateway.recordings.positions import TrackPoint
 from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.table import TableBlock, TableReader
 from gateway.records import NAN
 from gateway.units import DEG_PER_DEGE7, M_PER_CM
+from gateway.vehicle_state.positions import TrackPoint
 
 CATALOGUE_NAME: Final = "catalogue.sqlite"
 SCHEMA: Final = 2

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from gateway.analysis.flight import LocalFrame
 from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS
+from gateway.answers.log_answers import AUTOPILOT_VERSION_ID, PARAM_VALUE_ID
 from gateway.geometry.angle import wrap_180
-from gateway.recordings.answers import AUTOPILOT_VERSION_ID, PARAM_VALUE_ID
 from gateway.recordings.columns import (
     COLUMNS,
     GPS,
@@ -29,16 +29,16 @@ from gateway.recordings.columns import (
 from gateway.recordings.figures import gps_outages_us, lost_share
 from gateway.recordings.formats.maps import point_of_fix
 from gateway.recordings.moment import civil_time
-from gateway.recordings.positions import FIX_2D, GPS_IDS, Continuity, GroundDistance, TrackPoint
-from gateway.recordings.senders import RecordedSender, Senders
 from gateway.recordings.summary import TimesSpan
 from gateway.recordings.table import TableBlock, TableFault, TableHeader
-from gateway.recordings.tlog import Batch
 from gateway.recordings.tlog_index import TlogIndex
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.records import NodeStatus
 from gateway.units import US_PER_S
+from gateway.vehicle_state.positions import FIX_2D, GPS_IDS, Continuity, GroundDistance, TrackPoint
+from gateway.vehicle_state.senders import RecordedSender, Senders
 from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.recorded_frames import Batch
 
 TOLERANCE_M: Final = 3.0
 """Tolerance of a simplified track, less than the error of GPS."""

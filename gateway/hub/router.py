@@ -11,11 +11,11 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as dialect
 
+from gateway.answers.answer_cache import AnswerCache
 from gateway.hub.fanout import Fanout
 from gateway.hub.limits import RequestQueue
 from gateway.hub.round_trip import NOBODY, RoundTrip, is_of_gateway
 from gateway.hub.routing_table import (
-    HEARTBEAT_ID,
     LATE,
     NEW,
     DuplicateFilter,
@@ -28,10 +28,9 @@ from gateway.hub.routing_table import (
 from gateway.hub.stats import HubCounters
 from gateway.hub.systems import commands
 from gateway.hub.transports.base import Client, HubContext, OnForeign
-from gateway.recordings.answer_cache import AnswerCache
 from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import TARGET_OFFSETS
+from gateway.wire.mavlink_messages import HEARTBEAT_ID, TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 from gateway.wire.system_ids import LAST_ID
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import MESSAGE_IDS, boot_time_us
+from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS, boot_time_us
 from gateway.wire.mavlink_splitter import MavFrame
 
 Origin = tuple[int, int]
@@ -55,7 +55,7 @@ are seldom switched on at the same moment."""
 Note = TypeVar("Note")
 LINKED_US: Final = 60 * US_PER_S
 """A pair ends after this time without a copy: it was chance, or one of the links has gone."""
-HEARTBEAT_ID, HOME_POSITION_ID = MESSAGE_IDS["HEARTBEAT"], MESSAGE_IDS["HOME_POSITION"]
+HOME_POSITION_ID: Final = MESSAGE_IDS["HOME_POSITION"]
 GREETING: Final = (HEARTBEAT_ID, HOME_POSITION_ID)
 """Messages of a greeting, in this order: the vehicle exists, and its home."""
 OWN_FRESH_US: Final = 5 * US_PER_S

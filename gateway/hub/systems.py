@@ -20,9 +20,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from gateway.hub.routing_table import HEARTBEAT_ID, ROUTE_FRESH_US, Origin
+from gateway.hub.routing_table import ROUTE_FRESH_US, Origin
 from gateway.wire.frame_editing import Sign
-from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS, ids_of
+from gateway.wire.mavlink_messages import CRC_EXTRA, HEARTBEAT_ID, NO_TARGET, TARGET_OFFSETS, ids_of
 from gateway.wire.mavlink_splitter import MavFrame
 from gateway.wire.system_ids import LAST_ID, rename_systems
 

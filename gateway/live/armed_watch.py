@@ -3,10 +3,10 @@
 from collections.abc import Set
 from typing import Final
 
-from gateway.recordings.newest import NewestState, NewestVehicles
-from gateway.recordings.positions import RANKS
-from gateway.recordings.tlog import HEARTBEAT_ID
 from gateway.units import US_PER_S
+from gateway.vehicle_state.newest import NewestState, NewestVehicles
+from gateway.vehicle_state.positions import RANKS
+from gateway.wire.mavlink_messages import HEARTBEAT_ID
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 
 LOST_US: Final = 300 * US_PER_S

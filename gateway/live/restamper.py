@@ -21,7 +21,8 @@ from gateway.live.part import TLOG
 from gateway.live.part_files import free_bytes_near
 from gateway.output import sync_folder
 from gateway.recordings.table import HEADER_PREFIX, TableHeader, encode_line
-from gateway.recordings.tlog import Batch, TlogScanner
+from gateway.recordings.tlog import TlogScanner
+from gateway.wire.recorded_frames import Batch
 
 log = logging.getLogger(__name__)
 

@@ -12,9 +12,9 @@ from typing import Final
 from prometheus_client.core import Metric
 
 from gateway.live.metrics import Labels, counter, gauge
-from gateway.recordings.newest import STATE_IDS, NewestState, NewestVehicles
 from gateway.records import NAN
 from gateway.units import US_PER_S
+from gateway.vehicle_state.newest import STATE_IDS, NewestState, NewestVehicles
 from gateway.wire.mavlink_splitter import MavFrame
 
 MAX_SYSTEMS: Final = 32

@@ -20,9 +20,9 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.endpoint import Endpoint, EndpointKind
 from gateway.outputs.output import Output
-from gateway.recordings.newest import NewestState
-from gateway.recordings.positions import Position
 from gateway.units import US_PER_S
+from gateway.vehicle_state.newest import NewestState
+from gateway.vehicle_state.positions import Position
 
 HEADER: Final = '<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'
 UNKNOWN: Final = 9_999_999.0

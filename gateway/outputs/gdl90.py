@@ -22,9 +22,9 @@ from gateway.geometry.atmosphere import pressure_altitude_m
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.endpoint import Endpoint, EndpointKind
 from gateway.outputs.output import Output
-from gateway.recordings.newest import POSITION_OLD_US, STATE_IDS, NewestState
-from gateway.recordings.positions import Position
 from gateway.units import PA_PER_HPA, US_PER_S
+from gateway.vehicle_state.newest import POSITION_OLD_US, STATE_IDS, NewestState
+from gateway.vehicle_state.positions import Position
 from gateway.wire.mavlink_messages import ids_of
 
 FLAG: Final = b"\x7e"

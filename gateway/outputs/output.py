@@ -15,8 +15,8 @@ from gateway.hub.endpoint import NO_MESSAGES, Endpoint, number_from
 from gateway.hub.stats import ClientStats
 from gateway.hub.transports.base import Client
 from gateway.outputs.carrier import Carrier, client_context, target_of
-from gateway.recordings.antenna import HOME, AntennaStation, station_from
-from gateway.recordings.newest import STATE_IDS, NewestState, NewestVehicles
+from gateway.vehicle_state.antenna import HOME, AntennaStation, station_from
+from gateway.vehicle_state.newest import STATE_IDS, NewestState, NewestVehicles
 from gateway.wire.mavlink_splitter import MavFrame
 
 MIN_RATE_HZ, MAX_RATE_HZ = 0.01, 50.0

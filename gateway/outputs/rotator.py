@@ -16,7 +16,7 @@ from typing import Final
 from gateway.hub.endpoint import Endpoint, EndpointKind
 from gateway.outputs.output import Output, station_of
 from gateway.printable import unknown_choice
-from gateway.recordings.antenna import Pointing, pointing_of
+from gateway.vehicle_state.antenna import Pointing, pointing_of
 
 MAX_ELEVATION_DEG: Final = 90.0
 

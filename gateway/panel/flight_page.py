@@ -31,13 +31,13 @@ from gateway.estimation.select import ESTIMATORS
 from gateway.panel.state.history import FlightHistory
 from gateway.panel.state.vehicle import VehicleState
 from gateway.printable import printable, reason_of
-from gateway.recordings.convert import FlightToWrite
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import with_estimator
-from gateway.recordings.positions import Continuity, GroundDistance
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.vehicle_reader import VehicleMessage
+from gateway.recordings.workshop.convert import FlightToWrite
 from gateway.units import US_PER_S
+from gateway.vehicle_state.positions import Continuity, GroundDistance
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 WEB: Final = Path(__file__).parent / "web"

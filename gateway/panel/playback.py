@@ -23,11 +23,11 @@ from gateway.panel.uplink import ControlClient, Uplink
 from gateway.recordings.columns import TableRow
 from gateway.recordings.files import TLOG, format_of, open_tlog, read_chunks
 from gateway.recordings.index import RecordingError, find_recording, parts_together
-from gateway.recordings.positions import TrackPoint
-from gateway.recordings.senders import FIRST_GROUND_STATION, Senders
 from gateway.recordings.table import TableReader
 from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.units import US_PER_S
+from gateway.vehicle_state.positions import TrackPoint
+from gateway.vehicle_state.senders import FIRST_GROUND_STATION, Senders
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ from http import HTTPStatus
 from fastapi import APIRouter, HTTPException
 
 from gateway.panel.state.fleet import FleetState
-from gateway.recordings.antenna import HOME, pointing_of, station_from
+from gateway.vehicle_state.antenna import HOME, pointing_of, station_from
 
 
 def pointing_router(fleet: FleetState, now_us: Callable[[], int]) -> APIRouter:

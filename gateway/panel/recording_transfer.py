@@ -25,11 +25,11 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from gateway.panel.access import RECORDINGS, ROLE
 from gateway.panel.admission import Role
 from gateway.recordings.columns import TableRow
-from gateway.recordings.convert import Pieces
 from gateway.recordings.files import TABLE, TLOG, format_of
 from gateway.recordings.index import RecordingError, check_free, find_recording
 from gateway.recordings.table import TableReader
 from gateway.recordings.tlog import TlogScanner
+from gateway.recordings.workshop.convert import Pieces
 
 LOOKED_AT: Final = 1 << 20
 CHUNK: Final = 1 << 18

@@ -20,11 +20,12 @@ from gateway.recordings.message_table import (
     MessageTable,
     Values,
 )
-from gateway.recordings.tlog import Stamper, TlogRecord
+from gateway.recordings.tlog import Stamper
 from gateway.records import NAN
 from gateway.units import US_PER_S
 from gateway.vehicle.encoding import Encoder
 from gateway.vehicle.plan import MISSION, Item, write_item
+from gateway.wire.recorded_frames import RecordedFrame
 
 UINT32: Final = 0xFFFFFFFF
 BEAT_US: Final = US_PER_S
@@ -239,7 +240,7 @@ class RecordTranslator:
         self._numbers: dict[str, int] = {name: n for n, name in enumerate(log.parameters)}
         self._texts = 0
 
-    def frames(self) -> Iterator[TlogRecord]:
+    def frames(self) -> Iterator[RecordedFrame]:
         """Yield the frames at civil times, or at times since the start of the log."""
         stamper = Stamper(self._log.unix_us_at_zero or 0)
         entries = self._log.entries
@@ -248,11 +249,11 @@ class RecordTranslator:
             return
         begin_us = first.time_us if isinstance(first, LogRow) else first[0]
         for message in self._introduction():
-            yield TlogRecord(stamper.stamp(begin_us), self._encoder.encode(message).frame)
+            yield RecordedFrame(stamper.stamp(begin_us), self._encoder.encode(message).frame)
         for entry in chain([first], entries):
             time_us = entry.time_us if isinstance(entry, LogRow) else entry[0]
             for message in self._messages(entry, time_us):
-                yield TlogRecord(stamper.stamp(time_us), self._encoder.encode(message).frame)
+                yield RecordedFrame(stamper.stamp(time_us), self._encoder.encode(message).frame)
 
     def _messages(self, entry: Entry, time_us: int) -> Iterator[Any]:
         if not isinstance(entry, LogRow):

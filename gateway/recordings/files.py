@@ -26,21 +26,14 @@ from tempfile import TemporaryFile, gettempdir
 from typing import IO, Any, BinaryIO, Final, Literal, cast
 
 from gateway.printable import UserError
-from gateway.recordings.senders import Senders
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
-from gateway.recordings.tlog import (
-    DAY_US,
-    FIRST_CIVIL_US,
-    Batch,
-    Timeline,
-    TlogScanner,
-    encode_record,
-    fields_of,
-)
-from gateway.recordings.tlog_scan import TIME_SIZE
+from gateway.recordings.tlog import DAY_US, FIRST_CIVIL_US, Timeline, TlogScanner, encode_record
 from gateway.units import US_PER_S, counted
+from gateway.vehicle_state.senders import Senders
+from gateway.wire.frame_scan import TIME_SIZE
 from gateway.wire.mavlink_messages import DEFINITIONS
 from gateway.wire.mavlink_splitter import MavlinkSplitter, SplitFault, message_id_of, origin_of
+from gateway.wire.recorded_frames import Batch, fields_of
 
 CHUNK: Final = 1 << 20
 SNIFF: Final = 512

@@ -10,10 +10,10 @@ import numpy as np
 from gateway.recordings.columns import FloatArray
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import Samples, samples_of
-from gateway.recordings.joining import joined_tables
 from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_fusion import aircraft_for
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.workshop.joining import joined_tables
 from gateway.records import BaroSample
 from gateway.simulator.recorded import RecordedFlight
 from gateway.units import DEG_PER_DEGE7, US_PER_S

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from gateway.recordings.answers import LogAnswers
+from gateway.answers.log_answers import LogAnswers
 from gateway.recordings.autopilot_record import RecordTranslator
 from gateway.recordings.files import (
     MAX_UNPACKED,
@@ -32,9 +32,10 @@ from gateway.recordings.play import Source, Track
 from gateway.recordings.reading import beside_id, estimates_of, open_record
 from gateway.recordings.recorded_fusion import RecordedFusion, end_of
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.senders import FIRST_GROUND_STATION
-from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
+from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.recordings.tlog_index import TlogIndex
+from gateway.vehicle_state.senders import FIRST_GROUND_STATION
+from gateway.wire.recorded_frames import RecordedFrame
 
 log = logging.getLogger(__name__)
 
@@ -111,7 +112,7 @@ class FusedTlog:
 
     def __init__(
         self,
-        frames: Iterator[TlogRecord],
+        frames: Iterator[RecordedFrame],
         last_us: int | None = None,
         answers: LogAnswers | None = None,
     ) -> None:
@@ -248,7 +249,7 @@ def _open_made(
 ) -> None:
     """Begin to generate the frames of a flight that contains none."""
 
-    def add(frames: Iterator[TlogRecord], last_us: int | None = None) -> None:
+    def add(frames: Iterator[RecordedFrame], last_us: int | None = None) -> None:
         made = FusedTlog(frames, last_us, flight.answers)
         opened.callback(made.close)
         flight.sources.append(made)

@@ -25,14 +25,14 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from gateway.recordings.answers import answers_of, telemetry_of
-from gateway.recordings.tlog import SEEK_BYTES, STRIDE, Batch, TlogRecord, TlogScanner
+from gateway.answers.log_answers import answers_of, telemetry_of
+from gateway.recordings.tlog import SEEK_BYTES, STRIDE, TlogScanner
 from gateway.recordings.tlog_index import TlogIndex
-from gateway.recordings.tlog_scan import IntArray
 from gateway.units import US_PER_S
 from gateway.wire.frame_editing import edit_frame, renumbered
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
+from gateway.wire.recorded_frames import Batch, IntArray, RecordedFrame
 
 BLOCK_BYTES: Final = 1 << 18
 """Bytes per read during playback: minutes of flight, for 0.1 s of processing."""
@@ -162,7 +162,7 @@ class Track:
             return np.arange(begin, len(batch))
         return telemetry_of(batch, begin, self._source.index.senders)
 
-    def _records_of(self, batches: Iterator[Batch], begin: int = 0) -> Iterator[TlogRecord]:
+    def _records_of(self, batches: Iterator[Batch], begin: int = 0) -> Iterator[RecordedFrame]:
         """Yield the records to play; sequence numbers are closed up where answers are left out.
 
         `begin` is the first record of the first batch.
@@ -185,7 +185,7 @@ class Track:
                 if count := left_out[origin]:
                     read = frame_of(frame)
                     frame = renumbered(read, read.sequence - count & 0xFF).data
-                yield TlogRecord(int(batch.time_us[i]), frame)
+                yield RecordedFrame(int(batch.time_us[i]), frame)
 
     def _left_out(self, batch: Batch) -> IntArray:
         if self._with_commands:

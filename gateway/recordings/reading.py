@@ -41,11 +41,11 @@ from gateway.recordings.recorded_table import (
     header_of_today,
     table_of_blocks,
 )
-from gateway.recordings.senders import FIRST_GROUND_STATION
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
 from gateway.recordings.tlog import ORDER_US
 from gateway.toml_file import TomlError, read_toml
 from gateway.units import counted
+from gateway.vehicle_state.senders import FIRST_GROUND_STATION
 
 TRACKER_LOG: Final = files("gateway.recordings.formats") / "tracker-log.toml"
 """Column map for logs with the columns time_s, ax, gx and so on."""

@@ -52,7 +52,6 @@ from gateway.recordings.fuse import (
     with_estimator,
     with_reference,
 )
-from gateway.recordings.joining import joined_tables
 from gateway.recordings.reading import csv_reader, is_table, open_rows
 from gateway.recordings.recorded_table import (
     Line,
@@ -71,11 +70,13 @@ from gateway.recordings.table import (
     TableReader,
     encode_line,
 )
-from gateway.recordings.tlog import UNRECORDED, Stamper, TlogRecord
+from gateway.recordings.tlog import UNRECORDED, Stamper
+from gateway.recordings.workshop.joining import joined_tables
 from gateway.records import RECORDED_ONLY, FusionState, NodeStatus
 from gateway.sensing.chain import IntArray
 from gateway.units import US_PER_S, counted
 from gateway.vehicle.service import INFO, StatusText
+from gateway.wire.recorded_frames import RecordedFrame
 
 PIECE: Final = 200
 """Rows fused per step of a playback: some milliseconds, in which nothing is sent."""
@@ -350,7 +351,7 @@ class RecordedFusion:
         self._refused, self._time_us = fusion.refused, fusion.time_us
         return fusion
 
-    def frames(self) -> Iterator[TlogRecord]:
+    def frames(self) -> Iterator[RecordedFrame]:
         """Yield the MAVLink that the gateway would have sent, at civil times."""
         header, states = self._table.header, FusedStates()
         fusion = self._fusion(played=states)
@@ -364,7 +365,7 @@ class RecordedFusion:
                 for sent in out.frames:
                     is_kept = sent.client_id in (None, RECORDED_ONLY)
                     if is_kept and sent.message_id not in UNRECORDED:
-                        yield TlogRecord(stamper.stamp(now_us), sent.frame)
+                        yield RecordedFrame(stamper.stamp(now_us), sent.frame)
 
     def table(self) -> RecordedTable:
         """Return the rows with the new states, under a head with the settings of the fusion."""

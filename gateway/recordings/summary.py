@@ -37,15 +37,15 @@ from gateway.recordings.files import (
     open_tlog,
     read_blocks,
 )
-from gateway.recordings.positions import GroundDistance
-from gateway.recordings.senders import Senders
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableNote, TableReader
-from gateway.recordings.tlog import DAY_US, Batch
+from gateway.recordings.tlog import DAY_US
 from gateway.recordings.tlog_index import TlogIndex
-from gateway.recordings.tlog_scan import IntArray
 from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
+from gateway.vehicle_state.positions import GroundDistance
+from gateway.vehicle_state.senders import Senders
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
+from gateway.wire.recorded_frames import Batch, IntArray
 
 if TYPE_CHECKING:
     from gateway.recordings.recorded_table import ReadOptions
@@ -334,8 +334,8 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
 
 def _describe_by_rows(file: Path, kind: str, options: ReadOptions) -> FileInfo:
     # These import all stages, which the summary of our own recordings does not need.
-    from gateway.recordings.joining import shifted
     from gateway.recordings.reading import has_record, is_table, open_record, open_rows
+    from gateway.recordings.workshop.joining import shifted
 
     recorded, table = open_rows(file, options), TableSummary()
     own = is_table(file)

@@ -5,9 +5,8 @@ offset from the gateway clock to civil time is constant while a file is open, an
 requires a new file.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +16,15 @@ from gateway.recordings.tlog_scan import (
     KNOWN_IDS,
     LARGEST_RECORD,
     SMALLEST_RECORD,
-    TIME_SIZE,
     ExtraArray,
     IntArray,
     lacks_end,
     scan,
 )
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, ids_of, layout_of
-from gateway.wire.mavlink_splitter import PAYLOAD_V1, PAYLOAD_V2, START_V2, message_id_of
+from gateway.wire.frame_scan import TIME_SIZE
+from gateway.wire.mavlink_messages import CRC_EXTRA, ids_of
+from gateway.wire.recorded_frames import Batch, Damage
 from gateway.wire.timesync import GpsTime
 
 DAY_US: Final = 86_400 * US_PER_S
@@ -42,9 +41,6 @@ BACK_US: Final = 60 * US_PER_S
 FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
 """The year 2000; an earlier time counts from the start of a clock."""
 MAX_JUMPS: Final = 1000
-HEARTBEAT_ID: Final = MESSAGE_IDS["HEARTBEAT"]
-LENGTH_AT: Final = 1
-"""Offset of the payload length in a frame."""
 UNRECORDED: Final = ids_of("HIGH_LATENCY2")
 """Messages for narrow links. Recorded next to the messages that they summarise, a ground
 station would take them for another state of the vehicle."""
@@ -76,118 +72,9 @@ def _crc_extra_table() -> ExtraArray:
 _EXTRA: Final = _crc_extra_table()
 
 
-def payload_of(frame: bytes, size: int) -> bytes:
-    """Return the first bytes of a payload, with the zeros that MAVLink 2 truncates."""
-    begin = PAYLOAD_V2 if frame[0] == START_V2 else PAYLOAD_V1
-    return frame[begin : begin + min(frame[LENGTH_AT], size)].ljust(size, b"\0")
-
-
-def fields_of(frame: bytes) -> dict[str, Any]:
-    """Return the fields of a frame of the dialect, as Python's built-in types."""
-    layout = layout_of(message_id_of(frame))
-    values = np.frombuffer(payload_of(frame, layout.itemsize), layout)[0].item()
-    return dict(zip(layout.names or (), values, strict=True))
-
-
-def columns_of(batch: "Batch", wanted: IntArray, message_id: int) -> NDArray[np.void]:
-    """Read the fields of some frames of one message; truncated or unknown ones are zero."""
-    layout = layout_of(message_id)
-    data = np.frombuffer(batch.data, np.uint8)
-    starts = batch.starts[wanted] + TIME_SIZE
-    begins = starts + np.where(data[starts] == START_V2, PAYLOAD_V2, PAYLOAD_V1)
-    offsets = np.arange(layout.itemsize)
-    is_there = offsets < data[starts + LENGTH_AT][:, None]
-    payloads = np.zeros((len(wanted), layout.itemsize), np.uint8)
-    payloads[is_there] = data[(begins[:, None] + offsets)[is_there]]
-    found: NDArray[np.void] = payloads.view(layout)[:, 0]
-    return found
-
-
-@dataclass(frozen=True, slots=True)
-class Damage:
-    """A run of bytes in a file that belong to no record."""
-
-    offset: int
-    size: int
-
-
-@dataclass(frozen=True, slots=True)
-class TlogRecord:
-    """One frame and the civil time at which it passed, in µs since 1970."""
-
-    time_us: int
-    frame: bytes
-
-
 def encode_record(time_us: int, frame: bytes) -> bytes:
     """Build the bytes of one record."""
     return time_us.to_bytes(TIME_SIZE, "big") + frame
-
-
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """Consecutive records of a file, as columns."""
-
-    data: bytes
-    offset: int
-    """Offset of `data` in the file."""
-    starts: IntArray
-    """Offset of each record in `data`."""
-    sizes: IntArray
-    """Size of each frame in bytes."""
-    time_us: IntArray
-    origins: IntArray
-    """Sender of each frame: system id << 8 | component id."""
-    message_ids: IntArray
-    damage: tuple[Damage, ...]
-    mended: int = 0
-    """Number of damaged times, which were replaced by those of the previous record."""
-    unfinished: int = 0
-    """Bytes of an incomplete record at the end of the file: it is being written, or was cut off."""
-
-    def __len__(self) -> int:
-        return len(self.starts)
-
-    def frame(self, index: int) -> bytes:
-        """Return the bytes of one frame."""
-        begin = int(self.starts[index]) + TIME_SIZE
-        return self.data[begin : begin + int(self.sizes[index])]
-
-    def chosen(self, wanted: NDArray[np.bool_]) -> "Batch":
-        """Return the batch with the chosen records only, and all of its damage."""
-        if wanted.all():
-            return self
-        columns = (self.starts, self.sizes, self.time_us, self.origins, self.message_ids)
-        starts, sizes, time_us, origins, message_ids = (column[wanted] for column in columns)
-        return replace(
-            self, starts=starts, sizes=sizes, time_us=time_us, origins=origins,
-            message_ids=message_ids,
-        )  # fmt: skip
-
-    def encoded(self) -> bytes:
-        """Return the records as the bytes of a tlog, with the times of the batch."""
-        edited = bytearray(self.data)
-        times = np.maximum(self.time_us, 0).astype(">u8")
-        np.frombuffer(edited, np.uint8)[self.starts[:, None] + np.arange(TIME_SIZE)] = times.view(
-            np.uint8
-        ).reshape(-1, TIME_SIZE)
-        ends = self.starts + TIME_SIZE + self.sizes
-        is_first = np.ones(len(self), np.bool_)
-        is_first[1:] = self.starts[1:] != ends[:-1]
-        begins, view = self.starts[is_first].tolist(), memoryview(edited)
-        stops = ends[np.roll(is_first, -1)].tolist()
-        return b"".join([view[begin:end] for begin, end in zip(begins, stops, strict=True)])
-
-    def records(self, wanted: IntArray | None = None) -> Iterator[TlogRecord]:
-        """Yield the records, or those with the given indices."""
-        data = self.data
-        times, starts, sizes = self.time_us, self.starts, self.sizes
-        if wanted is not None:
-            times, starts, sizes = times[wanted], starts[wanted], sizes[wanted]
-        for time_us, start, size in zip(
-            times.tolist(), starts.tolist(), sizes.tolist(), strict=True
-        ):
-            yield TlogRecord(time_us, data[start + TIME_SIZE : start + TIME_SIZE + size])
 
 
 class TlogScanner:

@@ -6,9 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from gateway.recordings.senders import Senders
-from gateway.recordings.tlog import STRIDE, Batch, Damage, Timeline
-from gateway.recordings.tlog_scan import TIME_SIZE
+from gateway.recordings.tlog import STRIDE, Timeline
+from gateway.vehicle_state.senders import Senders
+from gateway.wire.frame_scan import TIME_SIZE
+from gateway.wire.recorded_frames import Batch, Damage
 
 MAX_DAMAGE_RUNS: Final = 1000
 """Runs that are listed, so that a file damaged throughout cannot fill the memory."""

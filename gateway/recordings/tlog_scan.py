@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 
 from gateway.compiled import address_of, array_at, compiled
 from gateway.compiled.entry_point import EntryPoint
-from gateway.wire.frame_scan import crc_holds
+from gateway.wire.frame_scan import TIME_SIZE, crc_holds
 
 ByteArray = NDArray[np.uint8]
 IntArray = NDArray[np.int64]
 ExtraArray = NDArray[np.int16]
 
-TIME_SIZE: Final = 8
 HEADER_SIZE: Final = 9
 """Size of a record's time and the first byte of its frame, by which the next record is checked."""
 SMALLEST_RECORD: Final = 16

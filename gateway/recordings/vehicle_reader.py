@@ -13,13 +13,14 @@ from typing import Any, Final
 import numpy as np
 
 from gateway.geometry.quaternion import from_euler, normalise
-from gateway.recordings.positions import ORIGIN_ID, Position, named_position, position_of
-from gateway.recordings.senders import RecordedSender, Senders, is_station
-from gateway.recordings.status_texts import STATUSTEXT_ID, JoinedText, TextJoiner
-from gateway.recordings.tlog import FIRST_CIVIL_US, Batch, TlogRecord, fields_of
+from gateway.recordings.tlog import FIRST_CIVIL_US
 from gateway.records import Quat
+from gateway.vehicle_state.positions import ORIGIN_ID, Position, named_position, position_of
+from gateway.vehicle_state.senders import RecordedSender, Senders, is_station
+from gateway.vehicle_state.status_texts import STATUSTEXT_ID, JoinedText, TextJoiner
 from gateway.wire.mavlink_messages import DEFINITIONS
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from gateway.wire.recorded_frames import Batch, RecordedFrame, fields_of
 
 BOOT_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "timestamp": 1000}
 """Fields with the time since boot, and their unit in µs; a civil time in one is ignored."""
@@ -97,7 +98,7 @@ class VehicleReader:
         for record in batch.records(np.flatnonzero(np.isin(batch.message_ids, [*ids]))):
             yield from self.feed(record)
 
-    def feed(self, record: TlogRecord) -> Iterator[VehicleMessage]:
+    def feed(self, record: RecordedFrame) -> Iterator[VehicleMessage]:
         """Process the next record."""
         frame, time_us = record.frame, record.time_us
         system_id, component_id = origin_of(frame)
@@ -123,7 +124,7 @@ class VehicleReader:
         return map(_of_text, self._joiner.flush())
 
     def _message(
-        self, vehicle: RecordedSender, message_id: int, record: TlogRecord
+        self, vehicle: RecordedSender, message_id: int, record: RecordedFrame
     ) -> VehicleMessage:
         fields, system_id = fields_of(record.frame), vehicle.origin >> 8
         position = q_nb = None

@@ -5,14 +5,14 @@ from pathlib import Path
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.answers import LogAnswers
-from gateway.recordings.convert import FlightToWrite
-from gateway.recordings.extracts import RecordedPlan
+from gateway.answers.log_answers import LogAnswers
 from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.senders import Senders
-from gateway.recordings.tlog import Batch
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
+from gateway.recordings.workshop.convert import FlightToWrite
+from gateway.recordings.workshop.extracts import RecordedPlan
+from gateway.vehicle_state.senders import Senders
+from gateway.wire.recorded_frames import Batch
 
 
 class VehicleRecording:

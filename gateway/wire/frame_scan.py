@@ -10,6 +10,8 @@ _SIGNATURE: Final = 13
 _SIGNED: Final = 1
 SEQUENCE: Final = 4
 """Offset in a frame of MAVLink 2."""
+TIME_SIZE: Final = 8
+"""Bytes of the time before a recorded frame."""
 
 
 @compiled

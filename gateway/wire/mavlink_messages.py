@@ -104,6 +104,7 @@ MESSAGE_NAMES: Final[dict[int, str]] = {
 }
 
 MESSAGE_IDS: Final[dict[str, int]] = {name: number for number, name in MESSAGE_NAMES.items()}
+HEARTBEAT_ID: Final = MESSAGE_IDS["HEARTBEAT"]
 
 
 def ids_of(*names: str) -> frozenset[int]:

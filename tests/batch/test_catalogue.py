@@ -34,10 +34,10 @@ from gateway.batch.catalogue import (
 from gateway.batch.executors import LocalProcesses, ThisProcess
 from gateway.batch.facts import FlightFacts, FlightTally, simplified
 from gateway.pipeline import PipelineSettings
-from gateway.recordings.positions import TrackPoint
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.tlog import TlogRecord
 from gateway.units import US_PER_S
+from gateway.vehicle_state.positions import TrackPoint
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.batch.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
 from tests.kit.cli import invoke
 from tests.kit.mavlink import packed
@@ -59,13 +59,13 @@ class InThisProcess(ThisProcess):
         yield from super().run(work, items)
 
 
-def far_flight() -> list[TlogRecord]:
+def far_flight() -> list[RecordedFrame]:
     """Ten minutes of two vehicles: one flies two sides of a square, the other sends no position."""
     records = []
 
     def send(time_s: float, system: int, message: mavlink.MAVLink_message) -> None:
         frame = packed(message, system)
-        records.append(TlogRecord(1_780_000_000_000_000 + round(time_s * 1e6), frame))
+        records.append(RecordedFrame(1_780_000_000_000_000 + round(time_s * 1e6), frame))
 
     for second in range(600):
         for system in (1, 2):
@@ -149,7 +149,7 @@ def test_tlog_has_one_row_for_each_vehicle(folder: Path) -> None:
 
 def test_clock_jump_of_years_is_not_counted_as_duration(tmp_path: Path) -> None:
     records, leap_us = far_flight(), 30 * 31_556_952_000_000
-    records[:1000] = [TlogRecord(r.time_us - leap_us, r.frame) for r in records[:1000]]
+    records[:1000] = [RecordedFrame(r.time_us - leap_us, r.frame) for r in records[:1000]]
     write_tlog(tmp_path / "a.tlog", records)
     found = read_file(tmp_path, OPTIONS, ("a.tlog", ""))
     (facts, _), (other, _) = found.flights

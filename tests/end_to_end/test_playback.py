@@ -9,8 +9,8 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.live.control_socket import request
-from gateway.recordings.tlog import TlogRecord
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.end_to_end.processes import Client, Gateway, MavProxy, mavsdk_system
 from tests.end_to_end.test_demo import NEAR_DEG
 from tests.kit.mavlink import Sender
@@ -24,7 +24,7 @@ LAT_DEG, LON_DEG = 47.1, 8.5
 SECONDS = 60
 
 
-def make_flight() -> list[TlogRecord]:
+def make_flight() -> list[RecordedFrame]:
     """Make what a foreign vehicle (system 3) sends while it flies north."""
     sender, records = Sender(3), []
     for i in range(SECONDS * 10):
@@ -43,7 +43,7 @@ def make_flight() -> list[TlogRecord]:
                 ),
             ]
         time_us = START_US + 100_000 * i
-        records += [TlogRecord(time_us, sender.pack(message)) for message in messages]
+        records += [RecordedFrame(time_us, sender.pack(message)) for message in messages]
     return records
 
 

@@ -10,7 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.aircraft import Aircraft
-from gateway.recordings.answers import ANSWERS, VehicleAnswers
+from gateway.answers.log_answers import ANSWERS, VehicleAnswers
 from gateway.recordings.opening import lay_out, open_flights
 from gateway.recordings.play import AS_FAST_AS_POSSIBLE, Player
 from gateway.recordings.recorded_table import ReadOptions

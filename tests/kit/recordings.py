@@ -8,11 +8,12 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.play import Track
 from gateway.recordings.recorded_table import Line
-from gateway.recordings.senders import Senders
 from gateway.recordings.table import TableHeader, encode_head, encode_line
-from gateway.recordings.tlog import Batch, TlogRecord, TlogScanner, encode_record
+from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.recordings.tlog_index import TlogIndex
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
+from gateway.vehicle_state.senders import Senders
+from gateway.wire.recorded_frames import Batch, RecordedFrame
 from tests.kit.mavlink import Sender, packed
 
 START_US = 1_760_000_000_000_000
@@ -37,30 +38,30 @@ def make_frames(count: int, system_id: int = 1) -> list[bytes]:
     return frames
 
 
-def make_records(count: int, system_id: int = 1) -> list[TlogRecord]:
+def make_records(count: int, system_id: int = 1) -> list[RecordedFrame]:
     return records_of(make_frames(count, system_id))
 
 
-def records_of(frames: Iterable[bytes], step_us: int = STEP_US) -> list[TlogRecord]:
+def records_of(frames: Iterable[bytes], step_us: int = STEP_US) -> list[RecordedFrame]:
     """Record frames at equal intervals."""
-    return [TlogRecord(START_US + k * step_us, frame) for k, frame in enumerate(frames)]
+    return [RecordedFrame(START_US + k * step_us, frame) for k, frame in enumerate(frames)]
 
 
-def records_sent(sent: Sent, step_us: int = STEP_US) -> list[TlogRecord]:
+def records_sent(sent: Sent, step_us: int = STEP_US) -> list[RecordedFrame]:
     """Record messages at equal intervals, each with sequence number 0."""
     return records_of((packed(message, *origin) for origin, message in sent), step_us)
 
 
-def with_jump(records: list[TlogRecord], at: int, by_us: int) -> list[TlogRecord]:
+def with_jump(records: list[RecordedFrame], at: int, by_us: int) -> list[RecordedFrame]:
     """Shift the times from a record on, as if the clock had been set before it."""
-    return records[:at] + [TlogRecord(r.time_us + by_us, r.frame) for r in records[at:]]
+    return records[:at] + [RecordedFrame(r.time_us + by_us, r.frame) for r in records[at:]]
 
 
-def make_tlog(records: Iterable[TlogRecord]) -> bytes:
+def make_tlog(records: Iterable[RecordedFrame]) -> bytes:
     return b"".join(encode_record(record.time_us, record.frame) for record in records)
 
 
-def write_tlog(path: Path, records: Iterable[TlogRecord]) -> Path:
+def write_tlog(path: Path, records: Iterable[RecordedFrame]) -> Path:
     path.write_bytes(make_tlog(records))
     return path
 
@@ -70,7 +71,7 @@ def write_table(path: Path, header: TableHeader, lines: Iterable[Line]) -> Path:
     return path
 
 
-def batch_of(records: Iterable[TlogRecord]) -> Batch:
+def batch_of(records: Iterable[RecordedFrame]) -> Batch:
     return TlogScanner().feed(make_tlog(records), final=True)
 
 
@@ -81,7 +82,7 @@ def index_of(batches: Iterable[Batch]) -> TlogIndex:
     return index
 
 
-def read_tlog(path: Path) -> list[TlogRecord]:
+def read_tlog(path: Path) -> list[RecordedFrame]:
     """Read a tlog without damage."""
     batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
     assert batch.damage == ()
@@ -96,7 +97,7 @@ def senders_of(data: bytes) -> Senders:
 
 
 def messages_of(
-    records: list[TlogRecord], wanted: Iterable[int] = (), system_id: int | None = None
+    records: list[RecordedFrame], wanted: Iterable[int] = (), system_id: int | None = None
 ) -> list[VehicleMessage]:
     """Read the vehicles of a recording."""
     reader = VehicleReader(senders_of(make_tlog(records)), wanted, system_id)
@@ -122,8 +123,8 @@ def make_track(data: bytes, **options: object) -> Track:
     return Track(MemoryTlog(data), **options)
 
 
-def play_all(track: Track) -> list[TlogRecord]:
+def play_all(track: Track) -> list[RecordedFrame]:
     found = []
     while (time_us := track.peek_us()) is not None:
-        found.append(TlogRecord(time_us, track.take()))
+        found.append(RecordedFrame(time_us, track.take()))
     return found

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.live import control_socket
 from gateway.live.control_socket import ControlServer, Verbs, socket_path
 from gateway.live.other_gateways import conflicts, identity_verb, log_other_gateways, other_gateways
-from gateway.recordings.tlog import TlogRecord
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.cli import invoke
 from tests.kit.mavlink import Sender
 from tests.kit.recordings import START_US, make_tlog
@@ -101,7 +101,7 @@ async def test_vehicle_that_another_gateway_sends_is_refused(
     await listen("run", 1)
     heartbeat = Sender(1).pack(mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))
     file = tmp_path / "a.tlog"
-    file.write_bytes(make_tlog([TlogRecord(START_US, heartbeat)]))
+    file.write_bytes(make_tlog([RecordedFrame(START_US, heartbeat)]))
     words = [command, *([file] if command == "play" else []), "--endpoint", STATION]
     done = await asyncio.to_thread(invoke, *words, code=2)
     assert f"vehicle 1 is sent to {STATION} by another gateway" in done.output

@@ -12,7 +12,7 @@ from gateway.clock import GatewayClock
 from gateway.live.player_edge import BATCH, PlayerEdge
 from gateway.recordings.opening import TlogFile
 from gateway.recordings.play import Player, Track
-from gateway.recordings.tlog import TlogRecord
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.conftest import ManualClock
 from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog
 
@@ -78,7 +78,7 @@ def test_file_that_shrinks_during_playback_ends_early(tlog: Path) -> None:
     track.seek(START_US)
     found = []
     while (time_us := track.peek_us()) is not None:
-        found.append(TlogRecord(time_us, track.take()))
+        found.append(RecordedFrame(time_us, track.take()))
     assert found == RECORDS[:10]
     file.close()
     assert file.read(0, 10) == b""

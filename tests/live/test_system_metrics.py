@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.live.metrics import prometheus_text, text_of
 from gateway.live.system_metrics import MAX_SYSTEMS, SystemMetrics
-from gateway.recordings.newest import HEARD_US
 from gateway.units import US_PER_S
+from gateway.vehicle_state.newest import HEARD_US
 from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.mavlink import packed
 from tests.kit.messages import at, beat, gps

@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from pynmeagps import NMEAReader
 
 from gateway.hub.endpoint import parse_endpoint
-from gateway.recordings.newest import POSITION_OLD_US
 from gateway.units import US_PER_S
+from gateway.vehicle_state.newest import POSITION_OLD_US
 from tests.kit.hub import receive
 from tests.kit.messages import HERE, at, beat, estimator, gps
 from tests.kit.process import START_LIMIT_S

@@ -13,9 +13,9 @@ import pytest
 from pynmeagps import calc_checksum
 
 from gateway.outputs.rotator import command
-from gateway.recordings.antenna import AntennaStation, Pointing, pointing_of
-from gateway.recordings.newest import NewestState
-from gateway.recordings.positions import Position
+from gateway.vehicle_state.antenna import AntennaStation, Pointing, pointing_of
+from gateway.vehicle_state.newest import NewestState
+from gateway.vehicle_state.positions import Position
 from tests.kit.messages import HERE, at, beat, gps, home
 from tests.kit.process import START_LIMIT_S
 from tests.outputs.conftest import OutputRig

@@ -6,8 +6,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.tlog import TlogRecord
 from gateway.units import US_PER_S
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.mavlink import Sender
 from tests.kit.recordings import make_tlog, records_of
 
@@ -44,7 +44,7 @@ def fix(lat_deg: float, lon_deg: float, kind: int = 3, satellites: int = 12) -> 
     )  # fmt: skip
 
 
-def flight_records(seconds: int, hz: int = 10) -> Iterator[TlogRecord]:
+def flight_records(seconds: int, hz: int = 10) -> Iterator[RecordedFrame]:
     """Make the messages of a flight in circles, with a little noise."""
     sender = Sender(3)
     for step in range(seconds * hz):
@@ -69,7 +69,7 @@ def flight_records(seconds: int, hz: int = 10) -> Iterator[TlogRecord]:
             text = HOSTILE_TEXT.encode()[:50]
             messages.append(mavlink.MAVLink_statustext_message(2, text))
         for message in messages:
-            yield TlogRecord(time_us, sender.pack(message))
+            yield RecordedFrame(time_us, sender.pack(message))
 
 
 def short_tlog() -> bytes:

@@ -23,7 +23,7 @@ from gateway.panel.flight_page import (
     render_page,
 )
 from gateway.recordings.files import FlightError
-from gateway.recordings.tlog import TlogRecord
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.cli import invoke
 from tests.kit.mavlink import packed
 from tests.kit.recordings import write_tlog
@@ -35,14 +35,14 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "take_off.csv.gz"
 OPTIONS = read_options(GatewaySettings())
 
 
-def flight_of(folder: Path, records: Iterable[TlogRecord]) -> PageFlight:
+def flight_of(folder: Path, records: Iterable[RecordedFrame]) -> PageFlight:
     return read_flight([write_tlog(folder / "day_01.tlog", records)], OPTIONS, HOSTILE_TEXT)
 
 
 def flight_with(folder: Path, messages: list[tuple[float, Any]]) -> PageFlight:
     """Return the flight of messages with their times in s."""
     sent = ((BEGIN_US + round(s * 1e6), packed(message, 3)) for s, message in messages)
-    return flight_of(folder, (TlogRecord(*record) for record in sent))
+    return flight_of(folder, (RecordedFrame(*record) for record in sent))
 
 
 def unpacked(page: str, name: str) -> Any:

@@ -10,9 +10,9 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import to_euler
-from gateway.recordings.antenna import AntennaStation, pointing_of
-from gateway.recordings.newest import NewestState
-from gateway.recordings.positions import Position
+from gateway.vehicle_state.antenna import AntennaStation, pointing_of
+from gateway.vehicle_state.newest import NewestState
+from gateway.vehicle_state.positions import Position
 from tests.panel.browsing import (
     CONFIG_WITHOUT_MAP,
     WAIT_MS,

@@ -11,16 +11,16 @@ from typing import Any
 
 import pytest
 
+from gateway.answers.log_answers import VehicleAnswers
 from gateway.geometry.quaternion import from_euler
-from gateway.recordings.answers import VehicleAnswers
 from gateway.recordings.autopilot_record import RecordTranslator
 from gateway.recordings.files import FlightError
 from gateway.recordings.message_table import UNITS
 from gateway.recordings.opening import open_flights
 from gateway.recordings.reading import open_record
-from gateway.recordings.tlog import TlogRecord, fields_of
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from gateway.wire.recorded_frames import RecordedFrame, fields_of
 from tests.kit.cli import run
 from tests.kit.recordings import messages_of as vehicle_messages
 from tests.kit.recordings import read_tlog
@@ -91,17 +91,17 @@ def write(path: Path, extra: Sequence[flown.Row] = (), formats: dict[str, Any] =
     return flown.write(path, flown.dataflash_of(formats, [*extra, *rows()]))
 
 
-def translated(path: Path) -> list[TlogRecord]:
+def translated(path: Path) -> list[RecordedFrame]:
     return list(RecordTranslator(open_record(path, OPTIONS)).frames())
 
 
-def messages_of(records: Sequence[TlogRecord], name: str) -> list[dict[str, Any]]:
+def messages_of(records: Sequence[RecordedFrame], name: str) -> list[dict[str, Any]]:
     wanted = MESSAGE_IDS[name]
     return [fields_of(one.frame) for one in records if message_id_of(one.frame) == wanted]
 
 
 @pytest.fixture(scope="module")
-def records(tmp_path_factory: pytest.TempPathFactory) -> list[TlogRecord]:
+def records(tmp_path_factory: pytest.TempPathFactory) -> list[RecordedFrame]:
     return translated(write(tmp_path_factory.mktemp("log") / "flight.bin"))
 
 
@@ -133,27 +133,29 @@ EXPECTED: dict[str, dict[str, float]] = {
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_row_becomes_message_in_its_units(records: list[TlogRecord], name: str) -> None:
+def test_row_becomes_message_in_its_units(records: list[RecordedFrame], name: str) -> None:
     found = messages_of(records, name)
     last = found[-1] if name in ("VFR_HUD", "SYS_STATUS", "LOCAL_POSITION_NED") else found[0]
     for field, value in EXPECTED[name].items():
         assert last[field] == pytest.approx(value, abs=2e-4), field
 
 
-def test_every_row_is_sent_once_with_its_own_time(records: list[TlogRecord]) -> None:
+def test_every_row_is_sent_once_with_its_own_time(records: list[RecordedFrame]) -> None:
     times = [one["time_boot_ms"] for one in messages_of(records, "ATTITUDE")]
     assert times == [60_001 + 100 * number for number in range(40)]
     stamps = [one.time_us for one in records]
     assert stamps == sorted(set(stamps))
 
 
-def test_capacity_of_the_first_battery_is_not_that_of_the_second(records: list[TlogRecord]) -> None:
+def test_capacity_of_the_first_battery_is_not_that_of_the_second(
+    records: list[RecordedFrame],
+) -> None:
     batteries = messages_of(records, "BATTERY_STATUS")
     assert [one["id"] for one in batteries] == [0, 1] * 40
     assert {one["battery_remaining"] for one in batteries if one["id"] == 1} == {-1}
 
 
-def test_heartbeat_shows_type_armed_state_and_mode(records: list[TlogRecord]) -> None:
+def test_heartbeat_shows_type_armed_state_and_mode(records: list[RecordedFrame]) -> None:
     beats = messages_of(records, "HEARTBEAT")
     assert {(one["type"], one["autopilot"]) for one in beats} == {(13, 3)}
     assert (beats[0]["base_mode"] & 128, beats[0]["custom_mode"]) == (0, 0)
@@ -163,14 +165,14 @@ def test_heartbeat_shows_type_armed_state_and_mode(records: list[TlogRecord]) ->
     assert {one["custom_mode"]: one["mode_name"] for one in modes}[5] == b"LOITER"
 
 
-def test_texts_come_whole(records: list[TlogRecord]) -> None:
+def test_texts_come_whole(records: list[RecordedFrame]) -> None:
     assert [found.text.text for found in vehicle_messages(records) if found.text] == [
         "ArduCopter V4.5.7 (2a3dc4b7)",
         "a text that is longer than the fifty bytes of a STATUSTEXT",
     ]
 
 
-def test_item_that_is_known_is_the_current_one(records: list[TlogRecord]) -> None:
+def test_item_that_is_known_is_the_current_one(records: list[RecordedFrame]) -> None:
     assert [one["seq"] for one in messages_of(records, "MISSION_CURRENT")] == [1]
     assert len(messages_of(records, "MISSION_COUNT")) == 1
 
@@ -343,7 +345,7 @@ PX4_EXPECTED: dict[str, dict[str, float]] = {
 
 
 @pytest.fixture(scope="module")
-def px4_records(tmp_path_factory: pytest.TempPathFactory) -> list[TlogRecord]:
+def px4_records(tmp_path_factory: pytest.TempPathFactory) -> list[RecordedFrame]:
     path = flown.write(tmp_path_factory.mktemp("log") / "flight.ulg", px4_log())
     log = open_record(path, OPTIONS)
     assert log.without_counterpart == {"odd_topic": 40}
@@ -351,13 +353,15 @@ def px4_records(tmp_path_factory: pytest.TempPathFactory) -> list[TlogRecord]:
 
 
 @pytest.mark.parametrize("name", PX4_EXPECTED)
-def test_row_of_ulog_becomes_message_in_its_units(px4_records: list[TlogRecord], name: str) -> None:
+def test_row_of_ulog_becomes_message_in_its_units(
+    px4_records: list[RecordedFrame], name: str
+) -> None:
     last = messages_of(px4_records, name)[-1]
     for field, value in PX4_EXPECTED[name].items():
         assert last[field] == pytest.approx(value, abs=2e-4), field
 
 
-def test_state_of_px4_is_shown_with_its_mode(px4_records: list[TlogRecord]) -> None:
+def test_state_of_px4_is_shown_with_its_mode(px4_records: list[RecordedFrame]) -> None:
     beats = messages_of(px4_records, "HEARTBEAT")
     assert {(one["type"], one["autopilot"]) for one in beats} == {(13, 12)}
     assert beats[0]["base_mode"] & 128 == 0

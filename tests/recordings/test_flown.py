@@ -10,7 +10,7 @@ from gateway.recordings.columns import COLUMNS, row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
 from gateway.recordings.table import encode_head
-from gateway.recordings.tlog import TlogRecord
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.mavlink import packed
 from tests.kit.recordings import START_US, make_records, write_table, write_tlog
 from tests.recordings.flights import OPTIONS, flown_table, read
@@ -56,12 +56,12 @@ def test_tlog_of_an_autopilot_is_opened(tmp_path: Path) -> None:
         imu = mavlink.MAVLink_highres_imu_message(
             at_us, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03, 0.2, 0.0, 0.4, 950.0, 0.0, 540.0, 20.0, 0x1FFF
         )
-        records.append(TlogRecord(START_US + at_us, packed(imu)))
+        records.append(RecordedFrame(START_US + at_us, packed(imu)))
         if k % 10 == 0:
             gps = mavlink.MAVLink_gps_raw_int_message(
                 at_us, 3, 470_000_000 + k, 85_000_000, 540_000, 100, 100, 500, 0, 9
             )
-            records.append(TlogRecord(START_US + at_us, packed(gps)))
+            records.append(RecordedFrame(START_US + at_us, packed(gps)))
     flight = open_flown([write_tlog(tmp_path / "other.tlog", records)], OPTIONS)
     assert len(flight.time_s) == 300
     assert flight.rate_hz == pytest.approx(50.0)

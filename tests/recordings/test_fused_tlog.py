@@ -12,7 +12,7 @@ from gateway.recordings import files as recording_streams
 from gateway.recordings.files import temporary_copy
 from gateway.recordings.opening import PIECE, FusedTlog
 from gateway.recordings.play import Player, Track
-from gateway.recordings.tlog import TlogRecord
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.conftest import ManualClock
 from tests.kit.recordings import START_US, STEP_US, make_records, play_all
 
@@ -28,7 +28,7 @@ class Making:
     def __init__(self) -> None:
         self.made = 0
 
-    def __iter__(self) -> Iterator[TlogRecord]:
+    def __iter__(self) -> Iterator[RecordedFrame]:
         for record in RECORDS:
             self.made += 1
             yield record

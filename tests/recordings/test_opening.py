@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.answers.log_answers import VehicleAnswers
 from gateway.config import GatewaySettings
-from gateway.recordings.answers import VehicleAnswers
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
 from gateway.recordings.recorded_table import header_for
-from gateway.recordings.tlog import TlogRecord
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.mavlink import STATION, Sender, read_back
 from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, write_table, write_tlog
 from tests.recordings.flights import OPTIONS, flown_table, fly, make_flight, read
@@ -104,7 +104,7 @@ def test_settings_changed_in_flight_are_answered_from_their_time(
 
 
 def test_ground_station_is_no_vehicle(tmp_path: Path) -> None:
-    records = [*RECORDS[:9], TlogRecord(RECORDS[9].time_us, Sender(42, STATION).heartbeat())]
+    records = [*RECORDS[:9], RecordedFrame(RECORDS[9].time_us, Sender(42, STATION).heartbeat())]
     (flight,) = laid_out([write_tlog(tmp_path / "a.tlog", records)])
     assert flight.system_ids == {1: 1}
 

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from gateway.recordings.play import Player, PlayState
-from gateway.recordings.tlog import TlogRecord
 from gateway.wire.mavlink_splitter import origin_of
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, make_track, with_jump
 
 MANY = 10_000
@@ -15,7 +15,9 @@ FRAMES = [record.frame for record in RECORDS]
 SPAN_US = 99 * STEP_US
 
 
-def make_player(records: list[TlogRecord] = RECORDS, now_us: int = 0, **options: object) -> Player:
+def make_player(
+    records: list[RecordedFrame] = RECORDS, now_us: int = 0, **options: object
+) -> Player:
     return Player([make_track(make_tlog(records))], now_us, **options)
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.recordings.tlog import TlogRecord
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.mavlink import Sender, packed, read_back
 from tests.kit.recordings import Sent, make_tlog, make_track, play_all, records_of, records_sent
 
@@ -48,7 +48,7 @@ def frames_of(sent: Sent) -> list[bytes]:
     return [packed(message, *origin) for origin, message in sent]
 
 
-def played(records: list[TlogRecord], **options: bool) -> list[bytes]:
+def played(records: list[RecordedFrame], **options: bool) -> list[bytes]:
     return [record.frame for record in play_all(make_track(make_tlog(records), **options))]
 
 

@@ -7,7 +7,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.recordings.columns import RowBuilder, row_to_line
 from gateway.recordings.summary import FileInfo, Rate, TableSummary, TlogSummary
 from gateway.recordings.table import TableHeader, TableNote, TableReader, encode_head, encode_line
-from gateway.recordings.tlog import TlogRecord, TlogScanner
+from gateway.recordings.tlog import TlogScanner
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.mavlink import packed
 from tests.kit.recordings import SECOND_US, START_US, make_tlog, senders_of, with_jump
 from tests.recordings.samples import make_baro, make_fused
@@ -15,7 +16,7 @@ from tests.recordings.samples import make_baro, make_fused
 M_PER_DEG_LAT = 111_132.0
 
 
-def make_flight(seconds: int, system_id: int, gap_at: int | None = None) -> list[TlogRecord]:
+def make_flight(seconds: int, system_id: int, gap_at: int | None = None) -> list[RecordedFrame]:
     """Fly north at 10 m/s, with a position once a second."""
     records = []
     for i in range(seconds):
@@ -26,7 +27,7 @@ def make_flight(seconds: int, system_id: int, gap_at: int | None = None) -> list
             mavlink.MAVLink_global_position_int_message(i, lat, 80_000_000, 0, 0, 0, 0, 0, 0),
         ):
             at_us = START_US + i * SECOND_US + late_us
-            records.append(TlogRecord(at_us, packed(message, system_id)))
+            records.append(RecordedFrame(at_us, packed(message, system_id)))
     return records
 
 
@@ -82,7 +83,7 @@ def test_truncated_record_before_others_is_damage() -> None:
     """Also where the file ends before its length would be over."""
     flight = make_flight(20, 1)
     frame = packed(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251))
-    cut = make_tlog([TlogRecord(flight[-1].time_us, frame)])[:100]
+    cut = make_tlog([RecordedFrame(flight[-1].time_us, frame)])[:100]
     info = sum_up(make_tlog(flight[:-1]) + cut + make_tlog(flight[-1:]))
     assert (info.records, info.damaged_bytes, info.unfinished_bytes) == (40, len(cut), 0)
 

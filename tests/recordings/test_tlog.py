@@ -13,18 +13,15 @@ from gateway.recordings.tlog import (
     JUMP_US,
     ORDER_US,
     STRIDE,
-    Batch,
     CivilClock,
-    Damage,
     Stamper,
-    TlogRecord,
     TlogScanner,
     is_damaged,
 )
 from gateway.recordings.tlog import STEP_US as STAMP_STEP_US
-from gateway.recordings.tlog_scan import IntArray
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_splitter import message_id_of
+from gateway.wire.recorded_frames import Batch, Damage, IntArray, RecordedFrame
 from gateway.wire.timesync import ENOUGH
 from tests.kit.mavlink import KEY, packed
 from tests.kit.recordings import (
@@ -46,7 +43,7 @@ def scan(data: bytes, *, strict: bool = False, chunk: int | None = None) -> list
     return [*batches, scanner.feed(b"", final=True)]
 
 
-def read_of(batches: list[Batch]) -> list[TlogRecord]:
+def read_of(batches: list[Batch]) -> list[RecordedFrame]:
     return [record for batch in batches for record in batch.records()]
 
 
@@ -85,7 +82,7 @@ def test_damaged_mavlink_1_frame_is_left_out() -> None:
     assert [run for batch in batches for run in batch.damage] == [Damage(size, size)]
 
 
-def ends_of(records: list[TlogRecord]) -> IntArray:
+def ends_of(records: list[RecordedFrame]) -> IntArray:
     """Return the end of each record in its file."""
     return np.cumsum([8 + len(record.frame) for record in records])
 
@@ -170,7 +167,7 @@ def test_flipped_time_gives_no_gap(chunk: int | None, hit: tuple[int, ...], flip
     records = make_records(40)
     spoilt = list(records)
     for i in hit:
-        spoilt[i] = TlogRecord(records[i].time_us ^ flip, records[i].frame)
+        spoilt[i] = RecordedFrame(records[i].time_us ^ flip, records[i].frame)
     batches = scan(make_tlog(spoilt), chunk=chunk)
     found, index = read_of(batches), index_of(batches)
     assert [record.frame for record in found] == [record.frame for record in records]

@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.positions import Continuity, GroundDistance
-from gateway.recordings.status_texts import MAX_OPEN, TIMEOUT_US, TextJoiner
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.units import US_PER_S
+from gateway.vehicle_state.positions import Continuity, GroundDistance
+from gateway.vehicle_state.status_texts import MAX_OPEN, TIMEOUT_US, TextJoiner
 from tests.kit.mavlink import packed
 from tests.kit.recordings import START_US, Sent, messages_of, records_sent
 

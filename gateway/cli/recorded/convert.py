@@ -31,11 +31,16 @@ from gateway.cli.support.recording_options import (
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.estimation.select import ESTIMATORS
 from gateway.output import write_new
-from gateway.recordings.anonymising import MAX_PLACE_DEG, Anonymiser, Anonymity
-from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.files import FlightError
-from gateway.recordings.selection import MAX_MARGIN_S, FrameChoice, StateChoice, message_ids_of
-from gateway.recordings.tlog_editing import Renumbering, TlogEdits
+from gateway.recordings.workshop.anonymising import MAX_PLACE_DEG, Anonymiser, Anonymity
+from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
+from gateway.recordings.workshop.selection import (
+    MAX_MARGIN_S,
+    FrameChoice,
+    StateChoice,
+    message_ids_of,
+)
+from gateway.recordings.workshop.tlog_editing import Renumbering, TlogEdits
 from gateway.wire.system_ids import LAST_ID
 
 app = typer.Typer()

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from gateway.aircraft import Aircraft
+from gateway.answers.log_answers import LogAnswers
 from gateway.cli.support.control import ask
 from gateway.cli.support.options import output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
@@ -19,8 +20,9 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.output import check_output, write_new
-from gateway.recordings.answers import LogAnswers
-from gateway.recordings.comparison import (
+from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.vehicle_recording import VehicleRecording
+from gateway.recordings.workshop.comparison import (
     SECTIONS,
     Comparison,
     Contents,
@@ -31,10 +33,8 @@ from gateway.recordings.comparison import (
     read_recording,
     rows_of,
 )
-from gateway.recordings.extracts import RecordedPlan
-from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.senders import AUTOPILOT, RecordedSender
-from gateway.recordings.vehicle_recording import VehicleRecording
+from gateway.recordings.workshop.extracts import RecordedPlan
+from gateway.vehicle_state.senders import AUTOPILOT, RecordedSender
 
 app = typer.Typer()
 

@@ -18,10 +18,17 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.output import check_output, write_new
-from gateway.recordings.extracts import RecordedPlan, param_file, qgc_params, qgc_plan, waypoints
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, iso_time, parse_moment, time_us_of
-from gateway.recordings.timed_extracts import (
+from gateway.recordings.vehicle_recording import VehicleRecording
+from gateway.recordings.workshop.extracts import (
+    RecordedPlan,
+    param_file,
+    qgc_params,
+    qgc_plan,
+    waypoints,
+)
+from gateway.recordings.workshop.timed_extracts import (
     MAX_RATE_HZ,
     SUBTITLE_FIELDS,
     WANTED,
@@ -32,7 +39,6 @@ from gateway.recordings.timed_extracts import (
     subtitles,
     texts,
 )
-from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import KINDS, RALLY
 

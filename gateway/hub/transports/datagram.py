@@ -13,10 +13,11 @@ from typing import Final
 from gateway.compiled.messages import way_to_send
 from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import Endpoint
-from gateway.hub.routing_table import HEARTBEAT_ID, Origin
+from gateway.hub.routing_table import Origin
 from gateway.hub.send_queue import Packer
 from gateway.hub.transports.base import RETRY_US, STALE_AFTER_US, Client, new_socket
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import HEARTBEAT_ID
 from gateway.wire.mavlink_splitter import DatagramSplitter, MavFrame, message_id_of, read_datagram
 
 UNPROVEN: Final = "unproven"

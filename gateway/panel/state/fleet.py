@@ -7,7 +7,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.state.vehicle import VehicleState
-from gateway.recordings.newest import VehicleComponents
+from gateway.vehicle_state.newest import VehicleComponents
 
 MAX_VEHICLES: Final = 32
 """Maximum aircraft: more are forged, and each may take some MB."""

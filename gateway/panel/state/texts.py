@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from gateway.recordings.status_texts import JoinedText, TextJoiner
+from gateway.vehicle_state.status_texts import JoinedText, TextJoiner
 
 MAX_TEXTS: Final = 500
 MAX_LETTERS: Final = 2_000

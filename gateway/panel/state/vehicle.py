@@ -10,11 +10,17 @@ from gateway.geometry.angle import wrap_180
 from gateway.panel.state.history import MAX_TRACK, TRACK_INTERVAL_US, FlightHistory
 from gateway.panel.state.instant import Instant
 from gateway.panel.state.texts import StatusTexts
-from gateway.recordings.newest import NewestState
-from gateway.recordings.positions import GPS_IDS, Position, TrackPoint, named_position, position_of
 from gateway.records import NAN
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
+from gateway.vehicle_state.newest import NewestState
+from gateway.vehicle_state.positions import (
+    GPS_IDS,
+    Position,
+    TrackPoint,
+    named_position,
+    position_of,
+)
 
 LIVE: Final = "live"
 """Origin of an aircraft that is not played."""

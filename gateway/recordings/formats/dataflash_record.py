@@ -25,7 +25,6 @@ from gateway.recordings.autopilot_record import (
     Mode,
     Text,
 )
-from gateway.recordings.extracts import CIRCLES
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats.dataflash import (
     KINDS,
@@ -42,6 +41,7 @@ from gateway.recordings.formats.dataflash import (
 )
 from gateway.recordings.message_table import MessageTable, read_table
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.workshop.extracts import CIRCLES
 from gateway.records import NAN
 from gateway.units import DEGE7_PER_DEG, US_PER_S
 from gateway.vehicle.encoding import int32

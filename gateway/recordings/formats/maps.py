@@ -12,17 +12,17 @@ from typing import Any, Final
 from xml.sax import saxutils
 
 from gateway.aircraft import AircraftSettings
+from gateway.answers.log_answers import HOME_POSITION_ID
 from gateway.geometry.quaternion import to_euler
-from gateway.recordings.answers import HOME_POSITION_ID
 from gateway.recordings.columns import TableRow
 from gateway.recordings.moment import iso_time
-from gateway.recordings.positions import Continuity, TrackPoint, named_position
 from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import FORMER_NOTE, NOTE, TableNote
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.records import FusionState, GpsFix, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 from gateway.vehicle.plan import is_good_enough
+from gateway.vehicle_state.positions import Continuity, TrackPoint, named_position
 
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
 """Colours of the vehicles' lines, as hexadecimal alpha, blue, green, red."""

@@ -28,15 +28,15 @@ from gateway import __version__
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import multiply, to_euler
 from gateway.recordings.columns import unit_of
-from gateway.recordings.convert import FlightToWrite, Pieces
-from gateway.recordings.positions import Position, position_of
-from gateway.recordings.status_texts import JoinedText, text_of
-from gateway.recordings.tlog import fields_of
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
+from gateway.recordings.workshop.convert import FlightToWrite, Pieces
 from gateway.records import Quat
 from gateway.units import M_PER_MM, US_PER_S, counted
+from gateway.vehicle_state.positions import Position, position_of
+from gateway.vehicle_state.status_texts import JoinedText, text_of
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of
+from gateway.wire.recorded_frames import fields_of
 
 MAP: Final = "map"
 LOG_TOPIC: Final = "/log"

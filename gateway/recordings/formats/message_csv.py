@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 
 from gateway.recordings.files import FlightError
-from gateway.recordings.status_texts import text_of
-from gateway.recordings.tlog import Batch, columns_of
+from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_NAMES, layout_of
+from gateway.wire.recorded_frames import Batch, columns_of
 
 HEAD: Final = ("time", "system_id", "component_id")
 """Columns before the fields; the time is civil, in UTC, to the microsecond."""

@@ -14,10 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from gateway.recordings.columns import COLUMNS, TRUTHS, WHOLE_COLUMNS, TableRow, cells_of, unit_of
-from gateway.recordings.convert import FlightToWrite, Pieces
 from gateway.recordings.files import FlightError, is_packed, read_chunks, temporary_copy
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, table_of_blocks
-from gateway.recordings.status_texts import text_of
 from gateway.recordings.table import (
     FORMAT_LINE,
     HEADER_PREFIX,
@@ -25,9 +23,11 @@ from gateway.recordings.table import (
     TableReader,
     encode_line,
 )
-from gateway.recordings.tlog import fields_of
+from gateway.recordings.workshop.convert import FlightToWrite, Pieces
+from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from gateway.wire.recorded_frames import fields_of
 
 ROWS: Final = 16_384
 """Rows per row group, which is held in memory as a whole: about 40 MB."""

@@ -12,7 +12,7 @@ import pytest
 from pymavlink import mavparm, mavwp
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.extracts import RecordedParameter
+from gateway.recordings.workshop.extracts import RecordedParameter
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender
 from tests.kit.recordings import START_US, records_of, write_tlog

@@ -25,10 +25,10 @@ from gateway.recordings.formats.maps import (
     tracks_of_messages,
     tracks_of_table,
 )
-from gateway.recordings.positions import TrackPoint
 from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import TableNote, block_of
 from gateway.records import NavFlags
+from gateway.vehicle_state.positions import TrackPoint
 from tests.kit.recordings import SECOND_US, START_US, Sent, messages_of, records_sent
 from tests.recordings.flights import fly, make_flight, read
 

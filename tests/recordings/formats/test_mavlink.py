@@ -10,8 +10,9 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.geometry.quaternion import to_euler
 from gateway.recordings.columns import Imported, TableRow, row_of_cells
 from gateway.recordings.formats.mavlink import AutopilotReader
-from gateway.recordings.tlog import TlogRecord, TlogScanner
+from gateway.recordings.tlog import TlogScanner
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuCalibrated, ImuFlags, NavFlags, NavState
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.mavlink import packed
 from tests.kit.recordings import START_US, make_tlog, records_sent, senders_of
 
@@ -43,7 +44,7 @@ def position(time_ms: int, vz_cmps: int) -> Message:
 
 
 def rows_of(
-    reader: AutopilotReader, records: list[TlogRecord], chunk: int = 1 << 20
+    reader: AutopilotReader, records: list[RecordedFrame], chunk: int = 1 << 20
 ) -> list[TableRow]:
     """Read a recording in chunks of so many bytes."""
     scanner, data = TlogScanner(strict=True), make_tlog(records)
@@ -58,7 +59,7 @@ def rows_of(
 
 def read(messages: list[tuple[int, Message]], component_id: int = 1) -> list[Imported]:
     """Return what is read, in the order of the rows."""
-    records = [TlogRecord(START_US + at_us, packed(m, 1, component_id)) for at_us, m in messages]
+    records = [RecordedFrame(START_US + at_us, packed(m, 1, component_id)) for at_us, m in messages]
     rows = rows_of(AutopilotReader(), records)
     held = [record for row in rows for record in (row.baro, row.gps, row.state, row.imu)]
     return [record for record in held if record is not None]
@@ -213,7 +214,7 @@ def test_states_of_the_autopilot_are_read() -> None:
     assert stale.time_us == 600_000, "of two the newer"
 
 
-def recorded(seed: int) -> list[TlogRecord]:
+def recorded(seed: int) -> list[RecordedFrame]:
     """Make messages of two autopilots and a station in any order, with decreasing times too."""
     chance, records, at_us = random.Random(seed), [], 0
     senders = ((1, 1), (1, 1), (1, 1), (2, 1), (1, 5))
@@ -234,7 +235,7 @@ def recorded(seed: int) -> list[TlogRecord]:
         )
         version = chance.choice((1, 2, 2, 2, 2))
         frame = packed(message, *chance.choice(senders), version=version)
-        records.append(TlogRecord(START_US + at_us, frame))
+        records.append(RecordedFrame(START_US + at_us, frame))
     return records
 
 

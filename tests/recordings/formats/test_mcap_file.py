@@ -15,7 +15,7 @@ from mcap.summary import Summary
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import rotate
-from gateway.recordings.convert import WRITERS, FlightToWrite
+from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
 from tests.kit.cli import invoke
 from tests.kit.recordings import records_sent, write_tlog
 from tests.recordings.flights import OPTIONS

@@ -8,8 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from gateway.recordings.columns import COLUMNS
-from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.formats import parquet as parquet_file
+from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
 from tests.kit.cli import run
 from tests.kit.recordings import START_US, STEP_US, make_records, write_tlog
 from tests.recordings.flights import OPTIONS, commented_table

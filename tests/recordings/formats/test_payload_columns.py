@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.tlog import Batch, columns_of
 from gateway.wire.mavlink_messages import layout_of
+from gateway.wire.recorded_frames import Batch, columns_of
 from tests.kit.mavlink import frame_with
 from tests.kit.recordings import batch_of, records_of
 

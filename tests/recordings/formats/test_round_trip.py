@@ -21,15 +21,15 @@ from mcap.reader import make_reader
 
 from gateway.config import GatewaySettings
 from gateway.recordings.columns import TableRow, row_to_line
-from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats import parquet
 from gateway.recordings.formats.maps import tracks_of_messages, tracks_of_table
 from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_table import aircraft_of
-from gateway.recordings.tlog import TlogRecord
+from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.recordings import make_tlog
 from tests.recordings.flights import OPTIONS, commented_table
 from tests.recordings.formats import flown
@@ -94,7 +94,7 @@ def convert(name: str, data: bytes, ending: str) -> bytes:
 
 
 @cache
-def frames_of(path: Path) -> list[TlogRecord]:
+def frames_of(path: Path) -> list[RecordedFrame]:
     return list(FlightToWrite([path], OPTIONS).frames())
 
 
@@ -140,7 +140,7 @@ def of_mcap(data: bytes) -> list[tuple[int, str]]:
     ]
 
 
-def of_frames(records: Iterable[TlogRecord]) -> list[tuple[int, str]]:
+def of_frames(records: Iterable[RecordedFrame]) -> list[tuple[int, str]]:
     found = []
     for record in records:
         system, component = origin_of(record.frame)

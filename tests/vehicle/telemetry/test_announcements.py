@@ -6,13 +6,13 @@ import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.recordings.status_texts import TextJoiner
 from gateway.records import NodeId, PipeCounters, ReceiverStatus
 from gateway.vehicle.service import INFO, WARNING, StatusText
 from gateway.vehicle.telemetry.announcements import BUCKET, HOLD_US, Announcer
 from gateway.vehicle.telemetry.health import QUIET_REPORTS, RADIO_SPAN_US, Finding, Health
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
+from gateway.vehicle_state.status_texts import TextJoiner
 from tests.kit.ground_station import decode, kinds, of_kind, texts
 from tests.kit.mavlink import packed
 from tests.kit.records import link, report, status

@@ -21,15 +21,15 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.answers import ALL_KINDS, PARAM_VALUE, Items, LogAnswers, content_of
-from gateway.recordings.status_texts import text_of
-from gateway.recordings.tlog import payload_of
+from gateway.answers.log_answers import ALL_KINDS, PARAM_VALUE, Items, LogAnswers, content_of
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import KINDS
 from gateway.vehicle.services.ftp import ACK, WRITING, FtpError, Opcode, decode_packet, full_path
+from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_messages import BOOT_TIME_OFFSETS, boot_time_us, ids_of
 from gateway.wire.mavlink_splitter import MavFrame
+from gateway.wire.recorded_frames import payload_of
 
 HASH_NAME: Final = "_HASH_CHECK"
 """Name of PX4's checksum of all parameters."""

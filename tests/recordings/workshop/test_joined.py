@@ -5,9 +5,9 @@ import pytest
 
 from gateway.recordings.columns import TableRow
 from gateway.recordings.files import FlightError
-from gateway.recordings.joining import joined_tables
 from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import TableHeader, TableNote, block_of
+from gateway.recordings.workshop.joining import joined_tables
 
 SECOND_US = 1_000_000
 EPOCH_US = 1_780_000_000 * SECOND_US

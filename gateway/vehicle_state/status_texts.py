@@ -4,10 +4,10 @@ import re
 from dataclasses import dataclass, field
 from typing import Final
 
-from gateway.recordings.tlog import payload_of
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import origin_of
+from gateway.wire.recorded_frames import payload_of
 
 STATUSTEXT_ID: Final = MESSAGE_IDS["STATUSTEXT"]
 TEXT_BYTES: Final = 50

@@ -10,13 +10,13 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.cached_vehicle import CachedVehicle
-from gateway.recordings.live_answers import HASH_NAME, NOTED_IDS, PARAMETERS, LiveAnswers
-from gateway.recordings.senders import AUTOPILOT
+from gateway.answers.cached_vehicle import CachedVehicle
+from gateway.answers.live_answers import HASH_NAME, NOTED_IDS, PARAMETERS, LiveAnswers
 from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import KINDS
 from gateway.vehicle.service import Request
+from gateway.vehicle_state.senders import AUTOPILOT
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of

@@ -12,17 +12,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.recordings.anonymising import Anonymiser, Anonymity
 from gateway.recordings.files import FlightError, Progress, TlogSource
-from gateway.recordings.merging import WINDOW_US, Alignment, Copies, batched, by_time
-from gateway.recordings.selection import FrameChoice, StateChoice, while_in_state, within
-from gateway.recordings.senders import Senders
-from gateway.recordings.tlog import Batch, encode_record
-from gateway.recordings.trimming import NOTHING_WITHIN, Limits
+from gateway.recordings.tlog import encode_record
 from gateway.recordings.vehicle_reader import VehicleReader
+from gateway.recordings.workshop.anonymising import Anonymiser, Anonymity
+from gateway.recordings.workshop.merging import WINDOW_US, Alignment, Copies, batched, by_time
+from gateway.recordings.workshop.selection import FrameChoice, StateChoice, while_in_state, within
+from gateway.recordings.workshop.trimming import NOTHING_WITHIN, Limits
 from gateway.units import US_PER_S, counted
+from gateway.vehicle_state.senders import Senders
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import frame_of
+from gateway.wire.recorded_frames import Batch
 from gateway.wire.system_ids import FIELDS, rename_systems
 
 BoolArray = NDArray[np.bool_]

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.recordings.answers import LogAnswers, VehicleAnswers
+from gateway.answers.log_answers import LogAnswers, VehicleAnswers
 from tests.kit.mavlink import frame_with, packed, read_back
 from tests.kit.recordings import SECOND_US, START_US, batch_of, index_of, records_of
 

@@ -24,14 +24,13 @@ from typing import Final, Generic, TypeVar
 
 import numpy as np
 
-from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION, Senders, is_station
-from gateway.recordings.status_texts import text_of
-from gateway.recordings.tlog import Batch, fields_of, payload_of
-from gateway.recordings.tlog_scan import IntArray
 from gateway.vehicle.plan import KINDS
+from gateway.vehicle_state.senders import AUTOPILOT, FIRST_GROUND_STATION, Senders, is_station
+from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, TARGET_OFFSETS, ids_of
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
+from gateway.wire.recorded_frames import Batch, IntArray, fields_of, payload_of
 
 PARAM_VALUE_ID: Final = MESSAGE_IDS["PARAM_VALUE"]
 AUTOPILOT_VERSION_ID: Final = MESSAGE_IDS["AUTOPILOT_VERSION"]

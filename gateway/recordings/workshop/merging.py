@@ -18,9 +18,10 @@ from typing import Final
 
 import numpy as np
 
-from gateway.recordings.tlog import Batch, TlogRecord, TlogScanner, encode_record
-from gateway.recordings.tlog_scan import TIME_SIZE
+from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.units import US_PER_S
+from gateway.wire.frame_scan import TIME_SIZE
+from gateway.wire.recorded_frames import Batch, RecordedFrame
 
 MAX_SAMPLE: Final = 50_000
 """Maximum number of frames in the sample of a file, about 10 MB."""
@@ -176,7 +177,7 @@ class Copies:
 
 def by_time(
     files: Sequence[Iterable[Batch]], shifts_us: Sequence[int], copies: Copies | None = None
-) -> Iterator[TlogRecord]:
+) -> Iterator[RecordedFrame]:
     """Yield the records of all files in order of shifted time; `copies` removes copies."""
 
     def shifted(number: int) -> Iterator[tuple[int, int, bytes]]:
@@ -187,10 +188,10 @@ def by_time(
     streams = [shifted(number) for number in range(len(files))]
     for time_us, number, frame in heapq.merge(*streams, key=itemgetter(0)):
         if copies is None or not copies.is_copy(time_us, number, frame):
-            yield TlogRecord(time_us, frame)
+            yield RecordedFrame(time_us, frame)
 
 
-def batched(records: Iterable[TlogRecord]) -> Iterator[Batch]:
+def batched(records: Iterable[RecordedFrame]) -> Iterator[Batch]:
     """Put records into batches."""
     scanner, rest = TlogScanner(), iter(records)
     while piece := b"".join(encode_record(r.time_us, r.frame) for r in islice(rest, PIECE)):

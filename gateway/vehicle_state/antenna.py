@@ -13,8 +13,8 @@ from typing import Final
 
 from pymap3d import geodetic2aer
 
-from gateway.recordings.newest import NewestState
-from gateway.recordings.positions import Position, named_position
+from gateway.vehicle_state.newest import NewestState
+from gateway.vehicle_state.positions import Position, named_position
 
 HOME: Final = "home"
 SYSTEM: Final = "system:"

@@ -8,18 +8,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from gateway.recordings.answers import AUTOPILOT_VERSION_ID
-from gateway.recordings.extracts import RecordedPlan, parameter_text
+from gateway.answers.log_answers import AUTOPILOT_VERSION_ID
 from gateway.recordings.files import FlightError
-from gateway.recordings.positions import GroundDistance
-from gateway.recordings.tlog import Batch
-from gateway.recordings.tlog_scan import TIME_SIZE
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.recordings.vehicle_recording import VehicleRecording
+from gateway.recordings.workshop.extracts import RecordedPlan, parameter_text
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import KINDS, Item
+from gateway.vehicle_state.positions import GroundDistance
+from gateway.wire.frame_scan import TIME_SIZE
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import SEQUENCE_V1, SEQUENCE_V2, START_V2
+from gateway.wire.recorded_frames import Batch
 
 MAX_PARAM_FILE: Final = 4 << 20
 """Maximum size, bytes; a vehicle has about 1,500 parameters of 30 bytes each."""

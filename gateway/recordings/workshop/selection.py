@@ -17,10 +17,10 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, time_us_of
-from gateway.recordings.senders import Senders
-from gateway.recordings.tlog import HEARTBEAT_ID, Batch, columns_of
+from gateway.vehicle_state.senders import Senders
 from gateway.wire.flight_modes import mode_name
-from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS
+from gateway.wire.recorded_frames import Batch, columns_of
 
 BoolArray = NDArray[np.bool_]
 

@@ -18,16 +18,16 @@ from typing import Any, Final
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.answers import (
+from gateway.answers.log_answers import (
     AUTOPILOT_VERSION_ID,
     HOME_POSITION_ID,
     LogAnswers,
     VehicleAnswers,
 )
-from gateway.recordings.positions import Position, named_position
-from gateway.recordings.senders import RecordedSender
-from gateway.recordings.tlog import fields_of
 from gateway.vehicle.plan import FENCE, MISSION, RALLY, Item, read_item
+from gateway.vehicle_state.positions import Position, named_position
+from gateway.vehicle_state.senders import RecordedSender
+from gateway.wire.recorded_frames import fields_of
 
 END_US: Final = 1 << 62
 _INTEGERS: Final = {1: "<Bxxx", 2: "<bxxx", 3: "<Hxx", 4: "<hxx", 5: "<I", 6: "<i"}

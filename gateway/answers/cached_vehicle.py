@@ -12,7 +12,7 @@
 
 from typing import Final
 
-from gateway.recordings.live_answers import LiveAnswers
+from gateway.answers.live_answers import LiveAnswers
 from gateway.records import Incoming, Outgoing
 from gateway.vehicle.plan import ACCEPTED
 from gateway.vehicle.recorded_vehicle import PARAM_VALUE, RecordedVehicle

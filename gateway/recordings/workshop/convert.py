@@ -8,7 +8,6 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Final
 
-from gateway.recordings.anonymising import Anonymiser
 from gateway.recordings.autopilot_record import AutopilotLog, RecordTranslator
 from gateway.recordings.files import (
     NO_RECORDING,
@@ -29,8 +28,6 @@ from gateway.recordings.formats.maps import (
     tracks_of_messages,
     tracks_of_table,
 )
-from gateway.recordings.joining import joined_tables
-from gateway.recordings.merging import batched
 from gateway.recordings.reading import (
     beside_id,
     check_vehicle,
@@ -42,13 +39,17 @@ from gateway.recordings.reading import (
 )
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, aircraft_of
-from gateway.recordings.selection import message_ids_of
-from gateway.recordings.senders import Senders
 from gateway.recordings.table import encode_block, encode_head
-from gateway.recordings.tlog import Batch, Stamper, TlogRecord
-from gateway.recordings.tlog_editing import TlogEditor, TlogEdits, first_position
-from gateway.recordings.trimming import Limits, trimmed
+from gateway.recordings.tlog import Stamper
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
+from gateway.recordings.workshop.anonymising import Anonymiser
+from gateway.recordings.workshop.joining import joined_tables
+from gateway.recordings.workshop.merging import batched
+from gateway.recordings.workshop.selection import message_ids_of
+from gateway.recordings.workshop.tlog_editing import TlogEditor, TlogEdits, first_position
+from gateway.recordings.workshop.trimming import Limits, trimmed
+from gateway.vehicle_state.senders import Senders
+from gateway.wire.recorded_frames import Batch, RecordedFrame
 
 NOT_FUSED: Final = "raw samples, settings and the exact digits of states"
 NOT_IN_TABLE: Final = "all except samples, fixes and states of one vehicle"
@@ -107,7 +108,7 @@ class FlightToWrite:
         if kinds == {TABLE} and options.system_id is not None:
             self.files = self._files_of(options.system_id)
 
-    def frames(self) -> Iterator[TlogRecord]:
+    def frames(self) -> Iterator[RecordedFrame]:
         """Yield the selected MAVLink: as recorded, or as the gateway would send it."""
         return (record for batch in self.chosen() for record in batch.records())
 
@@ -220,12 +221,12 @@ class FlightToWrite:
         self.fusions.append(fusion)
         return fusion
 
-    def _sent(self) -> Iterator[TlogRecord]:
+    def _sent(self) -> Iterator[RecordedFrame]:
         """Yield the frames that the gateway would send for all aircraft, in order of time.
 
         For logs of autopilots these are the frames of their own estimates, or both.
         """
-        streams: list[Iterator[TlogRecord]] = []
+        streams: list[Iterator[RecordedFrame]] = []
         if self._estimates != "fused":
             for file in self.files:
                 log = open_record(file, self.options)
@@ -238,7 +239,7 @@ class FlightToWrite:
             streams += [part.fused().frames() for part in self.by_aircraft()]
         stamper = Stamper(0)
         for record in heapq.merge(*streams, key=lambda record: record.time_us):
-            yield TlogRecord(stamper.stamp(record.time_us), record.frame)
+            yield RecordedFrame(stamper.stamp(record.time_us), record.frame)
 
 
 Write = Callable[[FlightToWrite], Iterable[bytes]]

@@ -10,14 +10,13 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.printable import UNKNOWN, figure
 from gateway.recordings.formats.message_csv import csv_lines
 from gateway.recordings.moment import iso_time
-from gateway.recordings.newest import NewestState
-from gateway.recordings.positions import GroundDistance, Position
-from gateway.recordings.tlog import HEARTBEAT_ID
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.records import NAN
 from gateway.units import DEGE7_PER_DEG, US_PER_S
+from gateway.vehicle_state.newest import NewestState
+from gateway.vehicle_state.positions import GroundDistance, Position
 from gateway.wire.flight_modes import mode_name
-from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES
+from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS, MESSAGE_NAMES
 
 REACHED_ID: Final = MESSAGE_IDS["MISSION_ITEM_REACHED"]
 LANDED_ID: Final = MESSAGE_IDS["EXTENDED_SYS_STATE"]

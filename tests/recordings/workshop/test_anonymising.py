@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.estimation.record import FloatArray
-from gateway.recordings.anonymising import (
+from gateway.recordings.workshop.anonymising import (
     IDENTIFIERS,
     LOCATED,
     NAMED_VALUES,
@@ -21,9 +21,9 @@ from gateway.recordings.anonymising import (
     Anonymity,
     is_plain,
 )
-from gateway.recordings.tlog import fields_of
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, layout_of
 from gateway.wire.mavlink_splitter import MavFrame, frame_of, message_id_of, split_datagram
+from gateway.wire.recorded_frames import fields_of
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender, frame_with, packed
 from tests.kit.recordings import START_US, batch_of, read_tlog, records_of, write_tlog

@@ -13,7 +13,9 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import from_euler
-from gateway.recordings.positions import (
+from gateway.records import NAN, UNKNOWN_VEC3, Quat, Vec3
+from gateway.units import DEG_PER_CDEG, M_PER_CM, M_PER_MM, MV_PER_V, US_PER_S
+from gateway.vehicle_state.positions import (
     FIX_2D,
     RANKS,
     UNKNOWN_U16,
@@ -21,13 +23,11 @@ from gateway.recordings.positions import (
     named_position,
     position_of,
 )
-from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION
-from gateway.recordings.tlog import fields_of
-from gateway.records import NAN, UNKNOWN_VEC3, Quat, Vec3
-from gateway.units import DEG_PER_CDEG, M_PER_CM, M_PER_MM, MV_PER_V, US_PER_S
+from gateway.vehicle_state.senders import AUTOPILOT, FIRST_GROUND_STATION
 from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAMES, ids_of
 from gateway.wire.mavlink_splitter import MavFrame
+from gateway.wire.recorded_frames import fields_of
 
 Fields = Mapping[str, Any]
 

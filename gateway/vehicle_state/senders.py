@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.positions import (
+from gateway.units import US_PER_S
+from gateway.vehicle_state.positions import (
     GLOBAL_POSITION_INT_ID,
     LOCAL_POSITION_NED_ID,
     ORIGIN_ID,
@@ -22,9 +23,8 @@ from gateway.recordings.positions import (
     holds_position,
     named_position,
 )
-from gateway.recordings.tlog import HEARTBEAT_ID, Batch, columns_of, fields_of
-from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS
+from gateway.wire.recorded_frames import Batch, columns_of, fields_of
 
 FIRST_GROUND_STATION: Final = 250
 """System ids from here on are ground stations by convention, and keep their id."""

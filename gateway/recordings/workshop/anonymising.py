@@ -33,14 +33,15 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.files import LAST_CIVIL_US
-from gateway.recordings.status_texts import text_of
-from gateway.recordings.tlog import DAY_US, Batch, fields_of
-from gateway.recordings.tlog_scan import TIME_SIZE
+from gateway.recordings.tlog import DAY_US
 from gateway.units import DEGE7_PER_DEG, US_PER_S
 from gateway.vehicle.plan import GLOBAL_FRAMES
+from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.frame_editing import FLAGS, edit_frame
+from gateway.wire.frame_scan import TIME_SIZE
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_NAMES, layout_of
 from gateway.wire.mavlink_splitter import SIGNED, START_V2, frame_of
+from gateway.wire.recorded_frames import Batch, fields_of
 
 BoolArray = NDArray[np.bool_]
 

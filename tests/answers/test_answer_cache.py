@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings import answer_cache, live_answers
-from gateway.recordings.answer_cache import AnswerCache
-from gateway.recordings.live_answers import LiveAnswers
+from gateway.answers import answer_cache, live_answers
+from gateway.answers.answer_cache import AnswerCache
+from gateway.answers.live_answers import LiveAnswers
 from gateway.records import Incoming, Outgoing
 from gateway.vehicle.services.ftp import Opcode
 from gateway.vehicle.vehicle import Vehicle

@@ -9,19 +9,20 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.files import FlightError, open_tlog
-from gateway.recordings.merging import MAX_SAMPLE, Alignment, FrameSample, batched
-from gateway.recordings.selection import (
+from gateway.recordings.tlog import TlogScanner
+from gateway.recordings.workshop.merging import MAX_SAMPLE, Alignment, FrameSample, batched
+from gateway.recordings.workshop.selection import (
     MAX_MARGIN_S,
     FrameChoice,
     StateChoice,
     message_ids_of,
     while_in_state,
 )
-from gateway.recordings.senders import Senders
-from gateway.recordings.tlog import TlogRecord, TlogScanner
-from gateway.recordings.tlog_editing import Renumbering, TlogEdits
+from gateway.recordings.workshop.tlog_editing import Renumbering, TlogEdits
+from gateway.vehicle_state.senders import Senders
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender, frame_with, packed
 from tests.kit.recordings import (
@@ -43,7 +44,7 @@ pytestmark = pytest.mark.io
 ATTITUDE = MESSAGE_IDS["ATTITUDE"]
 
 
-def convert(folder: Path, *words: object) -> tuple[list[TlogRecord], str]:
+def convert(folder: Path, *words: object) -> tuple[list[RecordedFrame], str]:
     """Run `mavgate convert` to a tlog; lists of records become files. Return records and texts."""
     files = [
         write_tlog(folder / f"{k}.tlog", word) if isinstance(word, list) else word
@@ -162,13 +163,13 @@ def test_times_run_on_where_the_clock_was_set_back(tmp_path: Path) -> None:
 
 
 def test_messages_of_a_foreign_dialect_are_kept_and_chosen_by_id(tmp_path: Path) -> None:
-    foreign = TlogRecord(MIXED[50].time_us + 1, frame_with(60_001, b"foreign"))
+    foreign = RecordedFrame(MIXED[50].time_us + 1, frame_with(60_001, b"foreign"))
     records = [*MIXED[:51], foreign, *MIXED[51:]]
     assert foreign in convert(tmp_path, records, "--system", 1)[0]
     assert convert(tmp_path, records, "--message", "60001")[0] == [foreign]
 
 
-def armed_flight(*armed_s: tuple[int, int], length_s: int = 60) -> list[TlogRecord]:
+def armed_flight(*armed_s: tuple[int, int], length_s: int = 60) -> list[RecordedFrame]:
     """Make heartbeats once a second, armed in some ranges, with an attitude 0.5 s after each."""
     sender, frames = Sender(), []
     for second in range(length_s):
@@ -237,13 +238,13 @@ def test_time_in_chosen_modes_is_kept(
     assert [(one.time_us - START_US) // SECOND_US for one in kept] == kept_s
 
 
-def two_receivers(offset_us: int, *, loss: int = 7) -> tuple[list[TlogRecord], ...]:
+def two_receivers(offset_us: int, *, loss: int = 7) -> tuple[list[RecordedFrame], ...]:
     """Return what two receivers record of a flight, the second with another clock and delays."""
     sender = Sender()
     whole = records_of(sender.attitude(k) for k in range(600))
     first = [record for k, record in enumerate(whole) if k % loss]
     second = [
-        TlogRecord(record.time_us + offset_us + 40 * (k % 11), record.frame)
+        RecordedFrame(record.time_us + offset_us + 40 * (k % 11), record.frame)
         for k, record in enumerate(whole)
         if k % 5
     ]
@@ -280,7 +281,7 @@ def test_files_one_behind_another_are_joined_in_order_of_time(tmp_path: Path) ->
 def test_frames_that_repeat_in_one_file_are_no_copies(tmp_path: Path) -> None:
     same = packed(mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3))
     first, second, _ = two_receivers(0)
-    repeated = [TlogRecord(START_US + k * 50_000, same) for k in range(20)]
+    repeated = [RecordedFrame(START_US + k * 50_000, same) for k in range(20)]
     first = sorted([*first, *repeated], key=lambda r: r.time_us)
     kept, _ = convert(tmp_path, first, second, "--merge")
     assert sum(record.frame == same for record in kept) == 20
@@ -332,7 +333,10 @@ def test_systems_can_swap_their_ids(tmp_path: Path) -> None:
 
 
 def test_unknown_message_that_cannot_be_renumbered_is_left_out_and_listed(tmp_path: Path) -> None:
-    records = [*make_records(9), TlogRecord(START_US + SECOND_US, frame_with(60_001, b"foreign"))]
+    records = [
+        *make_records(9),
+        RecordedFrame(START_US + SECOND_US, frame_with(60_001, b"foreign")),
+    ]
     kept, text = convert(tmp_path, records, "--as", "1:9")
     assert len(kept) == 9
     assert "kept 9 of 10 records" in text

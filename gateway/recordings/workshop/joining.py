@@ -11,7 +11,7 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader, TableNote
 from gateway.recordings.tlog import JUMP_US
-from gateway.recordings.trimming import first_true
+from gateway.recordings.workshop.trimming import first_true
 from gateway.records import FusionState, NodeStatus
 from gateway.units import counted
 
