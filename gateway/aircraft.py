@@ -5,9 +5,8 @@ Pure: time is an argument, and results are added to the `Outputs` that the calle
 
 import zlib
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import astuple, dataclass
-from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from gateway import __version__
 from gateway.estimation.columns import nav_state
 from gateway.estimation.kernel import KernelEstimator
-from gateway.estimation.paper import PaperSettings
 from gateway.estimation.select import EstimationSettings, Estimator, make_estimator
 from gateway.records import (
     BaroRaw,
@@ -55,23 +53,6 @@ from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_signing import SigningClock, SigningTimestamps
 
 Order = ClientInterval | LogWarning | RecordingRequest | SaveSettings | SavePlan
-DEPRECATED: Final = {"complementary": "eskf"}
-"""Present names of deprecated estimators."""
-FORMER_SECTIONS: Final = ("complementary", "compass", "rest")
-FORMER_KEYS: Final = frozenset(
-    {
-        "accel_roughness",
-        "gps_height_wander_m",
-        "gps_wander_m",
-        "gps_wander_s",
-        "gyro_roughness",
-        "mag_bias_ut",
-        "mag_bias_walk_utprs",
-        "unaided_velocity_mps",
-    }
-)
-"""Sections and keys of the settings of earlier versions."""
-FILTER_KEYS: Final = frozenset(PaperSettings.__struct_fields__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,35 +298,3 @@ def with_passphrase(settings: AircraftSettings, passphrase: str) -> AircraftSett
     """Return the settings with another signing passphrase."""
     vehicle = msgspec.structs.replace(settings.vehicle, signing_passphrase=passphrase)
     return msgspec.structs.replace(settings, vehicle=vehicle)
-
-
-def migrate_sections(sections: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Convert settings of earlier versions, as builtins; also return remarks on the changes.
-
-    The filter chain in `sensing` has become part of the paper's estimator, and `complementary` has
-    become `eskf`. Settings of estimators that no longer exist are left out.
-    """
-    present: dict[str, Any] = dict(sections)
-    remarks: list[str] = []
-    found = present.get("estimation", {})
-    if not isinstance(found, Mapping):
-        return present, remarks
-    estimation: dict[str, Any] = dict(found)
-    if (chain := present.pop("sensing", None)) is not None:
-        moved = {key: value for key, value in chain.items() if key in FILTER_KEYS}
-        estimation["paper"] = moved | dict(estimation.get("paper", {}))
-        remarks.append("[sensing] is [estimation.paper] now")
-    name = estimation.get("estimator")
-    if name in DEPRECATED:
-        estimation["estimator"] = DEPRECATED[name]
-        remarks.append(f"estimator {name} is deprecated, {DEPRECATED[name]} is used")
-    for section in [key for key in FORMER_SECTIONS if key in estimation]:
-        del estimation[section]
-        remarks.append(f"[estimation.{section}] has no effect any more")
-    own = estimation.get("eskf")
-    if isinstance(own, Mapping) and (former := FORMER_KEYS & own.keys()):
-        estimation["eskf"] = {key: value for key, value in own.items() if key not in former}
-        remarks.append(f"[estimation.eskf] {', '.join(sorted(former))} has no effect any more")
-    if estimation:
-        present["estimation"] = estimation
-    return present, remarks

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Final
 import msgspec
 import tomlkit
 
-from gateway.aircraft import AircraftSettings, migrate_sections
+from gateway.aircraft import AircraftSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.fleet.settings import FleetSettings
 from gateway.hub.settings import HubSettings
@@ -85,7 +85,7 @@ class GatewaySettings(Settings, frozen=True):
             "Folder of the aircraft's own settings: one file each, named by its vehicle id "
             '("1.toml"), with the sections vehicle and estimation of this file and the '
             "calibration of its IMU node. Ground stations and `mavgate calibrate` write it too. "
-            'Missions, mark and home are kept in the same folder ("1.places.json").',
+            'Missions, mark and home are kept in the same folder ("1.plan.json").',
             path=True,
         ),
     ] = "~/.config/mavgate/aircraft"
@@ -253,9 +253,6 @@ def _read(path: Path, kind: type[Settings]) -> dict[str, Any]:
         table = read_toml(path)
     except TomlError as error:
         raise ConfigError(f"{path}: {error}") from error
-    table, remarks = migrate_sections(table)
-    for remark in remarks:
-        log.warning("%s: %s", path, remark)
     errors = [f"{path}: {error}" for error in islice(_check(table, kind, ""), MAX_ERRORS)]
     if len(errors) == MAX_ERRORS:
         errors.append(f"{path}: has more errors, which are not listed")

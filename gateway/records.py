@@ -238,7 +238,7 @@ class NodeStatus(msgspec.Struct, frozen=True, gc=False):
     supply_mv: int
     radio: RadioState = RadioState.OK
     chips: tuple[str, ...] = ()
-    """Names of the chips detected since its start; empty from firmware before 1.1."""
+    """Names of the chips detected since its start."""
 
 
 class PipeCounters(msgspec.Struct, frozen=True, gc=False):

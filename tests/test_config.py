@@ -181,7 +181,7 @@ def test_invalid_aircraft_files_are_reported(settings: GatewaySettings) -> None:
 def test_only_changed_settings_are_saved_and_comments_kept(settings: GatewaySettings) -> None:
     file = aircraft_file(settings, 2)
     file.parent.mkdir()
-    file.write_text("# my plane\n[sensing]\naccel_cutoff_hz = 4.0 # slow\n")
+    file.write_text("# my plane\n[estimation.paper]\naccel_cutoff_hz = 4.0 # slow\n")
     aircraft = load_aircraft(settings)[2]
     calibration = NodeCalibration(accel_bias_mps2=(0.1, 0.2, 0.3))
     aircraft = msgspec.structs.replace(aircraft, calibration=calibration)

@@ -432,7 +432,7 @@ COMMANDS: Final = (
     ("recover", "--force", "-o", "OUT.csv"),
     *(("convert", "--force", "-o", f"OUT{end}") for end in (".csv", ".tlog", ".kml", ".gpx")),
     ("fuse", "--force", "--from", "1", "-o", "OUT.csv"),
-    ("fuse", "--force", "--estimator", "complementary", "-o", "OUT.csv"),
+    ("fuse", "--force", "--estimator", "paper", "-o", "OUT.csv"),
     ("check-config",),
 )
 

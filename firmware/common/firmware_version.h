@@ -5,4 +5,4 @@
 #include <stdint.h>
 
 constexpr uint8_t FIRMWARE_VERSION_MAJOR = 1;
-constexpr uint8_t FIRMWARE_VERSION_MINOR = 1;
+constexpr uint8_t FIRMWARE_VERSION_MINOR = 0;

@@ -11,7 +11,7 @@
 #include "common/firmware_version.h"
 
 // Raised when the layout changes. A new field takes a reserved byte or goes before the CRC.
-constexpr uint8_t SETTINGS_VERSION = 2;
+constexpr uint8_t SETTINGS_VERSION = 1;
 
 enum SettingsProgram : uint8_t { PROGRAM_IMU_NODE = 1, PROGRAM_GPS_NODE = 2, PROGRAM_RECEIVER = 3 };
 

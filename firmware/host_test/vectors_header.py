@@ -99,8 +99,6 @@ def status_vector(vector: dict[str, Any]) -> str:
 def main() -> None:
     """Write the table to standard output."""
     vectors = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
-    # The node report of firmware 1.0 is read, but not sent any more.
-    vectors = [v for v in vectors if v["fields"].get("chips", ()) is not None]
     table = [radio_vector(v) if v["kind"] in BODIES else status_vector(v) for v in vectors]
     head = "// Written by vectors_header.py out of frames.json.\n"
     sys.stdout.write(f"{head}static const std::vector<Vector> VECTORS = {{\n")

@@ -20,7 +20,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from gateway import __version__
 from gateway.cli.support.options import CONFIG, SOCKET, USER_CONFIG, extend
-from gateway.cli.support.terminal import in_words, refuse, refusing
+from gateway.cli.support.terminal import in_words, refusing
 from gateway.live.log_limit import LogLimit
 from gateway.printable import PrintableFormatter, printable, reason_of
 
@@ -109,30 +109,6 @@ COMMANDS: Final = {name: text for below in GROUPS.values() for name, text in bel
 HOISTED: Final = frozenset({"--config", "-c", "--socket"})
 """Options of `mavgate` itself that may also follow the command."""
 EPILOG: Final = "`mavgate --help` lists the options of all commands: --config, --socket, --verbose."
-FORMER: Final[dict[str, dict[str, str]]] = {
-    "convert": {"--out": "--output"},
-    "fuse": {"--out": "--output", "--settings": "--fuse-with"},
-    "recover": {"--out": "--output"},
-    "map get": {"--from": "--source"},
-    "fleet recordings get": {"--to": "--output"},
-    **{
-        words: {"--settings": "--fuse-with"}
-        for words in ("play", "page", "report", "sweep", "batch report", "batch sweep")
-    },
-}
-"""Present names of renamed options, by command; the former names work for one release."""
-MOVED: Final = {
-    "record save": "record rename",
-    "record list": "info",
-    "catalogue show": "info",
-    "batch info": "catalogue",
-    "batch fuse": "batch report",
-    **{f"convert {option}": "fuse" for option in ("--fuse", "--smooth", "--beside", "--position")},
-    "convert --fuse-with": "fuse",
-}
-"""Replaced commands and options with the commands that replace them, for one release."""
-
-
 SMALL: Final = frozenset({"ports", "flash", "record", *MODULES["live.clients"]})
 """Commands that mostly send requests to a gateway; extensions are loaded only with settings."""
 ISO: Final = "%Y-%m-%d %H:%M:%S"
@@ -145,14 +121,11 @@ def load_command(name: str) -> Any:
     module = next(module for module, names in MODULES.items() if name in names)
     group = typer.main.get_group(import_module(f"gateway.cli.{module}").app)
     gc.enable()
-    return tidied(group.commands[name], name)
+    return tidied(group.commands[name])
 
 
-def tidied(command: Any, words: str = "") -> Any:
-    """Return a command whose help is reflowed, with no metavar for flags.
-
-    `words` is the command with its subcommands. Former names are accepted.
-    """
+def tidied(command: Any, *, is_root: bool = False) -> Any:
+    """Return a command whose help is reflowed, with no metavar for flags."""
     if command.help:
         paragraphs = command.help.split("\n\n")
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
@@ -160,29 +133,11 @@ def tidied(command: Any, words: str = "") -> Any:
     for parameter in command.get_params(command.context_class(command, **HELP)):
         if getattr(parameter, "is_flag", False):
             parameter.metavar = ""
-    if words:
+    if not is_root:
         command.epilog = EPILOG
-        parse = command.parse_args
-        command.parse_args = lambda ctx, args: parse(ctx, _present(words, args))
-    for name, each in getattr(command, "commands", {}).items():
-        tidied(each, f"{words} {name}".strip())
+    for each in getattr(command, "commands", {}).values():
+        tidied(each)
     return command
-
-
-def _present(command: str, words: list[str]) -> list[str]:
-    """Replace former names of options, with a message; a replaced command is an error."""
-    found = list[str]()
-    for at, word in enumerate(words):
-        name, equals, value = word.partition("=")
-        moved = f"{command} {name}"
-        if moved in MOVED and (at == 0 or name.startswith("--")):
-            refuse(f"`mavgate {moved}` was replaced: use `mavgate {MOVED[moved]}`")
-        present = FORMER.get(command, {}).get(name, name)
-        if present != name:
-            text = f"{name} is called {present} now; the former name works until version 0.2"
-            typer.echo(text, err=True)
-        found.append(f"{present}{equals}{value}")
-    return found
 
 
 def hoisted(words: list[str]) -> list[str]:
@@ -246,7 +201,7 @@ class LazyGroup(TyperGroup):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the list of commands without importing them."""
         self._listing = True
-        tidied(self)
+        tidied(self, is_root=True)
         super().format_help(ctx, formatter)
         self._listing = False
 

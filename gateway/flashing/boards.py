@@ -30,12 +30,10 @@ from gateway.wire.framing import crc16
 from gateway.wire.payloads import ACCEL_RANGES_G, GYRO_RANGES_DPS, PIPES
 
 MAGIC: Final = b"mavgate"
-VERSION: Final = 2
+VERSION: Final = 1
 POWERS_DBM: Final = (-18, -12, -6, 0)
 
 _LAYOUT: Final = struct.Struct("<7s9BH2BI6B2xBIH5B")
-_LAYOUT_1: Final = struct.Struct("<7s9BH2BI6B2x")
-"""Block of version 1, before there was a second radio; it is read, but no longer written."""
 _CRC: Final = struct.Struct("<H")
 SIZE: Final = _LAYOUT.size + _CRC.size
 PIPES_PER_VEHICLE: Final = 2
@@ -174,17 +172,14 @@ def find_block(image: bytes) -> SettingsBlock:
     damaged = None
     offset = image.find(MAGIC)
     while offset >= 0:
-        version = image[offset + len(MAGIC) : offset + len(MAGIC) + 1]
-        layout = _LAYOUT_1 if version == b"\x01" else _LAYOUT
-        size = layout.size + _CRC.size
-        block = image[offset : offset + size]
-        if len(block) == size and _CRC.unpack(block[-2:])[0] == crc16(block[:-2]):
-            return _decode(block, offset, layout)
+        block = image[offset : offset + SIZE]
+        if len(block) == SIZE and _CRC.unpack(block[-2:])[0] == crc16(block[:-2]):
+            return _decode(block, offset)
         damaged = offset if damaged is None else damaged
         offset = image.find(MAGIC, offset + 1)
     if damaged is not None:
         raise FlashError(f"the settings block at {damaged:#x} is damaged (CRC)")
-    raise FlashError("no settings block: not a mavgate program, or one before version 1.1")
+    raise FlashError("no settings block: not a mavgate program")
 
 
 def patch(image: bytes, settings: BoardSettings) -> tuple[int, bytes]:
@@ -193,18 +188,18 @@ def patch(image: bytes, settings: BoardSettings) -> tuple[int, bytes]:
     return block.offset, _encode(block, settings)
 
 
-def _decode(block: bytes, offset: int, layout: struct.Struct) -> SettingsBlock:
-    values = layout.unpack(block[: layout.size])
+def _decode(block: bytes, offset: int) -> SettingsBlock:
+    values = _LAYOUT.unpack(block[: _LAYOUT.size])
     version, program, clock_mhz, major, minor = values[1:6]
-    if version not in (1, VERSION):
+    if version != VERSION:
         raise FlashError(f"the settings block has version {version}; this mavgate reads {VERSION}")
-    found = dict(zip(BoardSettings.__struct_fields__, values[6:], strict=False))
+    found = dict(zip(BoardSettings.__struct_fields__, values[6:], strict=True))
     try:
-        found["radio"] = RADIOS[found.get("radio", 0)]
+        found["radio"] = RADIOS[found["radio"]]
         found["radio_power_dbm"] = POWERS_DBM[found["radio_power_dbm"]]
         found["accel_range_g"] = round(ACCEL_RANGES_G[found["accel_range_g"]])
         found["gyro_range_dps"] = round(GYRO_RANGES_DPS[found["gyro_range_dps"]])
-        for name in {"imu_raw", "soft_restart", "lora_foreign"} & found.keys():
+        for name in ("imu_raw", "soft_restart", "lora_foreign"):
             found[name] = bool(found[name])
         settings = msgspec.convert(found, BoardSettings)
         kind = Program(program)

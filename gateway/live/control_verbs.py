@@ -49,7 +49,7 @@ class RecorderVerbs:
             "record.start": self._start,
             "record.stop": self._stop,
             "record.status": self._recorder.status,
-            "record.save": self._save,
+            "record.rename": self._rename,
             "record.delete": self._delete,
             "record.list": self._list,
             "record.note": self._note,
@@ -65,7 +65,7 @@ class RecorderVerbs:
         await self._recorder.settle()
         return self._recorder.status()
 
-    async def _save(self, name: str) -> RecorderStatus:
+    async def _rename(self, name: str) -> RecorderStatus:
         await self._recorder.save(name)
         return self._recorder.status()
 

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
-NAME: Final = re.compile(r"(\d{1,3})\.places\.json")
+NAME: Final = re.compile(r"(\d{1,3})\.plan\.json")
 RETRY_S: Final = 10.0
 """Interval of retries: short for a person who has freed disk space, no load for a failing disk."""
 TIMESTAMPS_NAME: Final = "signing-stamps.json"
@@ -73,7 +73,7 @@ class PlanFiles:
     def load(self) -> dict[int, StoredPlan]:
         """Read all files that can be read."""
         found: dict[int, StoredPlan] = {}
-        for file in sorted(self._folder.glob("*.places.json")):
+        for file in sorted(self._folder.glob("*.plan.json")):
             named = NAME.fullmatch(file.name)
             if named is None:
                 continue
@@ -152,7 +152,7 @@ class PlanFiles:
             self._report(vehicle_id, None)
 
     def _write(self, vehicle_id: int, plan: StoredPlan) -> None:
-        file = self._folder / f"{vehicle_id}.places.json"
+        file = self._folder / f"{vehicle_id}.plan.json"
         if vehicle_id in self.broken and file.exists():
             raise OSError(None, _broken(file))
         self._folder.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 
 from gateway import __version__
-from gateway.aircraft import AircraftSettings, migrate_sections
+from gateway.aircraft import AircraftSettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.files import MAX_UNPACKED, FlightError, Position, Progress, SettingsChoice
@@ -89,7 +89,7 @@ def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
 def settings_of(header: TableHeader) -> AircraftSettings:
     """Return the settings that were used to record a table."""
     sections = {**header.settings, "calibration": header.calibration}
-    return msgspec.convert(migrate_sections(sections)[0], AircraftSettings)
+    return msgspec.convert(sections, AircraftSettings)
 
 
 def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:

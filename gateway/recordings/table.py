@@ -44,8 +44,6 @@ FORMAT_LINE: Final = f"{FORMAT_PREFIX}1"
 HEADER_PREFIX: Final = "# header: "
 STATE_PREFIX: Final = "# state: "
 NOTE_PREFIX: Final = "# note: "
-FORMER_NOTE_PREFIX: Final = "# mark: "
-"""Prefix of notes in older tables, in which they were called marks."""
 NODE_PREFIX: Final = "# node: "
 
 HEAD_LINES: Final = 3
@@ -60,8 +58,6 @@ TimeUs = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
 IntArray = NDArray[np.int64]
 NOTE: Final = "Note: "
 """Prefix of the STATUSTEXT with an operator's remark."""
-FORMER_NOTE: Final = "Mark: "
-"""The prefix in older recordings."""
 NO_ROWS: Final = np.empty((0, len(COLUMNS)))
 BLOCK_ROWS: Final = 1000
 """Number of another program's rows that are converted to columns at a time."""
@@ -109,7 +105,6 @@ _COMMENTS: Final[dict[str, Any]] = {
     HEADER_PREFIX: TableHeader,
     STATE_PREFIX: FusionState,
     NOTE_PREFIX: TableNote,
-    FORMER_NOTE_PREFIX: TableNote,
     NODE_PREFIX: NodeStatus,
 }
 

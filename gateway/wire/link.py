@@ -363,7 +363,7 @@ def _node_status(
         time_us=time_us,
         node=header.node,
         node_time_us=header.node_time_us,
-        chips=() if chips is None else chip_names(chips, status.sensors_present),
+        chips=chip_names(chips, status.sensors_present),
         **fields,
     )
 

@@ -75,8 +75,6 @@ _IMU: Final = struct.Struct("<3h3h3hhHB")
 _BARO: Final = struct.Struct("<Ih")
 _GPS_FIX: Final = struct.Struct("<Iiii3hBB")
 _GPS_QUALITY: Final = struct.Struct("<IHHHHHhBBBBBBBB")
-_NODE_STATUS_1_0: Final = struct.Struct("<BBBBBHHHHHH")
-"""Layout of firmware 1.0, without the chips."""
 _NODE_STATUS: Final = struct.Struct("<BBBBBHHHHHHBBBBH")
 _RECEIVER_HEAD: Final = struct.Struct("<BBHB")
 _PIPE: Final = struct.Struct("<IIH")
@@ -232,8 +230,7 @@ class NodeStatusPayload(msgspec.Struct, frozen=True, gc=False):
     sample_rate_hz: int
     supply_mv: int
     radio: RadioState = RadioState.OK
-    chips: Chips | None = None
-    """None from firmware 1.0, which does not report them."""
+    chips: Chips = Chips()
 
 
 Payload = ImuPayload | BaroPayload | GpsFixPayload | GpsQualityPayload | NodeStatusPayload
@@ -440,8 +437,6 @@ def _encode_quality(payload: GpsQualityPayload) -> bytes:
 def _encode_node_status(payload: NodeStatusPayload) -> bytes:
     version, cause, *counts, radio, chips = msgspec.structs.astuple(payload)
     values = (*version, cause | radio << _RADIO_SHIFT, *counts)
-    if chips is None:
-        return _NODE_STATUS_1_0.pack(*values)
     return _NODE_STATUS.pack(*values, *msgspec.structs.astuple(chips))
 
 
@@ -478,8 +473,9 @@ def _read_node_status(words: tuple[int, ...]) -> NodeStatusPayload:
     major, minor, cause, present, failed, bus, unsent, resent, loop, rate, supply = words[:11]
     counts = (present, failed, bus, unsent, resent, loop, rate, supply)
     radio = RadioState(cause >> _RADIO_SHIFT)
-    chips = Chips(*words[11:]) if len(words) > 11 else None
-    return NodeStatusPayload((major, minor), cause & _RESET_MASK, *counts, radio, chips)
+    return NodeStatusPayload(
+        (major, minor), cause & _RESET_MASK, *counts, radio, Chips(*words[11:])
+    )
 
 
 _KINDS: Final = frozenset(PayloadKind)
@@ -492,9 +488,7 @@ _BODIES: Final[dict[tuple[int, int], tuple[_Unpack, _Read]]] = {
         (PayloadKind.BARO, _BARO, lambda words: BaroPayload(*words)),
         (PayloadKind.GPS_FIX, _GPS_FIX, _read_gps_fix),
         (PayloadKind.GPS_QUALITY, _GPS_QUALITY, _read_gps_quality),
-        (PayloadKind.NODE_STATUS, _NODE_STATUS_1_0, _read_node_status),
         (PayloadKind.NODE_STATUS, _NODE_STATUS, _read_node_status),
     )
 }
-"""Decoders by first byte and size of the body: extended payloads are also read in their old
-size."""
+"""Decoders by first byte and size of the body."""

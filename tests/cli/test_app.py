@@ -12,7 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from gateway.cli.app import COMMANDS, FORMER, GROUPS, MODULES, MOVED, app, hoisted, load_command
+from gateway.cli.app import COMMANDS, GROUPS, MODULES, app, hoisted, load_command
 from tests.kit.cli import invoke, run
 from tests.kit.process import python
 
@@ -96,24 +96,6 @@ def test_settings_file_is_read_wherever_it_is_named(words: str, tmp_path: Path) 
     assert f"{file}: cannot be read" in found.output
     # Another call starts from nothing.
     assert str(file) not in invoke("info", "x").output
-
-
-@pytest.mark.parametrize(
-    ("words", "former", "present"),
-    [(words, *pair) for words, names in FORMER.items() for pair in names.items()],
-)
-def test_former_option_leads_to_the_present_one(words: str, former: str, present: str) -> None:
-    # With the help, so that the command does nothing.
-    found = invoke(*words.split(), f"{former}=recorded", "--help")
-    assert f"{former} is called {present} now" in found.output
-    assert "No such option" not in found.output
-
-
-@pytest.mark.parametrize(("words", "present"), MOVED.items())
-def test_former_command_ends_with_its_successor(words: str, present: str) -> None:
-    found = invoke(*words.split(), "anything", "--at-all", code=2)
-    assert f"use `mavgate {present}`" in found.output
-    assert tuple(present.split()) in ALL
 
 
 @pytest.mark.parametrize(

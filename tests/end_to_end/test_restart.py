@@ -54,10 +54,10 @@ def find(port: int) -> tuple[int, int, int]:
 def texts_until_file_is_named(client: Client) -> list[str]:
     """Return texts and message names up to the text that names the file."""
     texts = [""]
-    while "1.places.json" not in texts[-1]:
+    while "1.plan.json" not in texts[-1]:
         assert len(texts) < 20_000, texts
         texts += [getattr(m, "text", m.get_type()) for m in client.receive()]
-        texts = texts[: next((n + 1 for n, t in enumerate(texts) if "1.places.json" in t), None)]
+        texts = texts[: next((n + 1 for n, t in enumerate(texts) if "1.plan.json" in t), None)]
     return texts
 
 
@@ -95,13 +95,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 async def test_broken_file_is_reported_when_the_aircraft_appears(
     folder: Path, connect: Callable[..., Client]
 ) -> None:
-    file = folder / "aircraft" / "1.places.json"
+    file = folder / "aircraft" / "1.plan.json"
     file.parent.mkdir()
     file.write_text("{")
     # It listens before the gateway begins: a later client may miss the text.
     client = connect(port := free_port())
     texts = await run(folder, lambda _: texts_until_file_is_named(client), f"udp:127.0.0.1:{port}")
-    assert texts[-1].startswith("Mission, mark and home not stored: 1.places.json")
+    assert texts[-1].startswith("Mission, mark and home not stored: 1.plan.json")
     assert "HEARTBEAT" in texts, "ground stations show no text before it"
     assert file.read_text() == "{"
 
@@ -109,4 +109,4 @@ async def test_broken_file_is_reported_when_the_aircraft_appears(
 async def test_missions_and_home_survive_a_restart(folder: Path) -> None:
     await run(folder, store)
     assert await run(folder, find) == (475_000_000, 85_000_000, 400_000)
-    assert [f.name for f in (folder / "aircraft").iterdir()] == ["1.places.json"]
+    assert [f.name for f in (folder / "aircraft").iterdir()] == ["1.plan.json"]

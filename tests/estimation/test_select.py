@@ -1,10 +1,9 @@
-"""The choice of an estimator, and settings of earlier versions."""
+"""The choice of an estimator."""
 
 from typing import Any
 
 import pytest
 
-from gateway.aircraft import migrate_sections
 from gateway.estimation.eskf.settings import EskfSettings
 from gateway.estimation.select import EstimationSettings, make_estimator
 from tests.estimation.samples import imu, times
@@ -27,16 +26,3 @@ def test_field_norm_tolerance_reaches_the_filter(tolerance: float, disturbed: in
         strength = 1.0 if time_us < 9_000_000 else 4.0 / 3.0
         estimator.update_imu(imu(time_us, mag=(21.0 * strength, 0.0, 43.0 * strength)))
     assert estimator.state.mag_disturbed == disturbed
-
-
-def test_former_sections_are_migrated_with_a_remark_each() -> None:
-    eskf = {"mag_bias_ut": 2.0, "gps_position_m": 3.0}
-    old = {
-        "sensing": {"accel_cutoff_hz": 5.0, "nominal_rate_hz": 50.0},
-        "estimation": {"estimator": "complementary", "rest": {"time_s": 2.0}, "eskf": eskf},
-    }
-    present, remarks = migrate_sections(old)
-    found = {"paper": {"accel_cutoff_hz": 5.0}, "eskf": {"gps_position_m": 3.0}}
-    assert present == {"estimation": {"estimator": "eskf", **found}}
-    assert len(remarks) == 4
-    assert migrate_sections(present) == (present, [])

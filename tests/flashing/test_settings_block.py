@@ -20,13 +20,12 @@ from gateway.flashing.boards import (
 from gateway.wire.framing import crc16
 
 HEAD = "01 10 01 02 05 03 02 50 fa00 01 3c 04030201 01 03 00 0a 06 01 0000"
-"""Program, MHz, firmware 1.2, and the fields of version 1."""
+"""Program, MHz, firmware 1.2, and the fields up to those of LoRa."""
 LORA = "01 7aa10600 f401 09 08 11 34 01"
-BLOCK = MAGIC + b"\x02" + bytes.fromhex(HEAD + LORA)
-NRF24_BLOCK = MAGIC + b"\x02" + bytes.fromhex(HEAD + "00" + LORA[2:])
-BLOCK_1 = MAGIC + b"\x01" + bytes.fromhex(HEAD)
+BLOCK = MAGIC + b"\x01" + bytes.fromhex(HEAD + LORA)
+NRF24_BLOCK = MAGIC + b"\x01" + bytes.fromhex(HEAD + "00" + LORA[2:])
 """Written by hand from firmware/common/settings_block.h."""
-SETTINGS_1 = BoardSettings(
+SETTINGS = BoardSettings(
     vehicle_id=5,
     node_id=3,
     radio_pipe=2,
@@ -41,9 +40,6 @@ SETTINGS_1 = BoardSettings(
     gps_rate_hz=10,
     gps_dynamic_model=6,
     soft_restart=True,
-)
-SETTINGS = msgspec.structs.replace(
-    SETTINGS_1,
     radio="sx1276",
     lora_frequency_khz=434_554,
     lora_bandwidth_khz=500,
@@ -68,10 +64,6 @@ def test_block_is_found_and_every_field_decoded() -> None:
     assert (found.offset, found.program) == (104, Program.IMU)
     assert (found.clock_mhz, found.firmware_version) == (16, (1, 2))
     assert found.settings == SETTINGS
-
-
-def test_block_of_version_1_is_that_of_an_nrf24() -> None:
-    assert find_block(image_with(with_crc(BLOCK_1))).settings == SETTINGS_1
 
 
 def test_patch_changes_the_block_alone_and_reads_back() -> None:

@@ -46,9 +46,9 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(
     bench.send(make_frames(9))
     assert (await ask(server, "record.note", text="here"))["ok"]
     await bench.recorder.settle()
-    saved = await ask(server, "record.save", name="first")
+    saved = await ask(server, "record.rename", name="first")
     assert saved["result"]["name"] == "first"
-    assert not (await ask(server, "record.save", name="../x"))["ok"]
+    assert not (await ask(server, "record.rename", name="../x"))["ok"]
     refused = await ask(server, "record.delete", name="last")
     assert refused["error"] == "first is being recorded; stop it first"
     stopped = (await ask(server, "record.stop"))["result"]

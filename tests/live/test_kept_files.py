@@ -48,7 +48,7 @@ async def test_saved_plans_are_loaded(bench: Bench) -> None:
     assert bench.read() == {1: FIRST, 31: SECOND}
     await bench.save(1, SECOND)
     assert bench.read() == {1: SECOND, 31: SECOND}
-    assert sorted(f.name for f in bench.folder.iterdir()) == ["1.places.json", "31.places.json"]
+    assert sorted(f.name for f in bench.folder.iterdir()) == ["1.plan.json", "31.plan.json"]
 
 
 async def test_only_the_newest_of_many_plans_is_written(
@@ -118,12 +118,12 @@ async def test_unwritable_plan_does_not_delay_others(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await bench.save(2, FIRST)
-    file = bench.folder / "1.places.json"
+    file = bench.folder / "1.plan.json"
     file.write_text("{")
     bench.files.load()
     bench.files.save(1, FIRST)
     await bench.save(2, SECOND)
-    assert bench.files.broken == {1: "1.places.json is broken: repair or remove it"}
+    assert bench.files.broken == {1: "1.plan.json is broken: repair or remove it"}
     file.unlink()
     assert bench.read() == {2: SECOND}
     await bench.save(2, FIRST)
@@ -135,13 +135,13 @@ async def test_broken_plan_is_reported_and_not_overwritten(
     bench: Bench, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     await bench.save(2, SECOND)
-    file = bench.folder / "1.places.json"
+    file = bench.folder / "1.plan.json"
     file.write_bytes(content)
     assert bench.files.load() == {2: SECOND}
     assert f"{file} cannot be read and is left alone: " in caplog.text
     await bench.save(1, FIRST)
     assert file.read_bytes() == content
-    assert bench.reports == [(1, "1.places.json is broken: repair or remove it")]
+    assert bench.reports == [(1, "1.plan.json is broken: repair or remove it")]
     file.unlink()
     await bench.save(1, FIRST)
     assert bench.read() == {1: FIRST, 2: SECOND}
@@ -149,7 +149,7 @@ async def test_broken_plan_is_reported_and_not_overwritten(
 
 async def test_files_with_other_names_are_ignored(bench: Bench) -> None:
     await bench.save(1, FIRST)
-    for name in ("x.places.json", "1.places.json.bak", "12345.places.json", "1.places.new"):
+    for name in ("x.plan.json", "1.plan.json.bak", "12345.plan.json", "1.plan.new"):
         (bench.folder / name).write_text("nonsense")
     assert bench.files.load() == {1: FIRST}
     assert bench.reports == []

@@ -169,21 +169,6 @@ def test_settings_of_another_version_are_refused() -> None:
         settings_of(TableHeader(settings={"estimation": {"wings": 2}}))
 
 
-def test_settings_of_earlier_versions_are_migrated() -> None:
-    old = {
-        "sensing": {"accel_cutoff_hz": 5.0, "nominal_rate_hz": 50.0},
-        "estimation": {
-            "estimator": "complementary",
-            "complementary": {"tau_s": 3.0},
-            "eskf": {"mag_bias_ut": 2.0, "gps_position_m": 3.0},
-        },
-    }
-    estimation = settings_of(TableHeader(settings=old)).estimation
-    assert estimation.estimator == "eskf"
-    assert estimation.paper.accel_cutoff_hz == 5.0
-    assert estimation.eskf.gps_position_m == 3.0
-
-
 def test_interpolated_positions_lie_on_the_line_between_the_fixes(rng: np.random.Generator) -> None:
     first, second = make_fix(1_000_000, rng), make_fix(2_000_000, rng)
     first = msgspec.structs.replace(first, lon_dege7=1_799_999_000, alt_amsl_m=10.0)

@@ -64,7 +64,7 @@ def rename(
 ) -> None:
     """Rename a recording; nothing is ever overwritten."""
     if recording is None and is_running():
-        _show(ask("record.save", {"name": name}))
+        _show(ask("record.rename", {"name": name}))
         return
     renamed = rename_recording(_folder(), recording or "last", name)
     console_of().print(f"{renamed.name}: {counted(len(renamed.files), 'file')} in {_folder()}")

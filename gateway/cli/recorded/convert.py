@@ -8,7 +8,6 @@ from typing import Annotated, Any, Final, Literal
 
 import typer
 
-from gateway.aircraft import DEPRECATED
 from gateway.cli.support.options import CONFIG, output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     BesideOption,
@@ -260,9 +259,6 @@ def _check_edits(edits: TlogEdits, output: Path, message: list[str], system: lis
 
 
 def _known_estimator(name: str | None) -> str | None:
-    if name in DEPRECATED:
-        name, former = DEPRECATED[name], name
-        typer.echo(f"--estimator {former} is deprecated; using {name}", err=True)
     if name is not None and name not in ESTIMATORS:
         raise typer.BadParameter(f"unknown estimator {name!r}; choose {', '.join(ESTIMATORS)}")
     return name

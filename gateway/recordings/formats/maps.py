@@ -17,7 +17,7 @@ from gateway.geometry.quaternion import to_euler
 from gateway.recordings.columns import TableRow
 from gateway.recordings.moment import iso_time
 from gateway.recordings.recorded_table import RecordedTable
-from gateway.recordings.table import FORMER_NOTE, NOTE, TableNote
+from gateway.recordings.table import NOTE, TableNote
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.records import FusionState, GpsFix, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, US_PER_S
@@ -326,7 +326,7 @@ class _Drawing:
             if marked := _MARKED.fullmatch(text):
                 lat_deg, lon_deg = map(float, marked.groups())
                 at = replace(at, lat_deg=lat_deg, lon_deg=lon_deg)
-            note = text.removeprefix(NOTE).removeprefix(FORMER_NOTE)
+            note = text.removeprefix(NOTE)
             others = MarkerKind.NOTE if note != text else MarkerKind.EVENT
             kind = MarkerKind.MARK if marked else others
             self.track.markers.append(MapMarker(kind, note, at))

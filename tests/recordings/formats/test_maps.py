@@ -259,12 +259,6 @@ def test_points_have_the_attitude_of_their_time() -> None:
     assert [p.attitude_deg for p in two.points] == [None, (0.0, 0.0, 0.0)]
 
 
-@pytest.mark.parametrize("said", ["Note: lake", "Mark: lake"])
-def test_notes_of_former_recordings_are_notes_too(said: str) -> None:
-    (track,) = drawn([(ONE, position(1)), (ONE, text(said))])
-    assert (MarkerKind.NOTE, "lake") in markers(track)
-
-
 def test_tracks_of_frames_have_home_marks_and_events() -> None:
     one, _ = drawn()
     assert markers(one) == [
