@@ -28,9 +28,10 @@ from gateway.vehicle.plan import KINDS
 from gateway.vehicle_state.senders import AUTOPILOT, FIRST_GROUND_STATION, Senders, is_station
 from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.frame_editing import edit_frame
-from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, TARGET_OFFSETS, ids_of
+from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, ids_of
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 from gateway.wire.recorded_frames import Batch, IntArray, fields_of, payload_of
+from gateway.wire.vehicle_inputs import REQUESTS, UNADDRESSED_INPUTS
 
 PARAM_VALUE_ID: Final = MESSAGE_IDS["PARAM_VALUE"]
 AUTOPILOT_VERSION_ID: Final = MESSAGE_IDS["AUTOPILOT_VERSION"]
@@ -50,24 +51,9 @@ Items = tuple[bytes, ...]
 Value = TypeVar("Value")
 
 
-_REPORTS: Final = ids_of(
-    "COMMAND_ACK", "MISSION_ACK", "PARAM_ERROR", "MOUNT_STATUS", "CAMERA_STATUS",
-    "CAMERA_FEEDBACK", "GIMBAL_REPORT", "GIMBAL_TORQUE_CMD_REPORT",
-    "GIMBAL_DEVICE_ATTITUDE_STATUS", "OPEN_DRONE_ID_BASIC_ID", "OPEN_DRONE_ID_LOCATION",
-    "OPEN_DRONE_ID_AUTHENTICATION", "OPEN_DRONE_ID_SELF_ID", "OPEN_DRONE_ID_SYSTEM",
-    "OPEN_DRONE_ID_OPERATOR_ID", "OPEN_DRONE_ID_MESSAGE_PACK",
-)  # fmt: skip
-"""Messages with a target that are not requests."""
-_ASKING: Final = TARGET_OFFSETS.keys() - _REPORTS
-_FEEDING: Final = ids_of(
-    "GPS_RTCM_DATA", "GPS_INPUT", "HIL_CONTROLS", "HIL_RC_INPUTS_RAW", "HIL_SENSOR",
-    "HIL_GPS", "HIL_OPTICAL_FLOW", "HIL_ACTUATOR_CONTROLS", "HIL_STATE_QUATERNION",
-    "GLOBAL_VISION_POSITION_ESTIMATE", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE",
-    "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY", "LANDING_TARGET",
-    "OBSTACLE_DISTANCE", "OBSTACLE_DISTANCE_3D", "DISTANCE_SENSOR", "OPTICAL_FLOW",
-    "OPTICAL_FLOW_RAD", "FOLLOW_TARGET", "TERRAIN_DATA",
-)  # fmt: skip
-"""Inputs of an autopilot from other components; sent by the autopilot itself, telemetry."""
+_FEEDING: Final = UNADDRESSED_INPUTS - ids_of("RADIO_STATUS", "RADIO")
+"""Inputs of an autopilot from other components; sent by the autopilot itself, telemetry. The state
+of a radio is played: stations show it."""
 ANSWERS: Final = np.array(sorted(ids_of(
     "COMMAND_ACK", "MISSION_ACK", "MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT",
     "MISSION_REQUEST", "MISSION_REQUEST_INT", "PARAM_VALUE", "PARAM_ERROR",
@@ -75,7 +61,7 @@ ANSWERS: Final = np.array(sorted(ids_of(
     "PING", "TIMESYNC",
 )))  # fmt: skip
 """Answers to a recorded station; a live station could take them for answers to its requests."""
-_LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
+_LOOKED_AT: Final = np.array(sorted(REQUESTS | _FEEDING))
 _KEPT: Final = ids_of(
     "PARAM_VALUE", "GPS_GLOBAL_ORIGIN", "AUTOPILOT_VERSION", "HOME_POSITION", "PROTOCOL_VERSION",
     "AVAILABLE_MODES",
@@ -92,7 +78,7 @@ def is_command(frame: bytes, senders: Senders) -> bool:
     if message_id in _FEEDING:
         system, component = origin_of(frame)
         return component != senders.vehicle(system).component
-    if message_id not in _ASKING:
+    if message_id not in REQUESTS:
         return False
     target = frame_of(frame).target[0]
     return target < FIRST_GROUND_STATION and target not in {s >> 8 for s in stations}
