@@ -169,7 +169,10 @@ class TimestampFile:
     def __init__(self, folder: Path) -> None:
         self._file = folder / TIMESTAMPS_NAME
         self._worker = begin_worker("timestamps")
-        self._waiting: Kept | None = None
+        self._newest: Kept = {}
+        """Set by the event loop alone, and read by the worker."""
+        self._written: Kept | None = None
+        """The last timestamps that were written; of the worker alone."""
         self._is_reported = False
 
     def load(self) -> Kept:
@@ -190,9 +193,8 @@ class TimestampFile:
 
     def save(self, timestamps: Kept) -> None:
         """Store timestamps; returns at once. Only the newest ones are written."""
-        is_busy, self._waiting = self._waiting is not None, timestamps
-        if not is_busy:
-            self._worker.submit(self._write)
+        self._newest = timestamps
+        self._worker.submit(self._write)
 
     def close(self, timestamps: Kept) -> None:
         """Write the last timestamps, if any, and end."""
@@ -201,14 +203,16 @@ class TimestampFile:
         self._worker.shutdown(wait=True)
 
     def _write(self) -> None:
-        timestamps, self._waiting = self._waiting, None
+        newest = self._newest
+        if newest is self._written:
+            return
         try:
             self._file.parent.mkdir(parents=True, exist_ok=True)
-            text = msgspec.json.encode({str(key): kept for key, kept in (timestamps or {}).items()})
+            text = msgspec.json.encode({str(key): kept for key, kept in newest.items()})
             write_new(self._file, [text], overwrite=True, rights=PRIVATE)
         except OSError as error:
             if not self._is_reported:
                 log.warning("%s cannot be written: %s", self._file, reason_of(error))
             self._is_reported = True
         else:
-            self._is_reported = False
+            self._written, self._is_reported = newest, False

@@ -4,8 +4,11 @@ import asyncio
 import errno
 import os
 import stat
+import sys
+from collections import deque
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from types import CodeType, FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -173,6 +176,59 @@ def test_saved_timestamps_are_loaded(tmp_path: Path) -> None:
     file.close(TIMESTAMPS)
     assert TimestampFile(tmp_path / "new").load() == TIMESTAMPS
     assert stat.S_IMODE((tmp_path / "new" / TIMESTAMPS_NAME).stat().st_mode) == 0o600
+
+
+def is_switched(
+    action: Callable[[], None], code: CodeType, at: int, other: Callable[[], None]
+) -> bool:
+    """Call `other` before instruction `at` of a function; return whether it has so many."""
+    left = at
+
+    def trace(frame: FrameType, event: str, _: object) -> Any:
+        nonlocal left
+        if frame.f_code is not code:
+            return None
+        frame.f_trace_opcodes = True
+        left -= event == "opcode"
+        if event == "opcode" and left == 0:
+            other()
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        action()
+    finally:
+        sys.settrace(before)
+    return left <= 0
+
+
+@pytest.mark.parametrize("is_saving", [True, False], ids=["save", "write"])
+def test_thread_switch_at_any_instruction_loses_no_timestamps(
+    tmp_path: Path, is_saving: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    jobs: deque[Callable[[], None]] = deque()
+    file, number, at, is_inside = TimestampFile(tmp_path), 0, 0, True
+    monkeypatch.setattr(file, "_worker", SimpleNamespace(submit=jobs.append))
+
+    def save() -> None:
+        nonlocal number
+        number += 1
+        file.save({1: {"ff": {"0.255.190": number}}})
+
+    def work() -> None:
+        while jobs:
+            jobs.popleft()()
+
+    while is_inside:
+        at += 1
+        save()
+        if is_saving:
+            is_inside = is_switched(save, TimestampFile.save.__code__, at, work)
+        else:
+            is_inside = is_switched(work, TimestampFile._write.__code__, at, save)
+        work()
+        assert file.load() == {1: {"ff": {"0.255.190": number}}}, at
 
 
 def test_closing_without_timestamps_leaves_the_file_unchanged(tmp_path: Path) -> None:
