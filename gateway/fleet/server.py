@@ -65,7 +65,7 @@ class SiteClient(Client):
     translation: FrameTranslation
     tokens: set[str] = field(default_factory=set)
     """Its sessions by Zenoh's liveliness; more than one means several sites of the same name."""
-    may_return = False
+    may_return = is_measured = False
 
     @property
     def is_here(self) -> bool:

@@ -153,6 +153,14 @@ def is_loopback(host: str) -> bool:
     return address is not None and address.is_loopback
 
 
+def is_of_this_machine(host: str, local_host: str) -> bool:
+    """Return whether a datagram from `host` to our address `local_host` was sent on this machine.
+
+    The kernel accepts datagrams of its own addresses from no network.
+    """
+    return is_loopback(host) or _address(host) == _address(local_host)
+
+
 class EndpointKind(StrEnum):
     """How an endpoint reaches its peers; the word before the URL's first colon."""
 

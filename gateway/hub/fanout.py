@@ -263,15 +263,33 @@ class Fanout:
         self, frame: MavFrame, sequence: int, client_ids: Collection[int], now_us: int
     ) -> None:
         """Send one of our own frames to some clients only, past their filters."""
+
+        def gets(each: _Subscription) -> bool:
+            is_one = each.client.client_id in client_ids
+            return (is_one or each.client.endpoint.monitor) and each.carries(frame)
+
+        self._send_some(frame, sequence, gets, now_us)
+
+    def measure(self, frame: MavFrame, client_ids: Collection[int], now_us: int) -> None:
+        """Send a frame that measures a round trip to some clients, whatever systems they select."""
+
+        def gets(each: _Subscription) -> bool:
+            client = each.client
+            return client.client_id in client_ids and client.endpoint.passes(frame.message_id)
+
+        self._send_some(frame, frame.sequence, gets, now_us)
+
+    def _send_some(
+        self, frame: MavFrame, sequence: int, gets: Callable[[_Subscription], bool], now_us: int
+    ) -> None:
+        """Send a frame of ours to some clients, and leave no gap in the numbers of the others."""
         # A copy: a client that breaks at this frame removes itself.
-        for client_id, subscription in tuple(self._subscriptions.items()):
+        for subscription in tuple(self._subscriptions.values()):
             gap = subscription.gap_of(frame.origin)
-            wanted = client_id in client_ids or subscription.client.endpoint.monitor
-            if wanted and subscription.carries(frame):
+            if gets(subscription):
                 subscription.answered += len(frame.data)
                 number = sequence - gap.skipped & SEQUENCE_MASK
-                copy = self._signer.sequence_and_sign(frame, number, now_us)
-                subscription.client.send(copy)
+                subscription.client.send(self._signer.sequence_and_sign(frame, number, now_us))
             else:
                 gap.skip()
 

@@ -3,21 +3,20 @@
 import asyncio
 import contextlib
 import logging
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
-from pymavlink.dialects.v20 import all as dialect
 
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout
 from gateway.hub.forwarding import Forwarding
 from gateway.hub.forwarding_step import MOST
 from gateway.hub.limits import TokenBucket
-from gateway.hub.round_trip import PROBE_COMPONENT, RoundTrip
+from gateway.hub.round_trip import RoundTrip
 from gateway.hub.router import Router
 from gateway.hub.routing_table import Origin, OwnVehicles
 from gateway.hub.send_queue import NOT_TELEMETRY_IDS, Numbering
@@ -92,9 +91,6 @@ class Hub:
         HIGH_LATENCY2 is sent like all other messages.
     """
 
-    _own_sequence = 0
-    """Sequence number of the next message of the gateway itself."""
-
     def __init__(
         self,
         settings: HubSettings,
@@ -125,7 +121,7 @@ class Hub:
         self._share_reads()
         self._fanout = Fanout(signer, self.forwarding, on_foreign, is_recording=keeps_order)
         self.finish_run, self.update_buffer = self._fanout.finish_run, self._fanout.update_buffer
-        self._round_trip = RoundTrip(signer)
+        self._round_trip = RoundTrip()
         self._vehicles = OwnVehicles()
         self.greet = self._vehicles.await_greeting
         self._router = Router(
@@ -139,7 +135,7 @@ class Hub:
             rejects,
         )
         self.deliver = self._router.deliver
-        self._ping_us = self._alerts_us = 0
+        self._ping_us = self._proof_us = self._alerts_us = 0
         self._timer: asyncio.TimerHandle | None = None
         self._gathering: dict[float, list[Callable[[], None]]] = {}
         """Callbacks to flush, by their wait."""
@@ -250,12 +246,10 @@ class Hub:
         now_us, systems = self.now_us(), self.routed_vehicles()
         for message in messages:
             for system in systems:
-                sender = dialect.MAVLink(None, system, PROBE_COMPONENT)
-                frame = frame_of(bytes(message.pack(sender)))
-                self._fanout.publish(frame, self._own_sequence, now_us)
+                frame = self._round_trip.encode(message, system)
+                self._fanout.publish(frame, frame.sequence, now_us)
                 if self._on_foreign is not None:
                     self._on_foreign((frame.data,))
-            self._own_sequence = self._own_sequence + 1 & 0xFF
         return bool(systems)
 
     def set_interval(self, request: ClientInterval) -> None:
@@ -410,9 +404,6 @@ class Hub:
                 for before, each in zip(range(len(passing), 0, -1), passing, strict=True):
                     number = sequence - before & 0xFF
                     client.send(self.signer.sequence_and_sign(each, number, now_us))
-                if not client.is_proven:
-                    # Its answer proves that it receives.
-                    self._ask_round_trip([client], frame.origin[0], now_us)
 
     def _tick(self) -> None:
         # Scheduled first, so that the next tick follows even if an error is raised below.
@@ -426,13 +417,11 @@ class Hub:
             self._tick_one(client, now_us)
         self._router.links.expire(now_us)
         self._fanout.thin(now_us)
-        interval_us = round(self.settings.ping_interval_s * US_PER_S)
         # One of the two per tick: each takes as long as several frames.
         if now_us - self._alerts_us >= US_PER_S:
             self._alerts_us = now_us
             self._report_alerts(now_us)
-        elif interval_us and now_us - self._ping_us >= interval_us:
-            self._ping_us = now_us
+        else:
             self._measure_round_trips(now_us)
 
     def _tick_one(self, link: Client | Listener[Any], now_us: int) -> None:
@@ -458,23 +447,27 @@ class Hub:
             log.info("%s", line)
 
     def _measure_round_trips(self, now_us: int) -> None:
-        """Send round-trip requests to every client that sends; the others only receive."""
-        asked = [
-            client
-            for client in self._clients.values()
-            if client.heard_us is not None and not client.endpoint.monitor
-        ]
-        systems = self._vehicles.systems(now_us)
-        if not asked or not systems:
-            return
-        self._ask_round_trip(asked, systems[0], now_us)
-
-    def _ask_round_trip(self, clients: Iterable[Client], system: int, now_us: int) -> None:
-        requests = self._round_trip.ask(system, now_us)
-        for client in clients:
-            for frame in requests:
-                if client.endpoint.passes(frame.message_id):
-                    client.send(frame)
+        """Send requests to every client that sends; each second to one that has to prove itself."""
+        interval_us = round(self.settings.ping_interval_s * US_PER_S)
+        is_due = 0 < interval_us <= now_us - self._ping_us
+        if is_due:
+            self._ping_us = now_us
+        is_proof_due = now_us - self._proof_us >= US_PER_S
+        if is_proof_due:
+            self._proof_us = now_us
+        own = self._vehicles.systems(now_us)
+        systems = [*own, *sorted(self.routed_vehicles() - {*own})]
+        asked: defaultdict[int, set[int]] = defaultdict(set)
+        for client in self._clients.values():
+            endpoint = client.endpoint
+            if client.heard_us is None or endpoint.monitor or not client.is_measured:
+                continue
+            system = next(filter(endpoint.systems.has_system, systems), None)
+            if system is not None and (is_due or (is_proof_due and not client.is_proven)):
+                asked[system].add(client.client_id)
+        for system, client_ids in asked.items():
+            for frame in self._round_trip.ask(system, now_us):
+                self._fanout.measure(frame, client_ids, now_us)
 
 
 def _new_forwarding() -> Forwarding:

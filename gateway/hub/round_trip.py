@@ -2,25 +2,24 @@
 
 Some ground stations answer PING, others only TIMESYNC; both are sent. The requests come from a
 separate component, so they leave no gap in the sequence numbers of the vehicle, and no answer to
-the vehicle is mistaken for an answer to them. Requests of another gateway are answered by that
-component too and not forwarded: they measure this one link.
+the vehicle is mistaken for an answer to them. A gateway without a vehicle of its own sends them in
+the name of a system that it routes, because programs ignore frames of system 0. Requests of another
+gateway are answered by that component too and not forwarded: they measure this one link.
 """
 
-from collections import deque
+from collections import Counter, deque
 from typing import Final
 
 from pymavlink.dialects.v20 import all as dialect
 
-from gateway.hub.routing_table import Origin
 from gateway.records import EVERYBODY
 from gateway.units import NS_PER_US, US_PER_S
-from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
 PROBE_COMPONENT: Final = dialect.MAV_COMP_ID_USER75
 """The last id for private use; MAVROS and Cockpit use 240, that of the UDP bridge."""
-MAX_ASKED: Final = 64
-"""Rounds whose answers are recognised: those of a minute, one a second."""
+MAX_ASKED: Final = 256
+"""Rounds whose answers are recognised: those of a minute, some a second."""
 LONGEST_US: Final = 60 * US_PER_S
 """An answer to an older request is ignored."""
 NOBODY: Final = 0
@@ -29,45 +28,49 @@ MEASURING: Final = frozenset({dialect.MAVLINK_MSG_ID_PING, dialect.MAVLINK_MSG_I
 
 def is_of_gateway(frame: MavFrame) -> bool:
     """Return whether a frame is a round-trip request or answer of another gateway."""
-    return (
-        frame.origin[1] == PROBE_COMPONENT
-        and frame.message_id in MEASURING
-        and frame.target == EVERYBODY
-    )
+    return frame.origin[1] == PROBE_COMPONENT and frame.message_id in MEASURING
 
 
 class RoundTrip:
-    """Build round-trip requests and read the answers."""
+    """Build round-trip requests and read the answers; number all frames of the component."""
 
-    def __init__(self, signer: FrameSigner) -> None:
-        self._signer = signer
+    def __init__(self) -> None:
         self._sender = dialect.MAVLink(None, NOBODY, PROBE_COMPONENT)
         self._reader = dialect.MAVLink(None)
+        self._numbers: Counter[int] = Counter()
+        """Frames of the component so far, by system."""
         self._sent_us: deque[int] = deque(maxlen=MAX_ASKED)
 
-    @property
-    def origin(self) -> Origin:
-        """System and component that the requests come from; system 0 before the first."""
-        return self._sender.srcSystem, PROBE_COMPONENT
+    def encode(self, message: dialect.MAVLink_message, system: int) -> MavFrame:
+        """Return the next frame of the component in a system."""
+        self._sender.srcSystem, self._sender.seq = system, self._numbers[system] & 0xFF
+        self._numbers[system] += 1
+        return frame_of(bytes(message.pack(self._sender)))
 
     def ask(self, system: int, now_us: int) -> list[MavFrame]:
         """Build the requests of one round."""
-        self._sender.srcSystem = system
         self._sent_us.append(now_us)
         return [
-            self._encode(message, now_us)
-            for message in (
-                dialect.MAVLink_ping_message(now_us, self._sender.seq, 0, 0),
-                dialect.MAVLink_timesync_message(0, now_us * NS_PER_US),
-            )
+            self.encode(dialect.MAVLink_ping_message(now_us, self._numbers[system], 0, 0), system),
+            self.encode(dialect.MAVLink_timesync_message(0, now_us * NS_PER_US), system),
         ]
+
+    def is_returned(self, frame: MavFrame) -> bool:
+        """Return whether a frame is a request of ours that has come back."""
+        if not is_of_gateway(frame) or frame.origin[0] not in self._numbers:
+            return False
+        if (asked := self._decode(frame)) is None:
+            return False
+        if frame.message_id == dialect.MAVLINK_MSG_ID_PING:
+            return frame.target == EVERYBODY and asked.time_usec in self._sent_us
+        return asked.tc1 == 0 and asked.ts1 in (us * NS_PER_US for us in self._sent_us)
 
     def read(self, frame: MavFrame, now_us: int) -> int | None:
         """Return the round trip in microseconds if a frame answers a request of ours."""
         message_id = frame.message_id
         if message_id == dialect.MAVLINK_MSG_ID_PING:
             answer = self._decode(frame)
-            if answer is None or (answer.target_system, answer.target_component) != self.origin:
+            if answer is None or answer.target_component != PROBE_COMPONENT:
                 return None
             sent_us = answer.time_usec
         elif message_id == dialect.MAVLINK_MSG_ID_TIMESYNC:
@@ -83,23 +86,17 @@ class RoundTrip:
         return round_trip_us if 0 <= round_trip_us <= LONGEST_US else None
 
     def answer(self, frame: MavFrame, system: int, now_us: int) -> MavFrame | None:
-        """Answer a round-trip request of another gateway."""
-        asked = self._decode(frame) if is_of_gateway(frame) else None
-        if asked is None:
+        """Answer a round-trip request of another gateway; None if it is an answer itself."""
+        asked = self._decode(frame)
+        if asked is None or frame.target != EVERYBODY:
             return None
-        if asked.get_msgId() == dialect.MAVLINK_MSG_ID_PING:
-            message = dialect.MAVLink_ping_message(asked.time_usec, asked.seq, *frame.origin)
-        elif asked.tc1 == 0:
-            message = dialect.MAVLink_timesync_message(now_us * NS_PER_US, asked.ts1)
-        else:
-            return None
-        self._sender.srcSystem = system
-        return self._encode(message, now_us)
-
-    def _encode(self, message: dialect.MAVLink_message, now_us: int) -> MavFrame:
-        frame, sequence = frame_of(bytes(message.pack(self._sender))), self._sender.seq
-        self._sender.seq = (sequence + 1) % 256
-        return self._signer.sequence_and_sign(frame, sequence, now_us)
+        if frame.message_id == dialect.MAVLINK_MSG_ID_PING:
+            answer = dialect.MAVLink_ping_message(asked.time_usec, asked.seq, *frame.origin)
+            return self.encode(answer, system)
+        if asked.tc1 == 0:
+            answer = dialect.MAVLink_timesync_message(now_us * NS_PER_US, asked.ts1)
+            return self.encode(answer, system)
+        return None
 
     def _decode(self, frame: MavFrame) -> dialect.MAVLink_message | None:
         try:

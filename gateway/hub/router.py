@@ -14,11 +14,13 @@ from pymavlink.dialects.v20 import all as dialect
 from gateway.answers.answer_cache import AnswerCache
 from gateway.hub.fanout import Fanout
 from gateway.hub.limits import RequestQueue
-from gateway.hub.round_trip import NOBODY, RoundTrip, is_of_gateway
+from gateway.hub.round_trip import MAX_ASKED, NOBODY, RoundTrip, is_of_gateway
 from gateway.hub.routing_table import (
     LATE,
+    MEMORY_US,
     NEW,
     DuplicateFilter,
+    FrameMemory,
     Origin,
     OwnVehicles,
     RedundantLinks,
@@ -71,6 +73,8 @@ class Router:
         self._table = RoutingTable(fanout.clear)
         self._untrusted = RoutingTable(max_origins=MAX_UNTRUSTED_SYSTEMS)
         self._duplicates = DuplicateFilter()
+        self._round_trips: FrameMemory[int] = FrameMemory(MEMORY_US, MAX_ASKED)
+        """The first client that brought each round-trip request of another gateway."""
         self._requests = RequestQueue()
         self._cache = AnswerCache(context.signer)
         self._cache_timer: asyncio.TimerHandle | None = None
@@ -135,7 +139,7 @@ class Router:
         origin = frame.origin
         if self._rejects is not None and self._rejects(frame.data, now_us):
             return
-        if self._vehicles.is_own(origin, now_us) or origin == self._round_trip.origin:
+        if self._vehicles.is_own(origin, now_us) or self._round_trip.is_returned(frame):
             self.counters.looped += 1
             return
         round_trip_us = self._round_trip.read(frame, now_us)
@@ -143,26 +147,41 @@ class Router:
         if client.endpoint.systems and not (measures or self._admits(client, frame, now_us)):
             self.counters.unroutable += 1
             return
-        table = self._table if client.trusted else self._untrusted
-        # A gateway that has received no vehicle answers as system 0, to which nothing is sent.
-        is_nobody = measures and origin[0] == NOBODY
-        path = None if is_nobody else table.register(client.client_id, origin, now_us)
-        if path is not None and frame.message_id == HEARTBEAT_ID:
-            path.is_station = frame.is_station_heartbeat
         if round_trip_us is not None:
             client.round_trip_us = round_trip_us
             client.prove()
-            return
-        is_rejected = path is not None and self._is_rejected(client, path, frame, now_us)
-        if is_of_gateway(frame):
-            # Answered on each link, copies too, and never forwarded.
+        if not is_of_gateway(frame):
+            self._route(client, frame, now_us, is_answer=round_trip_us is not None)
+        elif round_trip_us is None:
+            # Its system has no path here: links are measured in the name of any system.
+            self._note_request(client, frame, now_us)
             self._ask(client, frame, forwarded=False)
-        elif is_rejected:
+
+    def _route(self, client: Client, frame: MavFrame, now_us: int, *, is_answer: bool) -> None:
+        """Route a frame of a system that is not ours, unless it answers the hub itself."""
+        table, origin = self._table if client.trusted else self._untrusted, frame.origin
+        path = table.register(client.client_id, origin, now_us)
+        if path is not None and frame.message_id == HEARTBEAT_ID:
+            path.is_station = frame.is_station_heartbeat
+        is_rejected = path is not None and self._is_rejected(client, path, frame, now_us)
+        if is_rejected or is_answer:
             return
-        elif frame.target[0]:
+        if frame.target[0]:
             self._route_addressed(client, frame, now_us)
         else:
             self._route_broadcast(client, path, frame, table.is_station(origin), now_us)
+
+    def _note_request(self, client: Client, frame: MavFrame, now_us: int) -> None:
+        """Pair two links that bring the same round-trip request of another gateway."""
+        if not client.trusted or frame.message_id != dialect.MAVLINK_MSG_ID_PING:
+            return
+        self._round_trips.turn(now_us)
+        content = (frame.key, frame.payload)
+        first = self._round_trips.get(content)
+        if first is None:
+            self._round_trips.put(content, client.client_id)
+        elif first != client.client_id:
+            self._pair(first, client, now_us)
 
     def _admits(self, client: Client, frame: MavFrame, now_us: int) -> bool:
         """Return whether the filter of a client's endpoint passes a frame received from it."""
@@ -226,14 +245,16 @@ class Router:
 
     def _register_link(self, first: int, client: Client, frame: MavFrame, now_us: int) -> None:
         """Pair two links that bring the same frame, if neither can have received it from us."""
-        for_us = frame.target[0] in self._vehicles.systems(now_us)
-        if not (for_us or is_of_gateway(frame)):
-            return
-        if self.links.register(first, client.client_id, now_us):
+        if frame.target[0] in self._vehicles.systems(now_us) and self._pair(first, client, now_us):
+            # The first request has been answered on one link only.
+            self._ask(client, frame, forwarded=False)
+
+    def _pair(self, first: int, client: Client, now_us: int) -> bool:
+        """Note that two links lead to one peer; return whether that is new."""
+        is_new = self.links.register(first, client.client_id, now_us)
+        if is_new:
             self._fanout.align(self.links.group(client.client_id))
-            if for_us:
-                # The first request has been answered on one link only.
-                self._ask(client, frame, forwarded=False)
+        return is_new
 
     def _keep(self, client: Client, frame: MavFrame, now_us: int) -> None:
         """Keep the answers of a client's vehicles, if its endpoint has the option `cache`."""
@@ -382,4 +403,4 @@ class Router:
             answer = self._round_trip.answer(frame, systems[0] if systems else NOBODY, now_us)
             if answer is not None:
                 self.charge(incoming.client_id, len(answer.data))
-                client.send(answer)
+                self._fanout.measure(answer, {client.client_id}, now_us)

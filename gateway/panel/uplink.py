@@ -233,7 +233,8 @@ class Uplink:
             for frame in frames:
                 self._handle(frame, played=played)
 
-        return Hub(HubSettings(endpoints=endpoints), on_frame, self._clock, on_foreign=on_foreign)
+        settings = HubSettings(endpoints=endpoints, ping_interval_s=0.0)
+        return Hub(settings, on_frame, self._clock, on_foreign=on_foreign)
 
     def _handle(self, frame: bytes, *, played: bool) -> None:
         if (origin_of(frame)[0] in self._fleet.origins) is not played:

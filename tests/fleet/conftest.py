@@ -17,12 +17,12 @@ from gateway.hub.settings import HubSettings
 from gateway.hub.transports.zenoh.session import open_session, presence_key, session_config
 from gateway.live.control_socket import request
 from tests.kit.cli import invoke
-from tests.kit.hub import Rig, Station, proven, rig
+from tests.kit.hub import Rig, Station, rig
 from tests.kit.mavlink import Sender
 from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
 
-__all__ = ["proven", "rig"]
+__all__ = ["rig"]
 
 
 class World:

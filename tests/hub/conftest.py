@@ -1,5 +1,5 @@
 """Fixtures of the hub's tests."""
 
-from tests.kit.hub import proven, rig
+from tests.kit.hub import rig
 
-__all__ = ["proven", "rig"]
+__all__ = ["rig"]

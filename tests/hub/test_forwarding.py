@@ -241,7 +241,7 @@ async def run(rig: Rig, seed: int) -> Any:
     ("seed", "mode"), [*((seed, MODES[2]) for seed in range(4)), (4, MODES[1]), (5, MODES[1])]
 )
 async def test_all_ways_of_forwarding_deliver_and_count_the_same(
-    seed: int, mode: str, proven: None, monkeypatch: pytest.MonkeyPatch
+    seed: int, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     results = []
     for each in (MODES[0], mode):

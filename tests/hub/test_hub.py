@@ -1,12 +1,14 @@
 """The hub between many endpoints: routing, loops, changes at run time, round trips."""
 
 import socket
+from collections import defaultdict
 from typing import Any
 
 import msgspec
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from gateway.hub.round_trip import PROBE_COMPONENT
 from gateway.hub.transports import stream
 from gateway.hub.transports.base import STALE_AFTER_US
 from gateway.wire.mavlink_messages import MESSAGE_IDS
@@ -321,3 +323,29 @@ async def test_round_trips_are_measured_at_each_interval(rig: Any) -> None:
     await rig.quiet()
     ids = [message_id_of(frame) for frame in station.received()]
     assert 9 <= ids.count(MESSAGE_IDS["PING"]) == ids.count(MESSAGE_IDS["TIMESYNC"]) <= 10
+
+
+async def test_frames_of_the_gateway_itself_have_no_gap_at_any_client(rig: Any) -> None:
+    """Requests, answers to another gateway, and texts have one numbering at each client."""
+    hub = rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=1.0)
+    vehicles = rig.station(hub.listening_ports()[0], origin=(1, 1))
+    gateway = rig.station(hub.listening_ports()[0], origin=(3, PROBE_COMPONENT))
+    stations = [vehicles, gateway, *(rig.station(hub.listening_ports()[0]) for _ in range(2))]
+    second, numbers = rig.sender(2), defaultdict(list)
+    for step in range(60):
+        vehicles.send(vehicles.sender.attitude(), second.attitude())
+        gateway.send(gateway.sender.pack(dialect.MAVLink_ping_message(step, step, 0, 0)))
+        for station in stations[2 : 3 + step // 20]:
+            station.send(station.sender.heartbeat())
+        await rig.quiet_some()
+        hub.say([dialect.MAVLink_statustext_message(6, b"text")])
+        rig.tick(hub, 0.5)
+        await rig.quiet_some()
+        for key, station in enumerate(stations):
+            for frame in map(frame_of, station.received()):
+                if frame.origin[1] == PROBE_COMPONENT:
+                    numbers[key, frame.origin].append(frame.sequence)
+    assert len(numbers) == 4 * 2 + 1, "texts of two systems to all, and answers to a gateway"
+    for key, found in numbers.items():
+        assert len(found) > 20, key
+        assert found == [(found[0] + step) % 256 for step in range(len(found))], key

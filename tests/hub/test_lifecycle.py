@@ -422,7 +422,7 @@ async def test_closed_hub_leaves_no_client_and_no_task(link: Link) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_uvloop_serves_every_transport_too(kind: str, proven: None) -> None:
+def test_uvloop_serves_every_transport_too(kind: str) -> None:
     uvloop = pytest.importorskip("uvloop")
 
     async def live() -> None:

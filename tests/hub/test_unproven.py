@@ -6,7 +6,10 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.hub.round_trip import PROBE_COMPONENT
+from gateway.hub.transports import udp_listen
 from gateway.hub.transports.datagram import UNPROVEN, UNPROVEN_FACTOR
+from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_splitter import MavFrame, frame_of, message_id_of
 from tests.kit.hub import FlyingHub, Rig, Station
 
 pytestmark = pytest.mark.io
@@ -14,9 +17,10 @@ pytestmark = pytest.mark.io
 SYSTEM = 7
 
 
-@pytest.fixture
-def proven() -> None:
-    """Let clients prove that they receive."""
+@pytest.fixture(autouse=True)
+def other_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the clients of UDP ports be on other machines."""
+    monkeypatch.setattr(udp_listen, "is_of_this_machine", lambda *_: False)
 
 
 class Port:
@@ -55,16 +59,17 @@ def request_of(port: Port) -> bytes:
     return port.station.sender.command(SYSTEM, 1)
 
 
+def answer_to(station: Station, ping: bytes) -> bytes:
+    """Answer a PING as MAVSDK does."""
+    asked = mavlink.MAVLink(None).decode(bytearray(ping))
+    target = asked.get_srcSystem(), asked.get_srcComponent()
+    return station.sender.pack(mavlink.MAVLink_ping_message(asked.time_usec, asked.seq, *target))
+
+
 def answer_of_ping(port: Port) -> bytes:
     """Answer the PING that has been received last."""
-    reader = mavlink.MAVLink(None)
-    asked = next(
-        message
-        for frame in reversed(port.frames)
-        if (message := reader.decode(bytearray(frame))).get_type() == "PING"
-    )
-    answer = mavlink.MAVLink_ping_message(asked.time_usec, asked.seq, SYSTEM, PROBE_COMPONENT)
-    return port.station.sender.pack(answer)
+    pings = [each for each in port.frames if message_id_of(each) == MESSAGE_IDS["PING"]]
+    return answer_to(port.station, pings[-1])
 
 
 def guessed_answer(port: Port) -> bytes:
@@ -77,7 +82,6 @@ def guessed_answer(port: Port) -> bytes:
     "datagrams",
     [
         pytest.param([lambda port: port.station.sender.heartbeat()], id="one heartbeat"),
-        pytest.param([request_of], id="one request"),
         pytest.param([lambda port: port.station.sender.heartbeat()] * 20, id="heartbeats"),
         pytest.param([guessed_answer] * 3, id="guessed answers"),
     ],
@@ -116,17 +120,71 @@ async def test_frame_that_depends_on_what_was_sent_opens_the_telemetry(
     assert port.received - before > 20 * port.sent
 
 
-async def test_station_that_asks_at_the_first_heartbeat_misses_nothing_of_it(rig: Rig) -> None:
+@pytest.mark.parametrize("is_one_datagram", [True, False])
+async def test_request_right_after_the_first_heartbeat_opens_the_telemetry(
+    rig: Rig, is_one_datagram: bool
+) -> None:
     port = Port(rig)
     await port.fly(1)
-    await port.send(port.station.sender.heartbeat())
-    await port.fly(0.1)
-    assert port.frames[0][7] == 0, "the vehicle's heartbeat is the first frame"
-    await port.send(request_of(port))
-    await port.fly(0.1)
+    frames = [port.station.sender.heartbeat(), request_of(port)]
+    port.station.send(*([b"".join(frames)] if is_one_datagram else frames))
+    await rig.quiet()
     assert port.state() == "open"
-    kinds = {int.from_bytes(frame[7:10], "little") for frame in port.frames}
+    await port.fly(4)
+    assert port.frames[0][7] == 0, "the vehicle's heartbeat is the first frame"
+    kinds = [int.from_bytes(frame[7:10], "little") for frame in port.frames]
     assert mavlink.MAVLINK_MSG_ID_COMMAND_ACK in kinds
+    assert len(kinds) > 100
+
+
+class Router:
+    """A gateway without vehicles of its own, five vehicles behind one port, and a station."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig, self.hub = rig, rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=0.0)
+        port = self.hub.listening_ports()[0]
+        self.link, self.station = rig.station(port), rig.station(port)
+        self.vehicles = [rig.sender(system) for system in range(11, 16)]
+        self.frames: list[MavFrame] = []
+
+    async def run(self, seconds: float) -> None:
+        """Let time pass: every vehicle sends at 10 Hz, and the station its heartbeats."""
+        for step in range(round(seconds * 10)):
+            if step % 10 == 0:
+                self.link.send(*(each.heartbeat() for each in self.vehicles))
+                self.station.send(self.station.sender.heartbeat())
+            self.link.send(*(each.attitude() for each in self.vehicles))
+            await self.rig.quiet()
+            self.rig.tick(self.hub, 0.1)
+            self.frames += map(frame_of, self.station.received())
+
+
+async def test_station_of_a_router_is_pinged_each_second_until_it_answers(rig: Rig) -> None:
+    router = Router(rig)
+    await router.run(4)
+    pings = [frame for frame in router.frames if frame.message_id == MESSAGE_IDS["PING"]]
+    assert len(pings) in (3, 4)
+    assert {frame.origin for frame in pings} == {(11, PROBE_COMPONENT)}
+    assert router.hub.clients()[1].state == UNPROVEN
+    router.station.send(answer_to(router.station, pings[-1].data))
+    await router.run(2)
+    assert [each.state for each in router.hub.clients()][1:] == ["open"]
+    router.frames.clear()
+    await router.run(4)
+    assert len(router.frames) == 4 * 5 * 11
+    systems = {system for each in router.hub.clients() for system, _ in each.systems}
+    assert systems == {11, 12, 13, 14, 15, 255}
+
+
+async def test_station_on_this_machine_gets_all_frames_of_a_router_at_once(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()
+    router = Router(rig)
+    await router.run(1)
+    before = len(router.frames)
+    await router.run(2)
+    assert len(router.frames) - before == 2 * 5 * 11
 
 
 async def test_heartbeats_reach_a_client_that_only_sends_heartbeats(rig: Rig) -> None:

@@ -106,7 +106,7 @@ class Site(Rig):
 
 
 @pytest.fixture
-async def site(router: Router, proven: None) -> AsyncIterator[Site]:
+async def site(router: Router) -> AsyncIterator[Site]:
     site = Site(router)
     yield site
     site.close()

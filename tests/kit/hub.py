@@ -18,7 +18,6 @@ from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientCounters
 from gateway.hub.transports.base import Client
-from gateway.hub.transports.datagram import DatagramPeer
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
@@ -282,13 +281,7 @@ class Rig:
 
 
 @pytest.fixture
-def proven(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let clients of UDP ports not need to prove that they receive."""
-    monkeypatch.setattr(DatagramPeer, "is_proven", True)
-
-
-@pytest.fixture
-async def rig(proven: None) -> AsyncIterator[Rig]:
+async def rig() -> AsyncIterator[Rig]:
     rig = Rig()
     yield rig
     rig.close()

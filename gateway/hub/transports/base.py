@@ -257,6 +257,8 @@ class Client:
     """Whether it is certain that it receives; False only of peers whose address may be forged."""
     may_return: ClassVar[bool] = True
     """Whether each frame from here may be one that was sent elsewhere and has returned."""
+    is_measured: ClassVar[bool] = True
+    """Whether the hub measures its round trip by messages."""
     renumbering: SystemTranslation | None = field(default=None, init=False)
     """Other system ids on its link, if its endpoint has the option `as`."""
     _version1_since_us: int | None = None

@@ -13,6 +13,7 @@ from typing import Final
 from gateway.compiled.messages import way_to_send
 from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import Endpoint
+from gateway.hub.round_trip import MEASURING
 from gateway.hub.routing_table import Origin
 from gateway.hub.send_queue import Packer
 from gateway.hub.transports.base import RETRY_US, STALE_AFTER_US, Client, new_socket
@@ -34,8 +35,10 @@ BACKLOG_DATAGRAMS: Final = 256
 UNPROVEN_FACTOR: Final = 10
 """Bytes sent for each byte received, to a peer that has not proven that it receives: a heartbeat of
 a station pays for a vehicle's heartbeat and home, which is all that it waits for."""
+MEASURING_RESERVE: Final = 80
+"""Part of that allowance for PING and TIMESYNC only, bytes: their answers are the proof."""
 HEARTBEAT_RESERVE: Final = 42
-"""Part of that allowance for heartbeats only, bytes: telemetry would leave no room for them."""
+"""A further part for heartbeats: telemetry would leave no room for them."""
 UNPROVEN_IDLE_US: Final = 5 * US_PER_S
 """A peer that has not proven that it receives is removed after this time without a frame."""
 
@@ -315,7 +318,8 @@ class DatagramPeer(DatagramClient):
     The address that a datagram claims to come from may be forged, to make the gateway flood
     somebody else. So a new client is *unproven*, and is sent at most `UNPROVEN_FACTOR` times the
     bytes that were received from it, until a frame depends on one that it was sent: an answer to
-    PING or TIMESYNC, or a frame addressed to a system behind the gateway.
+    PING or TIMESYNC, or a frame addressed to a system behind the gateway. The kernel drops forged
+    datagrams of this machine's addresses, so a client on this machine needs no proof.
     """
 
     identity: Origin
@@ -332,8 +336,8 @@ class DatagramPeer(DatagramClient):
         super().adopt(sock, write if self.is_proven else self._send_limited)
 
     def prove(self) -> None:
-        """Send everything from now on, if anything was sent on which a frame can depend."""
-        if self.is_proven or not self._spent:
+        """Send everything from now on."""
+        if self.is_proven:
             return
         self.is_proven = True
         is_held = self.write is not self._direct
@@ -347,7 +351,11 @@ class DatagramPeer(DatagramClient):
 
     def _send_limited(self, data: bytes) -> object:
         """Send a datagram if the allowance of an unproven client suffices; else drop it."""
-        reserve = 0 if message_id_of(data) == HEARTBEAT_ID else HEARTBEAT_RESERVE
+        message_id, reserve = message_id_of(data), MEASURING_RESERVE
+        if message_id in MEASURING:
+            reserve = 0
+        elif message_id != HEARTBEAT_ID:
+            reserve += HEARTBEAT_RESERVE
         allowance = UNPROVEN_FACTOR * self.counters.bytes_received - self._spent
         if allowance < len(data) + reserve:
             self._hold(data)

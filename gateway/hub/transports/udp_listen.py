@@ -13,7 +13,7 @@ import itertools
 import socket
 from typing import Final
 
-from gateway.hub.endpoint import Endpoint, host_and_port
+from gateway.hub.endpoint import Endpoint, host_and_port, is_of_this_machine
 from gateway.hub.forwarding_step import MAX_DATAGRAM, READS
 from gateway.hub.transports.base import (
     READ_BYTES,
@@ -126,6 +126,8 @@ class UdpListener(Listener[DatagramPeer]):
         client.splitter = self._splitter.split_off(client.address)
         self._clients[client_id] = self._by_address[client.address] = client
         client.adopt(sock)
+        if is_of_this_machine(client.host, local_host):
+            client.prove()
         self._context.appear(client)
         self._context.greet(client_id)
         self._pass_on_others(sock, address, local_host)
