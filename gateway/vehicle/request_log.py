@@ -17,11 +17,6 @@ _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_@/.? =-]")
 _GOOD_RESULTS: Final = (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
 _FTP_OPCODE, _FTP_DATA = 3, 12
 _FTP_ENDS: Final = (mavlink.MAV_FTP_OPCODE_TERMINATESESSION, mavlink.MAV_FTP_OPCODE_RESETSESSION)
-_CONTROL_NACKS: Final = {
-    1: "wrong passkey",
-    2: "unsupported passkey encryption",
-    3: "under another's control",
-}
 _ABOUT_MESSAGES: Final = (
     mavlink.MAV_CMD_REQUEST_MESSAGE,
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
@@ -79,8 +74,6 @@ def failure_of(message: Any, request: Any) -> str | None:
             return _name("MAV_PARAM_ERROR", message.error)
         case "PARAM_EXT_ACK" if message.param_result != mavlink.PARAM_ACK_ACCEPTED:
             return _name("PARAM_ACK", message.param_result)
-        case "CHANGE_OPERATOR_CONTROL_ACK" if message.ack:
-            return _CONTROL_NACKS.get(message.ack, f"NACK {message.ack}")
         case "FILE_TRANSFER_PROTOCOL" if message.payload[_FTP_OPCODE] == mavlink.MAV_FTP_OPCODE_NAK:
             error, asked = message.payload[_FTP_DATA], request.payload[_FTP_OPCODE]
             if error != mavlink.MAV_FTP_ERR_EOF and asked not in _FTP_ENDS:

@@ -55,7 +55,7 @@ from gateway.vehicle.services.commands import (
     read_command,
 )
 from gateway.vehicle.services.ftp import FtpService
-from gateway.vehicle.services.operator_control import REQUEST_OPERATOR_CONTROL, OperatorControl
+from gateway.vehicle.services.operator_control import OperatorControl
 from gateway.vehicle.services.parameter_service import HOME_SECTION, PACKED_PATH, ParameterService
 from gateway.vehicle.services.parameters import Metadata, ParameterTable
 from gateway.vehicle.services.plan_service import PlanService
@@ -69,6 +69,7 @@ from gateway.wire.mavlink_signing import (
     Verifier,
     key_from_passphrase,
 )
+from gateway.wire.system_ids import REQUEST_OPERATOR_CONTROL
 
 OWN_SECTION: Final = "vehicle"
 HOME_STEP_M: Final = 20.0

@@ -5,7 +5,8 @@ system that it reports, such as the one in control of a gimbal; and a system in 
 command or of a mission item, such as the vehicle to follow or the target of a camera.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -29,20 +30,47 @@ FIELDS: Final[dict[int, tuple[str, ...]]] = {
 } | {dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: ("target",)}
 """Fields with a system id, or an array of them, by message id."""
 
+REQUEST_OPERATOR_CONTROL: Final = 32100
+"""MAV_CMD_REQUEST_OPERATOR_CONTROL, which pymavlink's dialects lack."""
+REQUEST_CONTROL: Final = 1
+RELEASE_CONTROL: Final = 0
+"""Values of the action of that command."""
+TIMEOUTS_S: Final = (3, 60)
+"""Shortest and longest timeout of a request, by which the two orders of parameters differ."""
 COMMANDS: Final = {
     dialect.MAV_CMD_DO_FOLLOW: (1,),
     dialect.MAV_CMD_DO_SET_ROI_SYSID: (1,),
     dialect.MAV_CMD_DO_GUIDED_MASTER: (1,),
+    dialect.MAV_CMD_DO_SET_SYS_CMP_ID: (1,),
     dialect.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE: (1, 3),
     dialect.MAV_CMD_ARM_AUTHORIZATION_REQUEST: (1,),
+    REQUEST_OPERATOR_CONTROL: (4, 5),
 }
 """Numbers of the parameters that are system ids, by command."""
+FORMER_CONTROL: Final = (1,)
+"""The same for operator control in its former order of parameters."""
 CARRIERS: Final = frozenset(
     message_id
     for message_id in FIELDS
     if {"command", "param1"} <= set(layout_of(message_id).names or ())
 )
 """Messages that contain a command."""
+
+
+def is_former_control(params: Sequence[float], sender: int) -> bool:
+    """Return whether MAV_CMD_REQUEST_OPERATOR_CONTROL has its former order of parameters.
+
+    If both are possible, it has the present one: action, takeover, timeout, sender. The former one
+    is sender or 0, action, takeover, timeout. See `vehicle.services.operator_control`.
+    """
+    first, second, third, fourth = (round(p) if math.isfinite(p) else 0 for p in params[:4])
+    shortest, longest = TIMEOUTS_S
+    return first not in (RELEASE_CONTROL, REQUEST_CONTROL) or (
+        (first, second) == (0, REQUEST_CONTROL)
+        and third in (0, 1)
+        and shortest <= fourth <= longest
+        and fourth != sender
+    )
 
 
 def rename_systems(
@@ -75,7 +103,14 @@ def _renamed_fields(frame: MavFrame, rename: Callable[[int], int]) -> dict[str, 
     values = np.frombuffer(frame.payload.ljust(layout.itemsize, b"\0"), layout, 1)[0]
     names = FIELDS[message_id]
     if message_id in CARRIERS:
-        names += tuple(f"param{number}" for number in COMMANDS.get(int(values["command"]), ()))
+        numbers = COMMANDS.get(int(values["command"]), ())
+        if values["command"] == REQUEST_OPERATOR_CONTROL:
+            params = [float(values[f"param{number}"]) for number in range(1, 5)]
+            numbers = FORMER_CONTROL if is_former_control(params, frame.origin[0]) else numbers
+        for number in numbers:
+            # The fifth parameter of messages with a position is x.
+            name = f"param{number}"
+            names += (name if name in values.dtype.names else "x",)
     found: dict[str, Any] = {}
     for name in names:
         before = values[name].tolist()

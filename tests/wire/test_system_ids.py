@@ -1,5 +1,6 @@
 """System ids in the fields of messages."""
 
+import re
 from typing import Any
 
 import pytest
@@ -8,10 +9,18 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_messages import MESSAGE_NAMES, layout_of
 from gateway.wire.mavlink_splitter import MavFrame, frame_of, split_datagram
-from gateway.wire.system_ids import FIELDS, rename_systems
+from gateway.wire.system_ids import (
+    CARRIERS,
+    COMMANDS,
+    FIELDS,
+    REQUEST_OPERATOR_CONTROL,
+    rename_systems,
+)
 from tests.kit.mavlink import packed
 
 RENAMED = {1: 11, 2: 12}
+IS_ID = re.compile(r"(new |vehicle )?sys(tem )?id\b", re.IGNORECASE)
+"""Begin of the description of a parameter that is a system id."""
 
 
 def rename(system_id: int) -> int:
@@ -54,26 +63,49 @@ def test_every_field_that_is_named_like_a_system_id_is_known() -> None:
     assert found == {"system_status", "system_status_summary"}, "states, not ids"
 
 
+def test_every_parameter_that_is_described_as_a_system_id_is_known() -> None:
+    described = {
+        number: found
+        for number, command in mavlink.enums["MAV_CMD"].items()
+        if (found := tuple(n for n, text in command.param.items() if IS_ID.match(text)))
+    }
+    assert described == {n: each for n, each in COMMANDS.items() if n != REQUEST_OPERATOR_CONTROL}
+
+
+FOLLOW, CONTROL = mavlink.MAV_CMD_DO_FOLLOW, REQUEST_OPERATOR_CONTROL
+
+
 @pytest.mark.parametrize("version", [1, 2])
 @pytest.mark.parametrize(
-    "kind",
+    ("command", "before", "after"),
     [
-        mavlink.MAVLink_command_long_message,
-        mavlink.MAVLink_command_int_message,
-        mavlink.MAVLink_command_long_stamped_message,
-        mavlink.MAVLink_command_int_stamped_message,
-        mavlink.MAVLink_mission_item_message,
-        mavlink.MAVLink_mission_item_int_message,
+        (FOLLOW, (1, 2, 1, 2, 1), (11, 2, 1, 2, 1)),
+        (CONTROL, (1, 1, 10, 1, 2), (1, 1, 10, 11, 12)),
+        (CONTROL, (0, 0, 0, 2, 0), (0, 0, 0, 12, 0)),
+        # The former order, with the sender and with a timeout of 3 s.
+        (CONTROL, (2, 1, 1, 3, 0), (12, 1, 1, 3, 0)),
+        (CONTROL, (0, 1, 1, 3, 0), (0, 1, 1, 3, 0)),
     ],
 )
-def test_id_in_a_parameter_of_a_command_is_renamed(kind: Any, version: int) -> None:
-    follow = {"command": mavlink.MAV_CMD_DO_FOLLOW, "param1": 1.0, "param2": 2.0}
-    values = dict.fromkeys(kind.fieldnames, 0) | {"target_system": 2} | follow
-    frame = frame_of(packed(kind(**values), 1, version=version))
-    changed = rename_systems(frame, 11, rename)
-    assert changed is not None
-    got = mavlink.MAVLink(None).decode(bytearray(changed.data))
-    assert (got.get_srcSystem(), got.target_system, got.param1, got.param2) == (11, 12, 11.0, 2.0)
+@pytest.mark.parametrize("message_id", sorted(CARRIERS), ids=MESSAGE_NAMES.get)
+def test_ids_in_the_parameters_of_a_command_are_renamed(
+    message_id: int,
+    command: int,
+    before: tuple[int, ...],
+    after: tuple[int, ...],
+    version: int,
+) -> None:
+    def message(system: int, params: tuple[int, ...]) -> Any:
+        kind = mavlink.mavlink_map[message_id]
+        values = dict.fromkeys(kind.fieldnames, 0) | {"target_system": system, "command": command}
+        names = ("param1", "param2", "param3", "param4")
+        fifth = "param5" if "param5" in kind.fieldnames else "x"
+        return kind(**values | dict(zip((*names, fifth), params, strict=True)))
+
+    given = frame_of(packed(message(2, before), 1, version=version))
+    renamed = {1: 11, 2: 12, 3: 13, 10: 20}
+    changed = rename_systems(given, 11, lambda system: renamed.get(system, system))
+    assert changed == frame_of(packed(message(12, after), 11, version=version))
 
 
 def test_sender_alone_is_renamed_in_telemetry() -> None:

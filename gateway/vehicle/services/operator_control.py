@@ -25,13 +25,13 @@ from a ground station; those since then with the action:
 | present | action      | takeover | timeout, s | sender, or first of some | their last |
 | former  | sender or 0 | action   | takeover   | timeout, s               |            |
 
-CONTROL_STATUS changed with them, its checksum seed included: a program of the former definition
-discards the present message.
+QGroundControl sends the former order from 2025 to May 2026 and the present one since then, as does
+the module of MAVProxy. CONTROL_STATUS changed with the command, its checksum seed included: a
+program of the former definition discards the present message.
 
 References
 ----------
 .. [1] MAV_CMD_REQUEST_OPERATOR_CONTROL and CONTROL_STATUS in MAVLink's development.xml
-.. [2] CHANGE_OPERATOR_CONTROL in MAVLink's common.xml
 """
 
 from dataclasses import dataclass, replace
@@ -51,26 +51,13 @@ from gateway.vehicle.services.commands import (
     Outcome,
     whole,
 )
+from gateway.wire.system_ids import RELEASE_CONTROL, REQUEST_OPERATOR_CONTROL, is_former_control
 
-REQUEST_OPERATOR_CONTROL: Final = 32100
-"""MAV_CMD_REQUEST_OPERATOR_CONTROL, which pymavlink's dialects lack."""
 SYSTEM_MANAGER: Final = 1
 TAKEOVER_ALLOWED: Final = 2
 """Values of GCS_CONTROL_STATUS_FLAGS."""
 INTERVAL_US: Final = US_PER_S
 TIMEOUT_US: Final = 30 * US_PER_S
-
-REQUEST: Final = 1
-RELEASE: Final = 0
-"""Values of the action of the command."""
-TIMEOUTS_S: Final = (3, 60)
-"""Shortest and longest timeout of a request, by which the two orders of parameters differ."""
-
-LEGACY_ACK: Final = 0
-LEGACY_DENIED: Final = 1
-LEGACY_BAD_VERSION: Final = 2
-LEGACY_TAKEN: Final = 3
-"""Values of CHANGE_OPERATOR_CONTROL_ACK; 1 is "wrong passkey"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,13 +81,7 @@ class _Wanted:
 def read_wanted(params: tuple[float, ...], sender: int) -> _Wanted:
     """Read the command; if both orders are possible, the present one is assumed."""
     first, second, third, fourth, fifth = map(whole, params[:5])
-    shortest, longest = TIMEOUTS_S
-    is_former = first not in (RELEASE, REQUEST) or (
-        (first, second) == (0, REQUEST)
-        and third in (0, 1)
-        and shortest <= fourth <= longest
-        and fourth != sender
-    )
+    is_former = is_former_control(params, sender)
     if is_former:
         systems = range(first, first + 1) if first else range(0)
         return _Wanted(second, third, params[3], systems, is_former=True)
@@ -121,8 +102,6 @@ class _Operator:
 
 class OperatorControl(Service):
     """The ground station in control of one vehicle; if exclusive, only it may change things."""
-
-    types = ("CHANGE_OPERATOR_CONTROL",)
 
     def __init__(self, explain: Explain, *, exclusive: bool) -> None:
         self.exclusive = exclusive
@@ -148,32 +127,11 @@ class OperatorControl(Service):
         if self._operator is not None and self._is_operator(request) and request.may_change:
             self._operator.received_us = now_us
 
-    def handle(self, request: Request, now_us: int) -> list[Answer]:
-        """Answer CHANGE_OPERATOR_CONTROL, the older request, which has no takeover."""
-        message = request.message
-        is_release = message.control_request != 0
-        answers: list[Answer] = []
-        result = LEGACY_ACK
-        if not request.may_change:
-            result = LEGACY_DENIED
-        elif message.version != 0:
-            result = LEGACY_BAD_VERSION
-        elif is_release:
-            outcome, answers = self._release(request, now_us)
-            result = LEGACY_ACK if outcome == ACCEPTED else LEGACY_DENIED
-        else:
-            outcome, answers = self._request(request, now_us)
-            result = LEGACY_ACK if outcome == ACCEPTED else LEGACY_TAKEN
-        ack = mavlink.MAVLink_change_operator_control_ack_message(
-            request.system_id, message.control_request, result
-        )
-        return [request.reply(ack), *answers]
-
     def command(self, command: Command, now_us: int) -> Outcome:
         """Carry out MAV_CMD_REQUEST_OPERATOR_CONTROL."""
         request = command.request
         wanted = read_wanted(command.params, request.system_id)
-        is_release, reason = wanted.action == RELEASE, request.reason
+        is_release, reason = wanted.action == RELEASE_CONTROL, request.reason
         if wanted.systems and request.system_id not in wanted.systems and not is_release:
             reason = reason or "requested for another system"
         if reason:

@@ -127,22 +127,6 @@ def test_control_status_is_not_sent_while_control_is_open(station: GroundStation
     assert statuses(station) == []
 
 
-@pytest.mark.parametrize(
-    ("version", "trusted", "taken", "ack"),
-    [(0, True, False, 0), (1, True, False, 2), (0, False, False, 1), (0, True, True, 3)],
-)
-def test_change_operator_control_is_answered(
-    first: GroundStation, second: GroundStation, version: int, trusted: bool, taken: bool, ack: int
-) -> None:
-    if taken:
-        control(first)
-    second.trusted = trusted
-    message = mavlink.MAVLink_change_operator_control_message(1, 0, version, b"secret")
-    [answer] = [m for m in second.send(message) if m.get_type() == "CHANGE_OPERATOR_CONTROL_ACK"]
-    assert (answer.gcs_system_id, answer.control_request, answer.ack) == (254, 0, ack)
-    assert changes(second) == (ack == 0)
-
-
 def test_untrusted_client_cannot_take_control_or_act_for_another(
     first: GroundStation, second: GroundStation
 ) -> None:
