@@ -93,8 +93,8 @@ class GatewaySettings(Settings, frozen=True):
     sources: Annotated[
         tuple[SourceSettings, ...],
         setting(
-            "Sources other than the receiver, each a table [[sources]] with url and vehicle: "
-            'sources = [{ url = "crsf:/dev/ttyACM0", vehicle = 2 }]. docs/sources.md lists them.'
+            "Sources other than the receiver, each a table [[sources]] with a url: "
+            'sources = [{ url = "crsf:/dev/ttyACM0?id=2" }]. docs/sources.md lists them.'
         ),
     ] = ()
 

@@ -13,6 +13,9 @@ from gateway.units import US_PER_S
 GPS_EPOCH_UNIX_US: Final = 315_964_800 * US_PER_S
 """6 January 1980, the epoch of GPS time."""
 WEEK_US: Final = 604_800 * US_PER_S
+FIRST_YEAR: Final = 2024
+"""An earlier date is wrong: the receiver has missed a rollover of the GPS week number (every 1024
+weeks), or reports the date of its firmware until it has received that of the satellites."""
 
 
 def _unix_us(year: int, month: int, day: int = 1) -> int:

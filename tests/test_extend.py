@@ -111,7 +111,7 @@ def test_added_message_is_sent_at_its_rate(install: Install) -> None:
 def test_added_source_kind_is_a_vehicle(install: Install) -> None:
     install("beacon", example("A source"))
     load_extensions()
-    (source,) = make_sources((SourceSettings(url="beacon:stdin", vehicle=4),), str)
+    (source,) = make_sources((SourceSettings(url="beacon:stdin?id=4"),), str)
     payload = struct.pack("<iih", 481000000, 115000000, 512)
     frame = b"B" + payload + bytes([sum(payload) % 256])
     pipeline = Pipeline(PipelineSettings(AircraftSettings(), sources=[source]))

@@ -536,8 +536,9 @@ class Daemon:
 def _with_simulated(settings: GatewaySettings, kind: str, path: str) -> GatewaySettings:
     """Replace the receiver or the sources of the settings by a simulated one."""
     # The type is given because the names of most modes do not show that it is an aeroplane.
-    url = f"{kind}:{path}" + ("?type=fixed_wing" if kind == "crsf" else "")
-    found = (SourceSettings(url=url, vehicle=settings.simulator.vehicle_id),) if kind else ()
+    kept = "&type=fixed_wing" if kind == "crsf" else ""
+    url = f"{kind}:{path}?id={settings.simulator.vehicle_id}{kept}"
+    found = (SourceSettings(url=url),) if kind else ()
     serial = msgspec.structs.replace(settings.serial, port=NO_RECEIVER if kind else path)
     return msgspec.structs.replace(settings, sources=found, serial=serial)
 

@@ -9,8 +9,22 @@ accelerometer and gyroscope (0x13), which are x forward, y right and z down for 
 
 ArduPilot's own frames (0x80) contain packets of FrSky's passthrough protocol. Mode, arming state
 and vehicle type are taken from them if they are received, otherwise from the text of the flight
-mode. Betaflight and INAV count pitch as positive with the nose down, the specification with the
-nose up.
+mode.
+
+Betaflight, INAV and their relatives count pitch as positive with the nose down; the specification,
+ArduPilot and PX4 with the nose up. These two groups differ as well in the meaning of a mode
+without a mark (`flight_modes`). The group is recognised by, in this order:
+
+| evidence                                             | firmware               |
+| ---------------------------------------------------- | ---------------------- |
+| device information (0x29) of the flight controller   | by its name            |
+| frames 0x7F and 0x80; 0x11, 0x12 and 0x13            | ArduPilot; Betaflight  |
+| a mode that one group alone sends, a mark `!` or `?` | by `flight_modes`      |
+| attitudes that all are whole tenths of a degree      | Betaflight or INAV     |
+| any other attitude                                   | ArduPilot or PX4       |
+
+Betaflight and INAV convert whole tenths of a degree to 1e-4 rad, other firmware sends any value:
+three angles of another firmware look like tenths once in 5,000 frames.
 
 References
 ----------
@@ -43,6 +57,7 @@ from gateway.sources.flight_modes import (
     QUADROTOR,
     ardupilot_mode,
     mode_of_text,
+    wanted_sign,
     wanted_type,
 )
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
@@ -64,6 +79,21 @@ ACCEL_LSB_MPS2: Final = 16.0 * STANDARD_GRAVITY_MPS2 / 32767.0
 GYRO_LSB_DPS: Final = 2000.0 / 32767.0
 MAG_LSB_UT: Final = 0.1 / 3.0
 """A third of a milligauss, in µT."""
+TENTH_DEGREE: Final = math.radians(0.1) * 1e4
+"""A tenth of a degree in the unit of the attitude, 1e-4 rad."""
+ROUNDING: Final = 0.01
+"""Error of the conversion in single precision, 1e-4 rad."""
+FULL_TURN: Final = 36_000
+"""Of the course, in 0.01 deg. PX4 until 1.17 sends -180 to 180 deg, as a negative 16-bit number."""
+FIRMWARE: Final = {
+    b"betaflight": True, b"inav": True, b"emuflight": True, b"cleanflight": True,
+    b"rotorflight": True, b"quicksilver": True, b"ardu": False, b"rover": False, b"px4": False,
+}  # fmt: skip
+"""Beginnings of names in the device information, and whether these firmwares are of Betaflight's
+group."""
+FLIGHT_CONTROLLER: Final = 0xC8
+IDENTITY_US: Final = 10 * US_PER_S
+"""Time without a frame after which another aircraft may have been switched on."""
 EXTRA_AGE_US: Final = 2 * US_PER_S
 """Maximum age of the extended frame and of the time, to be used with a fix."""
 PERCENT: Final = 100
@@ -88,6 +118,10 @@ SIZES: Final = {
 """Minimum and maximum payload of the types that are read. After an address outside of the
 specification only these are accepted as frames: noise has a valid 8-bit CRC once in 256 times, and
 a wrong length would delay the frames after it."""
+OWN_FRAMES: Final = {0x11: True, 0x12: True, 0x13: True, 0x7F: False, 0x80: False}
+"""Frames of Betaflight and of ArduPilot: whether the firmware is of Betaflight's group."""
+EVIDENCE: Final = ("device", "frame", "mode", "attitude")
+"""Kinds of evidence of the firmware, the best first."""
 Parts = dict[str, Any]
 
 
@@ -98,11 +132,11 @@ class CrsfDecoder(CheckedFrames):
         super().__init__()
         self._node = node
         self._is_datagram = url.transport == "udp"
-        self._nose_down = url.options.get("pitch") == "down"
-        self._fixed_sign = "pitch" in url.options
-        self._type = wanted_type(url)
-        self._type_is_set = self._type is not None
-        self._has_passthrough = False
+        self._nose_down = wanted_sign(url)
+        """Sign of the pitch that the URL sets."""
+        self._wanted_type = wanted_type(url)
+        self._last_us = 0
+        self._begin_identity()
         self._velocity: tuple[int, tuple[Any, ...]] | None = None
         self._utc: tuple[int, int] | None = None
         self._fix: GpsFix | None = None
@@ -131,6 +165,18 @@ class CrsfDecoder(CheckedFrames):
             0x5008: _passthrough_battery(1),
         }
 
+    def _begin_identity(self) -> None:
+        """Discard what is known of the firmware and the vehicle."""
+        self._type = self._wanted_type
+        self._has_passthrough = self._has_marks = False
+        self._evidence: dict[str, bool] = {}
+        """Whether the firmware is of Betaflight's group, by kind of evidence."""
+
+    @property
+    def _is_betaflight(self) -> bool:
+        """Whether the firmware is of Betaflight's group, by the best evidence so far."""
+        return next((self._evidence[kind] for kind in EVIDENCE if kind in self._evidence), False)
+
     def feed(self, data: bytes, arrival_us: int) -> list[Any]:
         """Decode every frame that a chunk completes."""
         if self._is_datagram and data.startswith(MSP_START):
@@ -151,6 +197,11 @@ class CrsfDecoder(CheckedFrames):
     def read(self, frame: bytes, arrival_us: int) -> list[Any]:
         """Return the records and faults in a frame."""
         kind, payload = frame[HEAD], frame[HEAD + 1 : -1]
+        if arrival_us - self._last_us > IDENTITY_US:
+            self._begin_identity()
+        self._last_us = arrival_us
+        if kind in OWN_FRAMES:
+            self._evidence["frame"] = OWN_FRAMES[kind]
         read = self._readers.get(kind)
         if read is None:
             unknown = Fault("unknown type", len(payload), f"type {kind:#x} is not known")
@@ -168,8 +219,8 @@ class CrsfDecoder(CheckedFrames):
 
     def _gps(self, payload: bytes, arrival_us: int) -> GpsFix | None:
         lat, lon, speed, course, height, satellites = struct.unpack_from(">iiHHHB", payload)
-        vel = velocity(speed * KMH10_MPS, course / 100.0)
-        fix_type = None if (lat, lon) != (0, 0) else GpsFixType.NONE
+        course -= 0x10000 if course > FULL_TURN else 0
+        vel, fix_type = velocity(speed * KMH10_MPS, course / 100.0), None
         h_acc = v_acc = speed_acc = NAN
         if self._velocity is not None and arrival_us - self._velocity[0] <= EXTRA_AGE_US:
             kind, north, east, up, speed_cm, _, _, h_cm, v_cm = self._velocity[1]
@@ -226,31 +277,40 @@ class CrsfDecoder(CheckedFrames):
         return imu_raw(time_us, self._node, (ax, -ay, -az), (gx, -gy, -gz), mag, degc)
 
     def _attitude(self, payload: bytes, _arrival_us: int) -> Parts:
-        pitch, roll, yaw = (angle * 1e-4 for angle in struct.unpack_from(">hhh", payload))
-        return {"attitude_rad": (roll, -pitch if self._nose_down else pitch, yaw)}
+        counts = struct.unpack_from(">hhh", payload)
+        in_tenths = all(map(_is_in_tenths, counts))
+        self._evidence["attitude"] = in_tenths and self._evidence.get("attitude", True)
+        pitch, roll, yaw = (angle * 1e-4 for angle in counts)
+        nose_down = self._is_betaflight if self._nose_down is None else self._nose_down
+        return {"attitude_rad": (roll, -pitch if nose_down else pitch, yaw)}
 
     def _flight_mode(self, payload: bytes, _arrival_us: int) -> Parts:
-        if self._has_passthrough:
-            return {}
         text = payload.partition(b"\0")[0].decode("ascii", "replace").strip()
         mode = mode_of_text(text)
-        if mode.nose_down and not self._fixed_sign:
-            self._nose_down = True
-        if not self._type_is_set and mode.vehicle_type is not None and self._type != FIXED_WING:
+        if mode.is_betaflight is not None:
+            self._evidence["mode"] = mode.is_betaflight
+        if self._has_passthrough:
+            return {}
+        self._has_marks |= mode.armed is False
+        if not self._wanted_type and mode.vehicle_type is not None and self._type != FIXED_WING:
             # This mode exists only on aeroplanes; all others have the same names on copters.
             self._type = mode.vehicle_type
         kind = self._type
         number = mode.plane if kind == FIXED_WING else mode.copter
-        armed = {} if mode.armed is None else {"armed": mode.armed}
+        is_marked = self._has_marks or self._is_betaflight
+        armed = {} if mode.armed is None or not is_marked else {"armed": mode.armed}
         return {"mode": mode.name, "custom_mode": number, "vehicle_type": kind, **armed}
 
     def _device(self, payload: bytes, _arrival_us: int) -> Parts:
-        """Read the device information, in which Betaflight and INAV send their names."""
+        """Read the name of the flight controller's firmware in the device information."""
+        if payload[1] != FLIGHT_CONTROLLER:
+            return {}
         name = payload[2:].partition(b"\0")[0].lower()
-        if name.startswith((b"betaflight", b"inav", b"emuflight")):
-            self._nose_down = self._nose_down if self._fixed_sign else True
-            if name.startswith(b"betaflight") and not self._type_is_set:
-                self._type = QUADROTOR
+        for begin, is_betaflight in FIRMWARE.items():
+            if name.startswith(begin):
+                self._evidence["device"] = is_betaflight
+        if name.startswith(b"betaflight"):
+            self._type = self._wanted_type or QUADROTOR
         return {}
 
     def _ardupilot(self, payload: bytes, arrival_us: int) -> Parts:
@@ -276,7 +336,7 @@ class CrsfDecoder(CheckedFrames):
         return found | {"throttle_percent": (value >> 19 & 0x3F) / 0.63}
 
     def _parameter(self, value: int, _arrival_us: int) -> Parts:
-        if value >> 24 == 1 and not self._type_is_set:
+        if value >> 24 == 1 and not self._wanted_type:
             self._type = value & 0xFF
         return {}
 
@@ -286,7 +346,8 @@ class CrsfDecoder(CheckedFrames):
         height_m = 0.1 * _number(value >> 12 & 0xFFF, 2) * (-1.0 if value >> 24 & 1 else 1.0)
         found: Parts = {"alt_home_m": height_m}
         fix = self._fix
-        if fix is not None and fix.fix_ok and arrival_us - fix.time_us <= EXTRA_AGE_US:
+        is_new = fix is not None and arrival_us - fix.time_us <= EXTRA_AGE_US
+        if fix is not None and is_new and fix.fix_ok and (fix.lat_dege7 or fix.lon_dege7):
             bearing = (value >> 25 & 0x7F) * 3.0 * RAD_PER_DEG
             lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
             per_m = math.degrees(1.0 / 6_371_000.0)
@@ -295,6 +356,12 @@ class CrsfDecoder(CheckedFrames):
             home_lon = lon_deg + distance_m * math.sin(bearing) * per_m / shrink
             found["home"] = (home_lat, home_lon, fix.alt_amsl_m - height_m)
         return found
+
+
+def _is_in_tenths(angle: int) -> bool:
+    """Return whether 1e-4 rad may be whole tenths of a degree, rounded towards zero."""
+    tenths = math.ceil((abs(angle) - ROUNDING) / TENTH_DEGREE)
+    return tenths * TENTH_DEGREE < abs(angle) + 1
 
 
 def _number(bits: int, width: int) -> float:
@@ -333,10 +400,13 @@ def _scaled(kind: str, at: int, name: str, unit: float) -> Callable[[bytes, int]
 
 
 def _battery(payload: bytes, _arrival_us: int) -> Parts:
+    """Read a battery; without one, flight controllers send zeros."""
     voltage, current = struct.unpack_from(">HH", payload)
     remaining = payload[7]
+    if not any(payload[:7]):
+        return {}
     battery = BatteryReport(
-        voltage_v=voltage * 0.1,
+        voltage_v=voltage * 0.1 or NAN,
         current_a=current * 0.1,
         used_mah=float(int.from_bytes(payload[4:7], "big")),
         remaining_percent=float(remaining) if remaining <= PERCENT else NAN,

@@ -27,7 +27,7 @@ for an invalid option."""
 SOURCE_KINDS: Final[dict[str, tuple[SourceKind, tuple[str, ...]]]] = {
     "lines": (LinesDecoder, ("columns", "names")),
     "crsf": (CrsfDecoder, ("pitch", "type")),
-    "ltm": (LtmDecoder, ("type",)),
+    "ltm": (LtmDecoder, ("pitch", "type")),
     "phone": (PhoneDecoder, ("sensors", "geoid_m")),
 }
 """Decoder and options by kind."""

@@ -13,16 +13,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Final
 
-from gateway.records import (
-    NAN,
-    BaroRaw,
-    BatteryReport,
-    GpsFixType,
-    NodeId,
-    RadioSignal,
-    Vec3,
-    VehicleReport,
-)
+from gateway.records import NAN, BaroRaw, BatteryReport, NodeId, RadioSignal, Vec3, VehicleReport
 from gateway.sources.csv_lines import CsvLines, read_column_map
 from gateway.sources.nmea import NmeaReader
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
@@ -164,9 +155,11 @@ class LinesDecoder:
         unknown = [key for key in content if key not in KEYS]
         vehicle = values.get("id")
         node = self._node
-        if isinstance(vehicle, float) and not self._has_own_id:
+        if isinstance(vehicle, float):
             if not (vehicle.is_integer() and 1 <= vehicle <= MAX_VEHICLE):
                 return [unusable("id", line, f"id must be 1 to {MAX_VEHICLE}")]
+            if self._has_own_id and vehicle != node.vehicle_id:
+                return [unusable("id", line, f"this source is of vehicle {node.vehicle_id} only")]
             node = NodeId(int(vehicle), node.node_id)
         clock = self._clocks.setdefault(node.vehicle_id, SampleClock())
         stamp = values.get("t_ms")
@@ -232,7 +225,6 @@ def _fix(values: Mapping[str, Any], node: NodeId, time_us: int) -> SourceRecord 
     vel = get("vel")
     if vel is None:
         vel = velocity(get("speed", NAN), get("course", NAN), get("climb", NAN))
-    no_fix = (get("lat"), get("lon")) == (0.0, 0.0)
     return fix_at(
         time_us,
         node,
@@ -241,7 +233,6 @@ def _fix(values: Mapping[str, Any], node: NodeId, time_us: int) -> SourceRecord 
         get("alt", NAN),
         vel_n_mps=vel,
         satellites=round(get("satellites", 0.0)),
-        fix_type=GpsFixType.NONE if no_fix else None,
         h_acc_m=get("h_acc", NAN),
         v_acc_m=get("v_acc", NAN),
     )

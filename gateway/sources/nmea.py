@@ -21,7 +21,9 @@ from gateway.wire.framing import Fault
 SENTENCE: Final = re.compile(r"[$!](\w{2})(\w{3})((?:,[^*]*)?)(?:\*([0-9A-Fa-f]{2}))?")
 KNOTS_MPS: Final = 1852.0 / 3600.0
 KMH_MPS: Final = 1.0 / 3.6
-DEG_MIN: Final = re.compile(r"(\d{1,3})(\d\d(?:\.\d*)?)")
+DEG_MIN: Final = re.compile(r"(\d{0,3}?)(\d{1,2}(?:\.\d*)?)")
+FIRST_CENTURY: Final = 80
+"""Years of two digits from this one on are before 2000: the epoch of GPS is in 1980."""
 UERE_M: Final = 4.0
 """User-equivalent range error, m, which converts a DOP to an accuracy if there is no GST."""
 MAX_AGE_US: Final = 3 * US_PER_S
@@ -152,7 +154,7 @@ def _degrees(text: str, side: str) -> float:
     found = DEG_MIN.fullmatch(text)
     if found is None or side not in ("N", "S", "E", "W"):
         raise ValueError(text)
-    value = int(found[1]) + float(found[2]) / 60.0
+    value = int(found[1] or 0) + float(found[2]) / 60.0
     return -value if side in ("S", "W") else value
 
 
@@ -161,6 +163,7 @@ def _utc_us(rmc: list[str]) -> int | None:
     if len(time) < 6 or len(date) != 6:
         return None
     day, month, year = (int(date[k : k + 2]) for k in (0, 2, 4))
+    year += 1900 if year >= FIRST_CENTURY else 2000
     hour, minute = int(time[:2]), int(time[2:4])
-    whole_us = datetime(2000 + year, month, day, hour, minute, tzinfo=UTC).timestamp() * US_PER_S
+    whole_us = datetime(year, month, day, hour, minute, tzinfo=UTC).timestamp() * US_PER_S
     return round(whole_us + _number(time[4:]) * US_PER_S)

@@ -11,8 +11,8 @@
     KIND:stdin                   standard input
     KIND:file:PATH               a file that grows
 
-`KIND-udp:HOST:PORT` is equivalent to `KIND:udp:HOST:PORT`, and likewise for the others. An address
-outside of loopback is listened on only if it is given explicitly, as for every endpoint.
+An address outside of loopback is listened on only if it is given explicitly, as for every endpoint.
+The option `id` is the vehicle; by default it is the position of the source in the list.
 """
 
 from dataclasses import dataclass
@@ -56,15 +56,9 @@ class SourceUrl:
 def parse_source(url: str) -> SourceUrl:
     """Parse a URL; raises ValueError that states the reason."""
     location, _, query = url.partition("?")
-    head, colon, address = location.partition(":")
-    kind, transport = head, ""
-    for each in TRANSPORTS:
-        if head.endswith(f"-{each}"):
-            # The longest match is the last one: tcp-listen ends in no other.
-            kind, transport = head.removesuffix(f"-{each}"), each
-    if not transport:
-        transport, address = _transport_of(address)
-    if not kind or not (colon or transport in PLAIN):
+    kind, colon, address = location.partition(":")
+    transport, address = _transport_of(address)
+    if not kind or not colon:
         raise ValueError(f"source {location!r}: write KIND:WHERE, such as lines:/dev/ttyUSB0")
     options = dict(parse_qsl(query, keep_blank_values=True))
     port = 0
@@ -96,19 +90,10 @@ class SourceSettings(Settings, frozen=True):
     url: Annotated[
         str,
         setting(
-            "Kind and location, such as crsf:/dev/ttyACM0, lines:udp:0.0.0.0:5600 or "
-            "lines:file:/tmp/log; docs/sources.md lists the kinds and their options."
+            "Kind, location and options, such as crsf:/dev/ttyACM0?id=2 or "
+            "lines:udp:0.0.0.0:5600; docs/sources.md lists them."
         ),
     ]
-    vehicle: Annotated[
-        int,
-        setting(
-            "Vehicle id, which is its MAVLink system id; 0 for its position in the list. Several "
-            "sources may belong to one vehicle.",
-            ge=0,
-            le=MAX_VEHICLE,
-        ),
-    ] = 0
 
     def __post_init__(self) -> None:
         """Reject an invalid URL when the settings are read."""
@@ -118,9 +103,9 @@ class SourceSettings(Settings, frozen=True):
 def nodes_of(sources: tuple[SourceSettings, ...]) -> list[NodeId]:
     """Return the node of each source; node ids of sources begin at 8 for each vehicle."""
     found: list[NodeId] = []
-    for place, source in enumerate(sources, 1):
+    for position, source in enumerate(sources, 1):
         wanted = parse_source(source.url).options.get("id", "")
-        vehicle_id = int(wanted) if wanted.isdecimal() else source.vehicle or place
+        vehicle_id = int(wanted) if wanted.isdecimal() else position
         before = sum(node.vehicle_id == vehicle_id for node in found)
         found.append(NodeId(vehicle_id, SOURCE_NODE + before))
     return found

@@ -5,16 +5,26 @@ and its time of arrival, and returns the records and faults in it. There are two
 samples of sensors (`ImuRaw`, `BaroRaw`, `GpsFix`), which are calibrated and fused like those of
 boards, and reports of an autopilot (`VehicleReport`), which are passed on with their own time. The
 `GpsFix` of a vehicle without an IMU is also its position.
+
+Two rules apply to the positions of every kind: latitude and longitude of exactly 0 are no position,
+because receivers without one send zeros; and a date before `FIRST_YEAR` is not used, so that the
+civil time is that of this machine.
 """
 
 from abc import ABC, abstractmethod
 from collections import Counter, deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Any, Final, Protocol, runtime_checkable
 
+from msgspec.structs import replace
+
+from gateway.gps_time import FIRST_YEAR
 from gateway.records import (
     BaroRaw,
     GpsFix,
+    GpsFixType,
     ImuRaw,
     NodeId,
     NodeLink,
@@ -36,6 +46,7 @@ MAX_KINDS: Final = 32
 MAX_DETAIL: Final = 200
 SHOWN: Final = 60
 """Characters of an unusable line that are quoted."""
+FIRST_UTC_US: Final = round(datetime(FIRST_YEAR, 1, 1, tzinfo=UTC).timestamp()) * US_PER_S
 
 
 class SourceDecoder(Protocol):
@@ -53,6 +64,20 @@ class SourceDecoder(Protocol):
 def unusable(kind: str, line: str, why: str) -> Fault:
     """Return the fault for a line, with the start of the line and the reason."""
     return Fault(kind, len(line), f"{line[:SHOWN]!r}: {why}")
+
+
+def checked(fix: GpsFix) -> Iterator[SourceRecord | Fault]:
+    """Yield a fix without a position at 0/0 and without a date before `FIRST_YEAR`, and its faults.
+
+    Such a position is no fault: it means that there is none.
+    """
+    if fix.fix_ok and fix.lat_dege7 == fix.lon_dege7 == 0:
+        fix = replace(fix, fix_type=GpsFixType.NONE, fix_ok=False)
+    if fix.utc_us is not None and fix.utc_us < FIRST_UTC_US:
+        fix = replace(fix, utc_us=None)
+        why = f"the date of the GPS is before {FIRST_YEAR}: a week rollover, or none received yet"
+        yield Fault("gps date", 0, f"{why}; the clock of this machine is used")
+    yield fix
 
 
 class CheckedFrames(ABC):
@@ -141,13 +166,10 @@ class SourceInput:
         self, data: bytes, now_us: int, signal: RadioSignal | None = None
     ) -> list[SourceRecord]:
         """Decode bytes that arrived now, with the signal strength if known; count unusable ones."""
-        self._bytes += len(data)
         records: list[SourceRecord] = []
-        for event in self.decoder.feed(data, now_us):
+        for event in self.events(data, now_us):
             if isinstance(event, Fault):
-                self.count(event)
                 continue
-            self._records += 1
             node = self._nodes.setdefault(event.node, _Node(now_us))
             node.received += 1
             node.last_us = now_us
@@ -158,6 +180,17 @@ class SourceInput:
                 node.signal = signal
             records.append(event)
         return records
+
+    def events(self, data: bytes, now_us: int) -> Iterator[SourceRecord | Fault]:
+        """Decode bytes that arrived now; yield and count the records and faults."""
+        self._bytes += len(data)
+        for decoded in self.decoder.feed(data, now_us):
+            for event in checked(decoded) if isinstance(decoded, GpsFix) else (decoded,):
+                if isinstance(event, Fault):
+                    self.count(event)
+                else:
+                    self._records += 1
+                yield event
 
     @property
     def vehicles(self) -> frozenset[int]:

@@ -12,6 +12,7 @@ from typing import Final
 
 import msgspec
 
+from gateway.gps_time import FIRST_YEAR
 from gateway.records import (
     NAN,
     BaroRaw,
@@ -43,9 +44,6 @@ SLOWED: Final = 64
 MOST_AHEAD_US: Final = 50_000
 """A larger correction of the clock estimate is applied at once."""
 RATE_SPAN_US: Final = US_PER_S
-FIRST_YEAR: Final = 2024
-"""An earlier date is wrong: the receiver has missed a rollover of the GPS week number (every 1024
-weeks), or reports the date of its firmware until it has received that of the satellites."""
 MAX_PACKETS: Final = 64
 """Maximum waiting packets: more than in a chunk of the line, or than a slow radio sends in 1 s."""
 MAX_ARRIVALS: Final = 2048

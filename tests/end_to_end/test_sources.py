@@ -109,7 +109,7 @@ def test_datagrams_of_any_program_are_a_vehicle(
     start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
 ) -> None:
     port = free_port()
-    gateway = start_gateway("run", "--source", f"lines-udp:127.0.0.1:{port}?id=9")
+    gateway = start_gateway("run", "--source", f"lines:udp:127.0.0.1:{port}?id=9")
     client = connect(gateway.port)
     line = {"lat": 48.0, "lon": 11.0, "alt_m": 500, "speed_mps": 3, "course_deg": 90}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:

@@ -23,8 +23,8 @@ NODE = NodeId(2, 8)
 QUADROTOR, FIXED_WING = mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_FIXED_WING
 
 
-def decoder(options: str = "") -> Any:
-    return make_decoder(parse_source(f"crsf:/dev/ttyACM0{options}"), NODE)
+def decoder(options: str = "", kind: str = "crsf") -> Any:
+    return make_decoder(parse_source(f"{kind}:/dev/ttyACM0{options}"), NODE)
 
 
 def frame(kind: int, payload: bytes, address: int = 0xEA) -> bytes:
@@ -77,20 +77,42 @@ def test_attitude_has_the_order_and_scale_of_the_specification() -> None:
     assert report.time_us == 5_000_000
 
 
+TENTHS = struct.pack(">hhh", 1745, -3490, 25097)
+"""10, -20 and 143.8 degrees, as Betaflight rounds them."""
+BETAFLIGHT, ARDUPILOT = (b"\xea\xc8" + name for name in (b"Betaflight 4.5\0", b"ArduCopter V4.6\0"))
+
+
 @pytest.mark.parametrize(
-    ("before", "options", "pitch"),
+    ("before", "attitude", "options", "pitch"),
     [
-        (b"", "", 0.1745),
-        (frame(0x21, b"ANGL\0"), "", -0.1745),
-        (frame(0x21, b"STAB\0"), "", 0.1745),
-        (frame(0x29, b"\xea\xc8Betaflight 4.5\0"), "", -0.1745),
-        (frame(0x21, b"ANGL\0"), "?pitch=up", 0.1745),
-        (b"", "?pitch=down", -0.1745),
+        (b"", ATTITUDE, "", 0.1745),
+        (b"", TENTHS, "", -0.1745),
+        (frame(0x21, b"ACRO\0") + frame(0x1E, bytes(6)), TENTHS, "", -0.1745),
+        (frame(0x1E, ATTITUDE) + frame(0x21, b"ACRO*\0"), TENTHS, "", 0.1745),
+        (frame(0x21, b"ACRO!\0"), ATTITUDE, "", -0.1745),
+        (frame(0x21, b"ANGL\0"), ATTITUDE, "", -0.1745),
+        (frame(0x21, b"FBWA\0"), TENTHS, "", 0.1745),
+        (frame(0x21, b"STAB\0"), ATTITUDE, "", 0.1745),
+        (frame(0x12, bytes(6)), ATTITUDE, "", -0.1745),
+        (frame(0x29, BETAFLIGHT), ATTITUDE, "", -0.1745),
+        (frame(0x29, ARDUPILOT), TENTHS, "", 0.1745),
+        (frame(0x29, b"\xea\xeeINAV\0"), ATTITUDE, "", 0.1745),
+        (frame(0x21, b"ANGL\0"), ATTITUDE, "?pitch=up", 0.1745),
+        (b"", ATTITUDE, "?pitch=down", -0.1745),
     ],
 )
-def test_pitch_sign_is_that_of_the_autopilot(before: bytes, options: str, pitch: float) -> None:
-    found = decoder(options).feed(before + frame(0x1E, ATTITUDE), 0)
+def test_pitch_sign_is_that_of_the_firmware(
+    before: bytes, attitude: bytes, options: str, pitch: float
+) -> None:
+    found = decoder(options).feed(before + frame(0x1E, attitude), 0)
     assert found[-1].attitude_rad[1] == pytest.approx(pitch)
+
+
+def test_firmware_is_identified_again_after_a_gap() -> None:
+    stream = decoder()
+    stream.feed(frame(0x29, BETAFLIGHT), 0)
+    (report,) = stream.feed(frame(0x1E, ATTITUDE), 20_000_000)
+    assert report.attitude_rad[1] == pytest.approx(0.1745)
 
 
 GPS = struct.pack(">iiHHHB", 481173000, -115167000, 414, 27050, 1545, 11)
@@ -103,8 +125,8 @@ def test_gps_frame_is_a_fix() -> None:
     assert (fix.satellites, fix.fix_type, fix.fix_ok) == (11, GpsFixType.FIX_3D, True)
     speed = 41.4 / 3.6
     assert fix.vel_n_mps[1] == pytest.approx(speed * math.sin(math.radians(270.5)))
-    without = one(0x02, struct.pack(">iiHHHB", 0, 0, 0, 0, 1000, 3))
-    assert (without.fix_ok, without.satellites) == (False, 3), "no position"
+    west = one(0x02, struct.pack(">iiHhHB", 481173000, -115167000, 360, -9000, 1545, 11))
+    assert west.vel_n_mps[:2] == pytest.approx((0.0, -10.0), abs=1e-9), "a signed course of PX4"
 
 
 def test_extended_gps_and_time_belong_to_the_next_fix() -> None:
@@ -173,8 +195,10 @@ def test_pressure_field_and_inertial_sample_of_betaflight_are_samples() -> None:
         (b"WAIT", "WAIT", None, False, None),
         (b"!ERR", "!ERR", None, False, None),
         (b"!FS!", "!FS!", None, None, None),
-        (b"FBWA", "FBWA", 5, True, FIXED_WING),
-        (b"XYZ", "XYZ", None, True, None),
+        (b"!FS!*", "!FS!", None, False, None),
+        (b"FBWA", "FBWA", 5, None, FIXED_WING),
+        (b"LOIT*", "LOIT", 5, False, QUADROTOR),
+        (b"XYZ", "XYZ", None, None, None),
     ],
 )
 def test_mode_and_arming_are_read_from_the_text(
@@ -183,6 +207,17 @@ def test_mode_and_arming_are_read_from_the_text(
     report = one(0x21, text + b"\0")
     found = (report.mode, report.custom_mode, report.armed, report.vehicle_type)
     assert found == (mode, number, armed, kind)
+
+
+@pytest.mark.parametrize(
+    ("before", "armed"),
+    [(b"", None), (b"LOIT*", True), (b"ACRO", None), (b"ACRO?", True), (b"ANGL", True)],
+)
+def test_mode_without_a_mark_is_armed_if_the_firmware_has_marks(
+    before: bytes, armed: bool | None
+) -> None:
+    *_, report = decoder().feed(frame(0x21, before + b"\0") + frame(0x21, b"STAB\0"), 0)
+    assert report.armed is armed
 
 
 def test_aeroplane_remains_one_in_modes_that_copters_have_too() -> None:
@@ -257,7 +292,7 @@ def test_frames_are_found_between_bytes_of_other_protocols(noise: bytes) -> None
 def test_frame_of_a_backpack_is_read_from_its_msp_packet() -> None:
     content = frame(0x1E, ATTITUDE)
     body = struct.pack("<BHH", 0, 0x11, len(content)) + content
-    stream = make_decoder(parse_source("crsf-udp:127.0.0.1:14550"), NODE)
+    stream = make_decoder(parse_source("crsf:udp:127.0.0.1:14550"), NODE)
     found = [e for _ in range(3) for e in stream.feed(b"$X<" + body + bytes([dvb_s2(body)]), 0)]
     assert [type(each) for each in found] == [VehicleReport] * 3
 
@@ -281,7 +316,7 @@ def ltm(kind: bytes, payload: bytes) -> bytes:
 
 
 def test_ltm_is_read_behind_the_same_interface() -> None:
-    stream = make_decoder(parse_source("ltm:/dev/ttyUSB0"), NODE)
+    stream = decoder(kind="ltm")
     data = ltm(b"O", struct.pack("<iiiBB", 481000000, 115000000, 50_000, 1, 1))
     data += ltm(b"A", struct.pack("<hhh", -5, 20, 270))
     data += ltm(b"G", struct.pack("<iiBiB", 481100000, 115100000, 17, 12_300, 11 << 2 | 3))
@@ -289,7 +324,7 @@ def test_ltm_is_read_behind_the_same_interface() -> None:
     found = [e for k in range(len(data)) for e in stream.feed(data[k : k + 1], 9)]
     home, attitude, height, fix, state = found
     assert home.home == pytest.approx((48.1, 11.5, 500.0))
-    assert attitude.attitude_rad == pytest.approx([math.radians(v) for v in (20, -5, 270)])
+    assert attitude.attitude_rad == pytest.approx([math.radians(v) for v in (20, 5, 270)])
     assert height.alt_home_m == 123.0
     assert (fix.alt_amsl_m, fix.satellites) == (623.0, 11)
     assert fix.vel_n_mps[:2] == pytest.approx((0.0, -17.0), abs=1e-9)
@@ -298,17 +333,45 @@ def test_ltm_is_read_behind_the_same_interface() -> None:
     assert state.airspeed_mps == 18.0
 
 
+@pytest.mark.parametrize(
+    ("options", "schedule", "pitch_deg", "mode", "current_a"),
+    [
+        ("", b"ASAGASAGASAG", -12, "STABILIZED1", math.nan),
+        ("", b"ASOAGASAGASAG", -12, "STABILIZED1", math.nan),
+        ("", b"SAGASAGASAGAGASAGASAGAGAS", 12, "LOITER", 4.2),
+        ("", b"SAGASAGASAGAGASAGASAGAGAOAS", -12, "STABILIZED1", math.nan),
+        ("?pitch=up", b"ASAG", 12, "STABILIZED1", math.nan),
+    ],
+    ids=["INAV", "Betaflight", "ArduPilot", "losses of INAV", "set"],
+)
+def test_ltm_of_ardupilot_is_recognised_by_its_schedule(
+    options: str, schedule: bytes, pitch_deg: float, mode: str, current_a: float
+) -> None:
+    payloads = {
+        b"A": struct.pack("<hhh", 12, 0, 0),
+        b"S": struct.pack("<HHBBB", 12_600, 420, 0, 0, 5 << 2),
+        b"G": struct.pack("<iiBiB", 481100000, 115100000, 17, 0, 11 << 2 | 3),
+        b"O": struct.pack("<iiiBB", 481000000, 115000000, 0, 1, 1),
+    }
+    kinds = [schedule[k : k + 1] for k in range(len(schedule))]
+    data = b"".join(ltm(kind, payloads[kind]) for kind in [*kinds, b"S", b"A"])
+    *_, state, attitude = decoder(options, kind="ltm").feed(data, 0)
+    assert attitude.attitude_rad[1] == pytest.approx(math.radians(pitch_deg))
+    assert (state.mode, state.battery.current_a) == (mode, pytest.approx(current_a, nan_ok=True))
+    assert math.isnan(state.link_quality_percent), "0 means that it is not measured"
+
+
 def test_wanted_type_is_that_of_crsf_and_ltm_and_must_exist() -> None:
-    stream = make_decoder(parse_source("ltm:/dev/ttyUSB0?type=fixed_wing"), NODE)
+    stream = decoder("?type=fixed_wing", kind="ltm")
     (state,) = stream.feed(ltm(b"S", struct.pack("<HHBBB", 0, 0, 0, 0, 2 << 2)), 0)
     assert (state.vehicle_type, state.custom_mode) == (FIXED_WING, 5)
     for kind in ("ltm", "crsf"):
         with pytest.raises(ValueError, match="no MAV_TYPE 'plane'"):
-            make_decoder(parse_source(f"{kind}:/dev/ttyUSB0?type=plane"), NODE)
+            decoder("?type=plane", kind=kind)
 
 
 def test_ltm_noise_is_counted_and_the_next_frame_is_read() -> None:
-    stream = make_decoder(parse_source("ltm:/dev/ttyUSB0"), NODE)
+    stream = decoder(kind="ltm")
     fault, report = stream.feed(b"$TA123456x" + ltm(b"A", struct.pack("<hhh", 0, 0, 90)), 0)
     assert isinstance(fault, Fault)
     assert report.attitude_rad is not None

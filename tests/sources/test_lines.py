@@ -12,6 +12,7 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.sources.kinds import make_decoder, make_sources
 from gateway.sources.settings import SourceSettings, parse_source
+from gateway.sources.source import SourceInput
 from gateway.sources.trial import SourceTrial, describe
 from gateway.wire.framing import Fault
 
@@ -88,7 +89,8 @@ def test_trial_names_rates_what_is_missing_and_a_map() -> None:
 
 def decode(text: str | bytes, url: str = "lines:stdin", arrival_us: int = 1_000_000) -> list[Any]:
     data = text.encode() if isinstance(text, str) else text
-    return make_decoder(parse_source(url), NODE).feed(data, arrival_us)
+    parsed = parse_source(url)
+    return [*SourceInput(parsed, NODE, make_decoder(parsed, NODE)).events(data, arrival_us)]
 
 
 def json_line(**content: object) -> str:
@@ -169,7 +171,9 @@ def test_own_clock_is_followed_and_arrival_is_used_without_one() -> None:
 def test_id_selects_the_vehicle_unless_the_url_does() -> None:
     line = json_line(id=7, pressure_hpa=1000)
     assert decode(line)[0].node == NodeId(7, 8)
-    assert decode(line, "lines:stdin?id=3")[0].node == NODE
+    own = json_line(id=3, pressure_hpa=1000)
+    (fault, record) = decode(line + own, "lines:stdin?id=3")
+    assert (fault.kind, "vehicle 3 only" in fault.detail, record.node) == ("id", True, NODE)
     assert decode(json_line(id=99, pressure_hpa=1000))[0].kind == "id"
 
 
@@ -200,11 +204,29 @@ def test_accuracies_come_from_gst_or_else_from_the_dilution() -> None:
     assert fix.h_acc_m == pytest.approx(3.6)
 
 
-def test_lines_without_a_fix_report_that_there_is_none() -> None:
-    empty = nmea("GGA", "101530.20", "", "", "", "", "0", "00", "99.9", "", "M", "", "M", "", "")
-    for line in (empty, json_line(lat=0, lon=0)):
-        (fix,) = decode(line)
-        assert (fix.fix_ok, fix.fix_type) == (False, GpsFixType.NONE)
+@pytest.mark.parametrize(
+    "text",
+    [
+        nmea("GGA", "101530.20", "", "", "", "", "0", "00", "99.9", "", "M", "", "M", "", ""),
+        nmea("RMC", "100000.00", "A", "0000.0000", "N", "00000.0000", "E", "0", "0", "010626", ""),
+        "$GPRMC,000000.00,A,0.000,N,0.000,E,0.0,0.0,050525,0.0,E\n",
+        json_line(lat=0, lon=0, alt_m=50, satellites=7),
+    ],
+    ids=["empty fields", "zeros", "short zeros", "json"],
+)
+def test_lines_without_a_position_are_no_fix(text: str) -> None:
+    (fix,) = decode(text)
+    assert (fix.fix_ok, fix.fix_type) == (False, GpsFixType.NONE)
+
+
+@pytest.mark.parametrize(
+    ("date", "is_used"),
+    [("281126", True), ("010124", True), ("140407", False), ("010113", False), ("060180", False)],
+)
+def test_date_before_the_first_year_is_not_used(date: str, is_used: bool) -> None:
+    *faults, fix = decode(nmea("RMC", *RMC[:8], date, *RMC[9:]))
+    assert (fix.fix_ok, fix.utc_us is not None) == (True, is_used)
+    assert [each.kind for each in faults] == ([] if is_used else ["gps date"])
 
 
 def test_true_heading_is_reported_without_an_attitude() -> None:

@@ -143,6 +143,34 @@ def test_samples_of_a_source_are_fused(flight: Flight) -> None:
     assert (attitude.roll, attitude.pitch) == pytest.approx((0.0, 0.0), abs=0.02)
 
 
+@pytest.mark.parametrize(("samples_until_s", "roll"), [(20.0, 0.0), (2.0, 0.5)])
+def test_reported_attitude_is_used_only_without_samples(
+    flight: Flight, samples_until_s: float, roll: float
+) -> None:
+    for count in range(1, 1001):
+        flight.now_us = count * 10_000
+        if count * 0.01 <= samples_until_s:
+            flight.take(imu_raw(flight.now_us, NODE, (0.0, 0.0, 9.81), (0.0, 0.0, 0.0)))
+        if count % 10 == 5:
+            flight.report(attitude_rad=(0.5, 0.0, 1.0), alt_home_m=99.0)
+    rolls = [each.roll for each in flight.messages if each.get_type() == "ATTITUDE"]
+    assert rolls[-20:] == pytest.approx([roll] * 20, abs=0.02)
+
+
+def test_mode_arming_and_type_expire(flight: Flight) -> None:
+    kind = mavlink.MAV_TYPE_QUADROTOR
+    flight.report(mode="ALPHA", armed=True, vehicle_type=kind)
+    flight.wait(10.0)
+    beat = flight.newest("HEARTBEAT")
+    assert (beat.base_mode >> 7, beat.custom_mode, beat.type) == (1, 1000, kind)
+    assert flight.pipeline.find(1).vehicle.operates
+    flight.wait(10.0)
+    beat = flight.newest("HEARTBEAT")
+    assert (beat.base_mode >> 7, beat.custom_mode) == (0, 0)
+    assert beat.type != kind
+    assert not flight.pipeline.find(1).vehicle.operates
+
+
 def test_silent_source_is_announced_and_so_is_a_lost_one(flight: Flight) -> None:
     for _ in range(30):
         flight.wait(0.1)
@@ -193,8 +221,7 @@ def test_faults_are_counted_with_the_newest_explained(flight: Flight) -> None:
         ("lines:/dev/ttyUSB0", "serial", "/dev/ttyUSB0", 0),
         ("lines:usb:1a86:7523", "serial", "usb:1a86:7523", 0),
         ("lines:udp:0.0.0.0:5600", "udp", "0.0.0.0", 5600),
-        ("lines-udp:0.0.0.0:5600", "udp", "0.0.0.0", 5600),
-        ("lines-tcp-listen:[::1]:70", "tcp-listen", "::1", 70),
+        ("lines:tcp-listen:[::1]:70", "tcp-listen", "::1", 70),
         ("lines:tcp:host:70?id=4", "tcp", "host", 70),
         ("lines:stdin", "stdin", "", 0),
         ("lines:-", "stdin", "", 0),
@@ -215,6 +242,8 @@ def test_url_has_transport_and_address(url: str, transport: str, address: str, p
         ("lines:udp:5600", "HOST:PORT"),
         ("lines:udp:host:99999", "HOST:PORT"),
         ("line:stdin", "did you mean 'lines'"),
+        ("lines-udp:0.0.0.0:5600", "did you mean 'lines'"),
+        ("crsf:stdin?pitch=left", "up or down"),
         ("lines:stdin?bad=1", "unknown option 'bad'"),
         ("lines:stdin?id=x", "whole number"),
         ("lines:stdin?id=0", "1 to 31"),
@@ -229,10 +258,10 @@ def test_wrong_url_is_refused_with_the_reason_and_without_its_token(url: str, wh
     assert "sesame" not in str(refusal.value)
 
 
-def test_sources_are_vehicles_by_their_place_unless_a_vehicle_is_set() -> None:
+def test_sources_are_vehicles_by_their_position_unless_an_id_is_set() -> None:
     settings = (
         SourceSettings(url="lines:stdin"),
-        SourceSettings(url="lines:file:/a", vehicle=7),
+        SourceSettings(url="lines:file:/a?id=7"),
         SourceSettings(url="lines:file:/b?id=7"),
     )
     assert nodes_of(settings) == [NodeId(1, 8), NodeId(7, 8), NodeId(7, 9)]

@@ -51,7 +51,7 @@ async def _listen(source: SourceInput, seconds: float) -> SourceTrial:
 
     def show(found: SourceInput, data: bytes) -> None:
         trial.look_at(data.decode("utf-8", "replace"))
-        for event in found.decoder.feed(data, clock()):
+        for event in found.events(data, clock()):
             if trial.feed(event) <= SHOWN:
                 print(printable(describe(event)))
 

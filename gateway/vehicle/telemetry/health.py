@@ -205,9 +205,17 @@ class Health:
         """Whether an IMU sample was ever received."""
         return GYRO in self._seen_us
 
+    def is_fused(self, now_us: int) -> bool:
+        """Return whether attitude, position, velocity and height are those of our estimator.
+
+        This holds for every vehicle that sends IMU samples; one with an autopilot of its own is
+        shown by its reports and fixes once the samples have timed out.
+        """
+        return self.has_imu and (not self.is_reported or self.is_alive(GYRO, now_us))
+
     def has_state(self, now_us: int) -> bool:
         """Return whether the source of the state is alive."""
-        if self.has_imu:
+        if self.is_fused(now_us):
             return self.is_alive(GYRO, now_us)
         return self.is_alive(AHRS, now_us) or self.is_alive(GPS, now_us)
 

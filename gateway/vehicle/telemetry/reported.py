@@ -1,7 +1,8 @@
 """The newest reports of a vehicle's own autopilot, and the messages built from them.
 
 The reports are passed on with their own times. A field that has not been reported for the timeout
-of the settings is unknown: its message is not sent, or contains the value for unknown.
+of the settings is unknown: its message is not sent, or contains the value for unknown. Mode, arming
+and type change rarely, and slow radios send them rarely: their timeout is at least `RARE_US`.
 """
 
 import math
@@ -28,6 +29,8 @@ from gateway.vehicle.plan import is_3d
 UNKNOWN_QUAT: Final[Quat] = (NAN, NAN, NAN, NAN)
 WITHOUT_IMU_US: Final = 3 * US_PER_S
 """Time without an IMU sample after which a vehicle's position is taken from its fixes."""
+RARE_US: Final = 15 * US_PER_S
+"""Least timeout of mode, arming and type: a slow radio link sends each every 10 s."""
 MAX_CELLS: Final = 14
 JOINED_US: Final = 10 * US_PER_S
 """Maximum age of the other part of a battery report."""
@@ -37,6 +40,8 @@ MAX_MODES: Final = 64
 OWN_MODE: Final = 1000
 """First number of modes that ArduPilot does not have; its own numbers are below 100."""
 LOW_PERCENT: Final = 20.0
+_STATES: Final[dict[str, Any]] = {"mode": "", "armed": None, "vehicle_type": None}
+"""Fields that expire, with their values for unknown."""
 _NUMBERS: Final = (
     "heading_rad",
     "climb_mps",
@@ -57,6 +62,8 @@ class Reported:
         self.armed: bool | None = None
         self.vehicle_type: int | None = None
         self.mode_changes = 0
+        self._since_us = dict.fromkeys(_STATES, 0)
+        """Time of the newest mode, arming and type."""
         self.batteries: dict[int, tuple[int, BatteryReport]] = {}
         """Time and content of the batteries, by number."""
         self._modes: list[str] = []
@@ -74,15 +81,20 @@ class Reported:
                 self._newest[name] = (report.time_us, number)
         if report.battery is not None and 0 <= report.battery.number < MAX_BATTERIES:
             self.batteries[report.battery.number] = (report.time_us, self._joined(report))
-        if report.armed is not None:
-            self.armed = report.armed
-        if report.vehicle_type is not None:
-            self.vehicle_type = report.vehicle_type
         if report.mode and report.mode != self.mode:
             self.mode_changes += 1
-            self.mode = report.mode
         if report.mode:
             self.custom_mode = self._number_of(report)
+        for name, unknown in _STATES.items():
+            if (value := getattr(report, name)) != unknown:
+                self._since_us[name] = report.time_us
+                setattr(self, name, value)
+
+    def expire(self, now_us: int, timeout_us: int) -> None:
+        """Discard mode, arming and type if they are too old."""
+        for name, unknown in _STATES.items():
+            if now_us - self._since_us[name] > max(timeout_us, RARE_US):
+                setattr(self, name, unknown)
 
     def _joined(self, report: VehicleReport) -> BatteryReport:
         """Join a battery with its other report: cells are reported separately from the rest."""

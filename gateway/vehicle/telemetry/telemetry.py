@@ -309,7 +309,7 @@ class Telemetry:
         reported, time_us = self.health.reported, report.time_us
         reported.update(report)
         found: list[Answer] = [Reply(message) for message in named_values(report)]
-        if report.attitude_rad is not None:
+        if report.attitude_rad is not None and not self.health.is_fused(time_us):
             found += self._on_reported(time_us, ATTITUDE_MESSAGES)
         if report.battery is not None:
             stream = self.streams[mavlink.MAVLINK_MSG_ID_BATTERY_STATUS]
@@ -339,7 +339,7 @@ class Telemetry:
         if self._first_us is None:
             self._first_us = fix.time_us
         known = self.health.is_reported or fix.time_us - self._first_us >= WITHOUT_IMU_US
-        if self.health.has_imu or not known:
+        if self.health.is_fused(fix.time_us) or not known:
             return []
         return self._on_reported(fix.time_us, POSITION_MESSAGES)
 
@@ -391,6 +391,7 @@ class Telemetry:
 
     def poll(self, now_us: int) -> list[Answer]:
         """Return the timed messages that are due."""
+        self.health.reported.expire(now_us, self.health.silent_us)
         if not self._polled:
             self._polled, self._timed_due_us = True, None
             for k, message_id in enumerate(self._timed):
@@ -469,7 +470,7 @@ class Telemetry:
             return None
         reference_m = self._reference_alt_m
         height_m = self.health.reported.value("alt_home_m", now_us, self.health.silent_us)
-        if height_m is not None:
+        if height_m is not None and not self.health.is_fused(now_us):
             reference_m = self.state.alt_amsl_m - height_m
         return messages.global_position_int(self.state, reference_m)
 
