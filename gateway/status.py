@@ -1,7 +1,7 @@
 """Status of the daemon at one moment, for live view, status command and metrics."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gateway.aircraft import Aircraft
 from gateway.geometry.quaternion import to_euler
@@ -53,6 +53,8 @@ class AircraftStatus:
     mark: RelativeLocation | None
     boards: tuple[NodeStatus, ...]
     """The newest report of each node."""
+    origins: dict[str, str] = field(default_factory=dict)
+    """Origin of attitude and position: the samples, the vehicle's own autopilot, its fixes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +86,7 @@ class Snapshot:
     """Requests of clients that were refused, failed or not answered."""
 
 
-def status_of(aircraft: Aircraft) -> AircraftStatus:
+def status_of(aircraft: Aircraft, now_us: int) -> AircraftStatus:
     """Return the present status of an aircraft."""
     vehicle, state = aircraft.vehicle, aircraft.state
     home, here = vehicle.telemetry.home, None
@@ -96,6 +98,7 @@ def status_of(aircraft: Aircraft) -> AircraftStatus:
         _seen_from(here, None if home is None else home.location),
         _seen_from(here, vehicle.plan.mark.location),
         vehicle.health.statuses,
+        vehicle.telemetry.origins(now_us),
     )
 
 

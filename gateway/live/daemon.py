@@ -279,7 +279,7 @@ class Daemon:
             refused=self._pipeline.refused,
             forged=self._pipeline.forged,
             simulated=self._receiver is not None,
-            aircraft=tuple(status_of(one) for _, one in aircraft),
+            aircraft=tuple(status_of(one, self.now_us()) for _, one in aircraft),
             recorder=self._recorder.status(),
             requests=self._pipeline.failed_requests,
             slow_s=self._lag.longest_us / US_PER_S if self._lag.is_slow else 0.0,

@@ -12,6 +12,7 @@ from gateway.records import BatteryReport, GpsFix, NodeId, VehicleReport
 from gateway.sources.kinds import make_sources
 from gateway.sources.sampling import fix_at, imu_raw
 from gateway.sources.settings import SourceSettings, nodes_of, parse_source
+from gateway.status import status_of
 from gateway.wire.framing import encode_frame
 from tests.kit.pipeline_bench import PipelineBench
 
@@ -143,9 +144,12 @@ def test_samples_of_a_source_are_fused(flight: Flight) -> None:
     assert (attitude.roll, attitude.pitch) == pytest.approx((0.0, 0.0), abs=0.02)
 
 
-@pytest.mark.parametrize(("samples_until_s", "roll"), [(20.0, 0.0), (2.0, 0.5)])
+@pytest.mark.parametrize(
+    ("samples_until_s", "roll", "origin"),
+    [(20.0, 0.0, "fused from samples"), (2.0, 0.5, "reported by its autopilot")],
+)
 def test_reported_attitude_is_used_only_without_samples(
-    flight: Flight, samples_until_s: float, roll: float
+    flight: Flight, samples_until_s: float, roll: float, origin: str
 ) -> None:
     for count in range(1, 1001):
         flight.now_us = count * 10_000
@@ -155,6 +159,7 @@ def test_reported_attitude_is_used_only_without_samples(
             flight.report(attitude_rad=(0.5, 0.0, 1.0), alt_home_m=99.0)
     rolls = [each.roll for each in flight.messages if each.get_type() == "ATTITUDE"]
     assert rolls[-20:] == pytest.approx([roll] * 20, abs=0.02)
+    assert status_of(flight.pipeline.find(1), flight.now_us).origins["attitude"] == origin
 
 
 def test_mode_arming_and_type_expire(flight: Flight) -> None:

@@ -182,6 +182,12 @@ def _summary(snapshot: Record) -> str:
         for vehicle_id, state in snapshot["states"]
     ]
     lines += [
+        f"aircraft {one['vehicle_id']}: "
+        + "; ".join(f"{what}: {origin}" for what, origin in one["origins"].items())
+        for one in snapshot["aircraft"]
+        if snapshot["report"]["sources"]
+    ]
+    lines += [
         f"aircraft {one['vehicle_id']}: {what} {way['distance_m']:.0f} m, {way['bearing_deg']:.0f}°"
         for one in snapshot["aircraft"]
         for what in ("home", "mark")

@@ -41,7 +41,7 @@ from gateway.vehicle.encoding import AUTOPILOTS, CUSTOM_MODES, MODE_NAME
 from gateway.vehicle.plan import Home, Location, is_good_enough, location_of
 from gateway.vehicle.service import Answer, Reply
 from gateway.vehicle.telemetry import messages
-from gateway.vehicle.telemetry.health import GPS, Health
+from gateway.vehicle.telemetry.health import AHRS, GPS, Health
 from gateway.vehicle.telemetry.messages import high_latency2
 from gateway.vehicle.telemetry.reported import WITHOUT_IMU_US, battery_status, named_values
 from gateway.vehicle.telemetry.streams import (
@@ -262,6 +262,15 @@ class Telemetry:
         flying = self.motion.landed_state == IN_AIR and rule.startswith("flying")
         recording = self.health.recording and rule.endswith("recording")
         return flying or recording or rule == "always"
+
+    def origins(self, now_us: int) -> dict[str, str]:
+        """Return the origin of the present attitude and position; see `Health.is_fused`."""
+        health = self.health
+        if health.is_fused(now_us):
+            return dict.fromkeys(("attitude", "position"), "fused from samples")
+        attitude = "reported by its autopilot" if health.is_alive(AHRS, now_us) else "unknown"
+        position = "its GPS fixes" if health.has_fix(now_us) else "unknown"
+        return {"attitude": attitude, "position": position}
 
     def on_state(self, state: NavState, sample: ImuSample) -> list[Answer]:
         """Process a navigation state and its IMU sample, and return the messages due."""
