@@ -176,7 +176,19 @@ def _summary(snapshot: Record) -> str:
         lines.append(
             f"this computer is too slow: up to {snapshot['slow_s']:.1f} s late, samples are lost"
         )
-    lines += [
+    lines += _aircraft_lines(snapshot)
+    hub = snapshot["hub"]
+    counts = [f"{hub[key]} {key}" for key in hub if hub[key] or key == "published"]
+    lines.append("MAVLink frames: " + ", ".join(counts))
+    requests = [f"{snapshot[key]} {key}" for key in ("refused", "forged") if snapshot[key]]
+    if requests:
+        lines.append("requests: " + ", ".join(requests) + "; see mavgate status --requests")
+    return "\n".join(lines)
+
+
+def _aircraft_lines(snapshot: Record) -> list[str]:
+    """Describe where each aircraft is, and with sources the origin of its attitude and position."""
+    lines = [
         f"aircraft {vehicle_id}: {_position(state['lat_deg'], state['lon_deg'])}, "
         f"{figure(state['alt_amsl_m'], '.1f')} m"
         for vehicle_id, state in snapshot["states"]
@@ -193,13 +205,7 @@ def _summary(snapshot: Record) -> str:
         for what in ("home", "mark")
         if (way := one[what]) is not None and way["distance_m"] is not None
     ]
-    hub = snapshot["hub"]
-    counts = [f"{hub[key]} {key}" for key in hub if hub[key] or key == "published"]
-    lines.append("MAVLink frames: " + ", ".join(counts))
-    requests = [f"{snapshot[key]} {key}" for key in ("refused", "forged") if snapshot[key]]
-    if requests:
-        lines.append("requests: " + ", ".join(requests) + "; see mavgate status --requests")
-    return "\n".join(lines)
+    return lines
 
 
 def _source_lines(snapshot: Record) -> list[str]:
