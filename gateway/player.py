@@ -29,12 +29,17 @@ from gateway.recordings.workshop.trimming import NOTHING_WITHIN
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle
+from gateway.vehicle.request_reader import BROADCAST
+from gateway.vehicle.services.parameters import Metadata
+from gateway.vehicle_state.senders import AUTOPILOT
 from gateway.wire.frame_editing import renumbered
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 
 READY_S: Final = 3.0
 """Maximum time to wait for names to be resolved."""
 READY_STEP_S: Final = 0.01
+MAX_COMPONENTS: Final = 32
+"""Maximum number of components that answer in addition to the vehicles."""
 RESOLVING: Final = "resolving"
 REFUSED: Final = "refused"
 
@@ -99,13 +104,7 @@ class PlayerDaemon:
         )
         self._numbering = _Numbering()
         metadata = Aircraft(1, settings.default_aircraft).vehicle.metadata
-        self._vehicles = [
-            RecordedVehicle(
-                played_as, self._answers_of(flight, system_id, played_as), metadata.of(played_as)
-            )
-            for flight in flights
-            for system_id, played_as in flight.system_ids.items()
-        ]
+        self._vehicles = self._make_vehicles(flights, metadata)
         self._timer: asyncio.TimerHandle | None = None
         self.ended = asyncio.Event()
         self.edge = PlayerEdge(
@@ -116,7 +115,7 @@ class PlayerDaemon:
             files=files,
             on_end=self.ended.set,
         )
-        played = [vehicle.system_id for vehicle in self._vehicles]
+        played = sorted({vehicle.system_id for vehicle in self._vehicles})
         identity = identity_verb(lambda: played, self._hub.endpoints)
         self._control = ControlServer(socket_path("play"), identity, self.edge.verbs())
 
@@ -174,9 +173,34 @@ class PlayerDaemon:
         player.pause(self._now_us())
         return player
 
-    def _answers_of(self, flight: PlayedFlight, system_id: int, played_as: int) -> VehicleAnswers:
+    def _make_vehicles(
+        self, flights: Sequence[PlayedFlight], metadata: Metadata
+    ) -> list[RecordedVehicle]:
+        """Build the components that answer, up to a limit: first the vehicles of all systems."""
+        systems = [(flight, *ids) for flight in flights for ids in flight.system_ids.items()]
+        vehicles, others = [], []
+        for flight, system_id, played_as in systems:
+            vehicle, *rest = flight.answers.components(system_id)
+            others += [(flight, system_id, played_as, component) for component in rest]
+            answers = self._answers_of(flight, system_id, played_as, vehicle)
+            shared = (BROADCAST, *({AUTOPILOT} - {vehicle, *rest}))
+            own, ids = metadata.of(played_as), (vehicle, *shared)
+            vehicles.append(RecordedVehicle(played_as, answers, own, components=ids))
+        for one in others[:MAX_COMPONENTS]:
+            answers = self._answers_of(*one)
+            vehicles.append(RecordedVehicle(one[2], answers, components=one[3:]))
+        return vehicles
+
+    def _answers_of(
+        self, flight: PlayedFlight, system_id: int, played_as: int, component: int
+    ) -> VehicleAnswers:
         return VehicleAnswers(
-            flight.answers, system_id, played_as, lambda: self._player.position_us - flight.shift_us
+            flight.answers,
+            system_id,
+            played_as,
+            lambda: self._player.position_us - flight.shift_us,
+            component,
+            self._player.newest,
         )
 
     def _send(self, frames: Iterable[bytes]) -> None:

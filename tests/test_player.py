@@ -6,7 +6,7 @@ import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -19,21 +19,28 @@ from gateway.hub.hub import SENDS_AT_ONCE
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import lay_out, open_flights
-from gateway.records import Outgoing
+from gateway.records import Incoming, Outgoing
+from gateway.vehicle.recorded_vehicle import RecordedAction
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_splitter import frame_of
 from gateway.wire.recorded_frames import RecordedFrame
+from tests.conftest import ManualClock
+from tests.kit.ground_station import GroundStation, qgroundcontrol
 from tests.kit.hub import Station
 from tests.kit.mavlink import STATION, Sender
 from tests.kit.process import until
 from tests.kit.recordings import records_of, write_tlog
 from tests.ports import free_port
+from tests.recordings import test_autopilot_record
 from tests.recordings.flights import OPTIONS
+from tests.recordings.formats import flown
 
 pytestmark = pytest.mark.io
 
 PARAMETERS = 26
 LIMIT_S = 60
+END_US = 1 << 62
+DENIED, UNSUPPORTED = 2, 3
 
 
 def recording(step_us: int = 1) -> list[RecordedFrame]:
@@ -82,13 +89,18 @@ async def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator
     with ExitStack() as opened:
 
         def make(
-            *urls: str, records: list[RecordedFrame] | None = None, **plan: Any
+            *urls: str,
+            records: list[RecordedFrame] | None = None,
+            log: Path | None = None,
+            **plan: Any,
         ) -> PlayerDaemon:
-            path = write_tlog(tmp_path / "a.tlog", records or recording())
+            path = log or write_tlog(tmp_path / "a.tlog", records or recording())
             flights = open_flights([path], OPTIONS, opened)
             played = lay_out(flights, with_commands=plan.get("with_commands", False))
             daemon = PlayerDaemon(settings_of(*urls), played, PlayPlan(**plan), ["a.tlog"])
             opened.callback(daemon.close)
+            # A log is open until its end has been read.
+            opened.callback(lambda: [None for _ in iter(lambda: daemon._player.prepare(END_US), 1)])
             return daemon
 
         yield make
@@ -162,6 +174,122 @@ async def test_all_parameters_arrive_with_consecutive_sequence_numbers(
     ]
     # What was played before ended with 1; the answers go on from there.
     assert [f[4] for f in station.frames[:PARAMETERS]] == list(range(2, 2 + PARAMETERS))
+
+
+class Played:
+    """The answering components of a player, as one vehicle for the scripted ground station."""
+
+    def __init__(self, daemon: PlayerDaemon) -> None:
+        self._parts = daemon._vehicles
+        self.system_id = self._parts[0].system_id
+
+    def handle(self, incoming: Incoming, now_us: int) -> list[RecordedAction]:
+        return [action for part in self._parts for action in part.handle(incoming, now_us)]
+
+    def poll(self, now_us: int) -> list[RecordedAction]:
+        return [action for part in self._parts for action in part.poll(now_us)]
+
+    def next_due_us(self) -> int | None:
+        due = (part.next_due_us() for part in self._parts)
+        return min((us for us in due if us is not None), default=None)
+
+
+def log_of(name: str, folder: Path) -> Path:
+    """Write a flight by ArduPilot, PX4, or as a tlog of the former with a camera and modes."""
+    path = folder / name
+    if path.suffix == ".ulg":
+        return flown.write(path, test_autopilot_record.px4_log())
+    written = test_autopilot_record.write(folder / "flight.bin")
+    if path.suffix == ".bin":
+        return written
+    records = test_autopilot_record.translated(written)
+    camera, beat = Sender(7, 100), mavlink.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3)
+    versions = [mavlink.MAVLink_autopilot_version_message(32, 1, 0, 0, 0, [0] * 8, [0] * 8, [0] * 8,
+                                                          0, 0, 1)]  # fmt: skip
+    frames = [Sender(7).pack(each) for each in versions]
+    frames += [camera.pack(each) for each in (beat, *camera_messages())]
+    return write_tlog(path, [*records_of(frames, 1), *records])
+
+
+def camera_messages() -> list[Any]:
+    lens = mavlink.MAVLink_camera_information_message
+    storage = mavlink.MAVLink_storage_information_message
+    image = mavlink.MAVLink_camera_image_captured_message
+    return [
+        lens(5, [0] * 32, [0] * 32, 1, 24.0, 0, 0, 1920, 1080, 0, 0, 0, b""),
+        *(storage(5, number, 2, 2, 64.0, 1.0, 63.0, 0, 0) for number in (1, 2)),
+        *(image(5, 0, 1, 0, 0, 0, 0, [1, 0, 0, 0], n, 1, b"") for n in range(4)),
+    ]
+
+
+ARDUPILOT_MODES = 28
+READY = {
+    "flight.bin": (ARDUPILOT_MODES, 3, (2, 0, 0), []),
+    "flight.ulg": (26, 1, (0, 0, 0), []),
+    "flight.tlog": (ARDUPILOT_MODES, 3, (2, 0, 0), [100]),
+}
+"""Number of modes and parameters, of items of plans, and the cameras."""
+
+
+@pytest.mark.parametrize("one_by_one", [True, False])
+@pytest.mark.parametrize("name", READY)
+def test_qgroundcontrol_becomes_ready(
+    make: Make, tmp_path: Path, clock: ManualClock, name: str, one_by_one: bool
+) -> None:
+    daemon = make(log=log_of(name, tmp_path), paused=True)
+    station = GroundStation(cast(Any, Played(daemon)), clock)
+    daemon._player.step(0, 3)
+    station.inbox += [mavlink.MAVLink(None).decode(bytearray(f)) for f in daemon._player.held()]
+    began_us = clock.now_us
+    ready = qgroundcontrol(station, one_by_one=one_by_one)
+    found = (len(ready.modes), len(ready.parameters), ready.plans, ready.cameras)
+    assert found == READY[name]
+    assert clock.now_us - began_us < 2_000_000
+
+
+REQUESTS = {
+    "storage 2": (100, 261, (2,), [2]),
+    "every storage": (100, 261, (0,), [1, 2]),
+    "storage that is not there": (100, 261, (3,), DENIED),
+    "image 2": (100, 263, (2, 0), [2]),
+    "images from 1 to 2": (100, 263, (1, 2), [1, 2]),
+    "images from 2 on": (100, 263, (2, -1), [2, 3]),
+    "every image": (100, 263, (-1, 0), [0, 1, 2, 3]),
+    "image that is not there": (100, 263, (9,), DENIED),
+    "camera that a camera drives": (100, 259, (1,), DENIED),
+    "version of a camera": (100, 148, (), UNSUPPORTED),
+    "telemetry before it is played": (1, 1, (), mavlink.MAV_RESULT_TEMPORARILY_REJECTED),
+    "parameters as messages": (1, 22, (), UNSUPPORTED),
+}
+"""Component, message and parameters of a request; the numbers of the answers, or the result."""
+
+
+@pytest.mark.parametrize("name", REQUESTS)
+def test_request_selects_by_its_parameters(
+    make: Make, tmp_path: Path, clock: ManualClock, name: str
+) -> None:
+    component, message_id, params, expected = REQUESTS[name]
+    daemon = make(log=log_of("flight.tlog", tmp_path), paused=True)
+    station = GroundStation(cast(Any, Played(daemon)), clock)
+    ack, *found = station.command(512, message_id, *params, target=(7, component))
+    numbers = [getattr(m, "storage_id", getattr(m, "image_index", None)) for m in found]
+    assert (numbers or ack.result) == expected
+    older = {261: 525, 263: 2002}.get(message_id)
+    if older is not None and len(params) == 1:
+        ack, *found = station.command(older, *params, target=(7, component))
+        assert (len(found) or ack.result) == (len(numbers) or ack.result)
+
+
+def test_instances_of_telemetry_are_those_played_last(
+    make: Make, tmp_path: Path, clock: ManualClock
+) -> None:
+    daemon = make(log=log_of("flight.bin", tmp_path), paused=True)
+    station = GroundStation(cast(Any, Played(daemon)), clock)
+    while not daemon._player.newest(7 << 8 | 1, mavlink.MAVLINK_MSG_ID_VFR_HUD):
+        daemon._player.step(0, 10)
+    for wanted, expected in ((0, [0, 1]), (1, [1]), (2, [])):
+        _, *found = station.command(512, mavlink.MAVLINK_MSG_ID_BATTERY_STATUS, wanted)
+        assert [m.id for m in found] == expected
 
 
 async def test_answer_is_sent_after_the_batch_before_it(make: Make, station: PlayedTo) -> None:

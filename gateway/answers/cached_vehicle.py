@@ -17,12 +17,7 @@ from gateway.records import Incoming, Outgoing
 from gateway.vehicle.plan import ACCEPTED
 from gateway.vehicle.recorded_vehicle import PARAM_VALUE, RecordedVehicle
 from gateway.vehicle.service import Request
-from gateway.vehicle.services.commands import (
-    REQUEST_MESSAGE,
-    SHORTHANDS,
-    read_command,
-    requested_message,
-)
+from gateway.vehicle.services.commands import read_command, requested_message
 from gateway.vehicle.services.ftp import FtpService, Opcode, decode_packet, full_path
 from gateway.vehicle.services.parameter_service import BY_NAME
 
@@ -98,9 +93,8 @@ class CachedVehicle(RecordedVehicle):
             case "MISSION_ACK" if message.type == ACCEPTED:
                 return self._downloads.pop(_download(request), False)
             case "COMMAND_LONG" | "COMMAND_INT":
-                command = read_command(request)
-                is_known = command.number == REQUEST_MESSAGE or command.number in SHORTHANDS
-                return is_known and self._held.has_message(requested_message(command))
+                wanted = requested_message(read_command(request))
+                return wanted is not None and self._held.has_message(wanted.message_id)
             case "FILE_TRANSFER_PROTOCOL":
                 return self._files.holds(request)
         return False

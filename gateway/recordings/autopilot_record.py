@@ -240,6 +240,11 @@ class RecordTranslator:
         self._numbers: dict[str, int] = {name: n for n, name in enumerate(log.parameters)}
         self._texts = 0
 
+    def introduction(self) -> Iterator[bytes]:
+        """Yield the frames with modes, parameters and plans at the start of the log."""
+        encoder = Encoder(self._encoder.system_id)
+        return (encoder.encode(message).frame for message in self._introduction())
+
     def frames(self) -> Iterator[RecordedFrame]:
         """Yield the frames at civil times, or at times since the start of the log."""
         stamper = Stamper(self._log.unix_us_at_zero or 0)

@@ -257,7 +257,10 @@ def _open_made(
     if estimates != "fused":
         for part in parts:
             log = open_record(part, options)
-            add(RecordTranslator(log).frames())
+            translator = RecordTranslator(log)
+            for frame in translator.introduction():
+                flight.answers.add_frame(frame, 0)
+            add(translator.frames())
             flight.remarks += log.remarks
             options = replace(options, system_id=beside_id(log.vehicle_id), progress=None)
     if estimates != "own":

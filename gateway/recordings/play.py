@@ -25,7 +25,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from gateway.answers.log_answers import answers_of, telemetry_of
+from gateway.answers.log_answers import answers_of, key_of, telemetry_of
 from gateway.recordings.tlog import SEEK_BYTES, STRIDE, TlogScanner
 from gateway.recordings.tlog_index import TlogIndex
 from gateway.units import US_PER_S
@@ -53,6 +53,8 @@ LEAST_SPEED: Final = 0.1
 GREATEST_SPEED: Final = 100.0
 AS_FAST_AS_POSSIBLE: Final = math.inf
 END_OF_TIME_US: Final = 1 << 64
+MAX_NUMBERS: Final = 256
+"""Maximum number of frames of one message and sender with different numbers that are stored."""
 CLOCK_JUMP_US: Final = 86_400 * US_PER_S
 """A longer gap is a change of the clock and is skipped."""
 
@@ -128,7 +130,7 @@ class Track:
     def seek(self, time_us: int) -> list[bytes]:
         """Move to the first record at or after a time; return the frames of the state before it."""
         wanted_us = time_us - self._shift_us
-        newest: dict[tuple[int, int, int], bytes] = {}
+        newest: dict[tuple[int, int], bytes] = {}
         batches = self._read_from(self._source.index.offset_before(wanted_us, CONTEXT_RECORDS))
         self._records = iter(())
         for batch in batches:
@@ -252,8 +254,8 @@ class Player:
         self._anchor = (now_us, self.begin_us)
         self.position_us = self.begin_us
         """Recorded time of the last frame played."""
-        self._held: dict[tuple[int, int, int], bytes] = {}
-        """The newest message of each kind that contains the state of a vehicle."""
+        self._newest: dict[tuple[int, int], dict[bytes, bytes]] = {}
+        """The newest frames by sender and message, and by their number if they have one."""
         self._context = self._seek_tracks(self.begin_us)
 
     @property
@@ -300,7 +302,15 @@ class Player:
         For a message that was not sent before this position, the first one after it is returned.
         """
         ahead = {_kind_of(frame): frame for track in self._tracks for frame in track.ahead}
-        return list((ahead | self._held).values())
+        newest = {
+            kind: frame for kind, frames in self._newest.items() if kind[1] in _CONTEXT
+            for frame in frames.values()
+        }  # fmt: skip
+        return list((ahead | newest).values())
+
+    def newest(self, origin: int, message_id: int) -> list[bytes]:
+        """Return the newest frames of a message and sender (system << 8 | component)."""
+        return list(self._newest.get((origin, message_id), {}).values())
 
     def prepare(self, time_us: int) -> bool:
         """Do a part of the work for a seek; return whether the seek would be immediate now."""
@@ -342,8 +352,15 @@ class Player:
 
     def _seek_tracks(self, time_us: int) -> list[bytes]:
         context = [frame for track in self._tracks for frame in track.seek(time_us)]
-        self._held = {_kind_of(frame): frame for frame in context}
+        self._newest = {}
+        for frame in context:
+            self._keep(frame)
         return context
+
+    def _keep(self, frame: bytes) -> None:
+        frames = self._newest.setdefault(_kind_of(frame), {})
+        if len(frames) < MAX_NUMBERS:
+            frames[key_of(frame)] = frame
 
     def _next_track(self) -> Track | None:
         """Find the track whose next frame is the earliest; None at the end of the range."""
@@ -361,8 +378,7 @@ class Player:
         self.position_us = track.peek_us() or self.position_us
         self.sent += 1
         frame = track.take()
-        if message_id_of(frame) in _CONTEXT:
-            self._held[_kind_of(frame)] = frame
+        self._keep(frame)
         return frame
 
     def _end(self, now_us: int) -> None:
@@ -402,5 +418,6 @@ class Player:
         self.position_us = time_us - kept_us
 
 
-def _kind_of(frame: bytes) -> tuple[int, int, int]:
-    return (*origin_of(frame), message_id_of(frame))
+def _kind_of(frame: bytes) -> tuple[int, int]:
+    system, component = origin_of(frame)
+    return system << 8 | component, message_id_of(frame)

@@ -217,12 +217,12 @@ class PackedMessage(msgspec.Struct, frozen=True, gc=False):
 
 
 class Encoder:
-    """Frames of one system id; one sequence for all its messages."""
+    """Frames of one component; one sequence for all its messages."""
 
-    def __init__(self, system_id: int) -> None:
+    def __init__(self, system_id: int, component_id: int = AUTOPILOT_COMPONENT) -> None:
         """Start the sequence."""
         self.system_id = system_id
-        self._origin = (system_id, AUTOPILOT_COMPONENT)
+        self._origin = (system_id, component_id)
         self._keys: dict[int, bytes] = {}
         """System, component and message as in a frame, by message id."""
         self._sequence = 0

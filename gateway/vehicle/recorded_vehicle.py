@@ -6,14 +6,16 @@
 | PARAM_SET                            | PARAM_ERROR and the unchanged value                     |
 | MISSION_REQUEST_LIST and its items   | the recorded items, if any                              |
 | an upload, MISSION_CLEAR_ALL         | MISSION_ACK denied                                      |
-| REQUEST_MESSAGE, GET_HOME_POSITION … | the recorded message; unsupported if it was never sent  |
+| REQUEST_MESSAGE, GET_HOME_POSITION … | the recorded messages that it selects; denied if it      |
+|                                      | selects none, unsupported if there are none             |
 | SET_MESSAGE_INTERVAL                 | fewer messages are played to the client that asks       |
 | any other command, SET_MODE          | denied: the past cannot be changed                      |
 | logs, terrain, extended parameters   | empty lists                                             |
 | files, COMPONENT_METADATA            | for own recordings, the parameters' metadata            |
-| PING, TIMESYNC                       | answered                                                |
+| PING, TIMESYNC, PROTOCOL_VERSION     | answered, as the player is the sender                   |
 
-A station that tries to change something is also sent a text.
+Each component of a recorded system answers for itself. A station that tries to change something is
+also sent a text.
 """
 
 import math
@@ -24,27 +26,32 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
-from gateway.vehicle.encoding import MAVLINK_MSG_ID_COMPONENT_METADATA, Encoder
+from gateway.vehicle.encoding import (
+    MAVLINK_MSG_ID_COMPONENT_METADATA,
+    MAVLINK_MSG_ID_PROTOCOL_VERSION,
+    Encoder,
+    protocol_version,
+)
 from gateway.vehicle.plan import KINDS, MISSION, read_item
 from gateway.vehicle.request_log import UNANSWERED
-from gateway.vehicle.request_reader import RequestReader
+from gateway.vehicle.request_reader import VEHICLE, RequestReader
+from gateway.vehicle.requested_messages import DISTINGUISHED_BY, MessageRequest, whole
 from gateway.vehicle.service import NOTICE, Answer, Reply, Request, Service, StatusText
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
+    GET_INTERVAL,
     HEARTBEAT,
     KEEPS_CLIENTS_US,
     NONE,
-    REQUEST_MESSAGE,
+    NOT_NOW,
     SET_INTERVAL,
-    SHORTHANDS,
     UNSUPPORTED,
     Command,
     CommandService,
     QueryService,
     read_command,
     requested_message,
-    whole,
 )
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.missions import MissionService
@@ -53,6 +60,7 @@ from gateway.vehicle.services.parameters import Metadata
 from gateway.vehicle.telemetry.announcements import Announcer
 
 PARAM_VALUE: Final = mavlink.MAVLINK_MSG_ID_PARAM_VALUE
+AVAILABLE_MODES: Final = mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES
 THE_PAST: Final = StatusText(NOTICE, "This is a recording: nothing can be changed in it")
 TEXTS_AT_ONCE: Final = 3
 TEXT_INTERVAL_US: Final = 20 * US_PER_S
@@ -66,11 +74,11 @@ class Answers(Protocol):
     """The recorded answers of one vehicle, as of the moment that is played."""
 
     def has_message(self, message_id: int) -> bool:
-        """Return whether the vehicle sent a message at all."""
+        """Return whether the component sent a message at all that a station may request."""
         ...
 
     def frames(self, message_id: int) -> list[bytes]:
-        """Return the frames that answer a request for a message."""
+        """Return the frames of a message that are known now, among which a request selects."""
         ...
 
     def mission(self, kind: int) -> Sequence[bytes] | None:
@@ -124,10 +132,12 @@ class _Commands(Service):
         self._system_id = system_id
         self._answers = answers
         self._metadata = metadata
+        self._mavlink: Any = mavlink.MAVLink(None)
 
     def changes_state(self, request: Request) -> bool:
-        number = read_command(request).number
-        return number not in (REQUEST_MESSAGE, SET_INTERVAL, *SHORTHANDS)
+        command = read_command(request)
+        is_query = command.number in (SET_INTERVAL, GET_INTERVAL)
+        return not is_query and requested_message(command) is None
 
     def refuse(self, request: Request, result: int) -> list[Answer]:
         return [read_command(request).ack(result)]
@@ -136,15 +146,34 @@ class _Commands(Service):
         command = read_command(request)
         if command.number == SET_INTERVAL:
             return self._thin(command)
-        return self._send(command, requested_message(command))
+        wanted = requested_message(command)
+        return [command.ack(UNSUPPORTED)] if wanted is None else self._send(command, wanted)
 
-    def _send(self, command: Command, message_id: int) -> list[Answer]:
-        client_id = command.request.client_id
+    def _send(self, command: Command, wanted: MessageRequest) -> list[Answer]:
+        message_id, request = wanted.message_id, command.request
         frames = self._answers.frames(message_id)
-        found: list[Answer] = [Outgoing(frame, message_id, client_id) for frame in frames]
+        chosen = frames if message_id not in DISTINGUISHED_BY else self._chosen(frames, wanted)
+        found: list[Answer] = [Outgoing(frame, message_id, request.client_id) for frame in chosen]
         if message_id == MAVLINK_MSG_ID_COMPONENT_METADATA and self._metadata is not None:
-            found = [command.request.reply(self._metadata.announcement(0))]
-        return [command.ack(ACCEPTED), *found] if found else [command.ack(UNSUPPORTED)]
+            found = [request.reply(self._metadata.announcement(0))]
+        elif message_id == MAVLINK_MSG_ID_PROTOCOL_VERSION and not frames:
+            found = [request.reply(protocol_version())]
+        if found:
+            return [command.ack(ACCEPTED), *found]
+        is_known = self._answers.has_message(message_id)
+        return [command.ack(DENIED if frames else NOT_NOW if is_known else UNSUPPORTED)]
+
+    def _chosen(self, frames: Sequence[bytes], wanted: MessageRequest) -> list[bytes]:
+        """Return the frames that a request selects, in the order of their numbers."""
+        read = [(self._mavlink.decode(bytearray(frame)), frame) for frame in frames]
+        chosen = [(message, frame) for message, frame in read if wanted.selects(message)]
+        if wanted.message_id == AVAILABLE_MODES and wanted.is_for_all and chosen:
+            # A station that requests all of them waits until the last one has come.
+            is_complete = len(chosen) >= chosen[0][0].number_modes
+            chosen = chosen if is_complete else []
+        fields = DISTINGUISHED_BY[wanted.message_id]
+        chosen.sort(key=lambda each: [getattr(each[0], field) for field in fields])
+        return [frame for _, frame in chosen]
 
     def _thin(self, command: Command) -> list[Answer]:
         """Grant a rate up to the recorded one; 0 means the default and -1 none, as in MAVLink."""
@@ -161,8 +190,9 @@ class _Commands(Service):
 
 
 class RecordedVehicle:
-    """One vehicle of a recording, under the system id with which it is played.
+    """One component of a recording, under the system id with which it is played.
 
+    `components` are its own id and further ones for which it answers; see `RequestReader`.
     Metadata of the parameters is used if it describes the recorded ones.
     """
 
@@ -172,14 +202,15 @@ class RecordedVehicle:
         answers: Answers,
         metadata: Metadata | None = None,
         files: FtpService | None = None,
+        components: Sequence[int] = VEHICLE,
     ) -> None:
         self.system_id = system_id
         self.metadata = metadata
         """Metadata of the recorded parameters; None if they are of another version."""
         if metadata is not None and not metadata.describes(answers.parameters()):
             self.metadata = None
-        self._reader = RequestReader(system_id)
-        self._encoder = Encoder(system_id)
+        self._reader = RequestReader(system_id, components)
+        self._encoder = Encoder(system_id, components[0])
         self._services: tuple[Service, ...] = (
             _Commands(system_id, answers, self.metadata),
             _Parameters(answers),

@@ -4,6 +4,7 @@ Invalid frames are counted and dropped.
 """
 
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -15,20 +16,28 @@ from gateway.wire.mavlink_signing import Verifier
 from gateway.wire.mavlink_splitter import SIGNED, START_V2
 
 BROADCAST: Final = 0
+VEHICLE: Final = (AUTOPILOT_COMPONENT, BROADCAST)
+"""Components for which the vehicle of a system answers."""
 BAD_SIGNATURE: Final = "bad signature"
 NOT_TRUSTED: Final = "not trusted; set trusted=yes at its endpoint"
 NOT_SIGNED: Final = "not signed; set the signing passphrase in the ground station"
 
 
 class RequestReader:
-    """Decode frames and check their sender and target."""
+    """Decode frames and check their sender and target.
 
-    def __init__(self, system_id: int) -> None:
+    `components` are the own component, and further ones for which it answers; with `BROADCAST`
+    among them it also answers requests to all components.
+    """
+
+    def __init__(self, system_id: int, components: Sequence[int] = VEHICLE) -> None:
         self.faults: Counter[str] = Counter()
         """Frames dropped, by reason."""
         self.verifier: Verifier | None = None
         """Checks signatures; with one, an unsigned client may only read."""
         self._system_id = system_id
+        self._targets = frozenset(components)
+        self._own = (system_id, components[0])
         self._mav: Any = mavlink.MAVLink(None)
 
     def read(self, incoming: Incoming, now_us: int) -> Request | None:
@@ -65,12 +74,11 @@ class RequestReader:
             return "unknown"
         # Only the pair of ids is ours: a companion computer shares the system id of its vehicle.
         sender = (message.get_srcSystem(), message.get_srcComponent())
-        if sender == (self._system_id, AUTOPILOT_COMPONENT):
+        if sender == self._own:
             return "own id"
         return message
 
     def _is_for_us(self, message: Any) -> bool:
         system = getattr(message, "target_system", BROADCAST)
         component = getattr(message, "target_component", BROADCAST)
-        is_ours = component in (BROADCAST, AUTOPILOT_COMPONENT)
-        return is_ours and system in (BROADCAST, self._system_id)
+        return component in self._targets and system in (BROADCAST, self._system_id)

@@ -1,12 +1,15 @@
 """Parameters, missions, home and version in a recording, and since when each is known."""
 
+import re
 import struct
 from typing import Any
 
 import pytest
+from pymavlink.dialects.v20 import all as all_messages
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.answers.log_answers import LogAnswers, VehicleAnswers
+from gateway.vehicle.requested_messages import DISTINGUISHED_BY, read_request
 from tests.kit.mavlink import frame_with, packed, read_back
 from tests.kit.recordings import SECOND_US, START_US, batch_of, index_of, records_of
 
@@ -132,6 +135,74 @@ def test_denied_upload_leaves_the_mission_unchanged(day: Day) -> None:
     mission = day.answers().mission(MISSION)
     assert mission is not None
     assert read_back(mission[0]).get_srcSystem() == 3
+
+
+UPLOADS = {
+    "cleared and uploaded at once": ("clear count ack 0 1 ack", [0, 1]),
+    "clear is never acknowledged": ("clear count 0 1 ack", [0, 1]),
+    "upload is not finished": ("clear count ack 0", []),
+    "clear is refused, upload accepted": ("clear count no 0 1 ack", [0, 1]),
+    "upload is refused at the end": ("clear count ack 0 1 no ack", []),
+    "item is refused once": ("count 0 no 1 ack", [0, 1]),
+    "uploaded, then cleared": ("count 0 1 ack clear ack", []),
+    "cleared during an upload": ("count 0 clear ack 1 ack", []),
+    "counted again": ("count 0 count 0 1 ack", [0, 1]),
+    "another station's upload": ("count 0 other 1 ack", [0, 1]),
+    "part written": ("count 0 1 ack part 1 ack", [0, 1]),
+    "nothing is acknowledged": ("clear count 0 1", None),
+}
+"""Messages in their order, and the numbers of the items of the mission after them."""
+
+
+@pytest.mark.parametrize("name", UPLOADS)
+@pytest.mark.parametrize("kind", [MISSION, FENCE])
+def test_mission_is_that_of_the_acknowledged_transfer(day: Day, name: str, kind: int) -> None:
+    words, expected = UPLOADS[name]
+    companion = (7, 191)
+    day.send(companion, mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    for word in words.split():
+        match word:
+            case "clear":
+                day.send(day.station, mavlink.MAVLink_mission_clear_all_message(3, 1, kind))
+            case "count":
+                day.send(day.station, count_of(2, kind, target=3))
+            case "part":
+                part = mavlink.MAVLink_mission_write_partial_list_message(3, 1, 1, 1, kind)
+                day.send(day.station, part)
+            case "other":
+                day.send(companion, count_of(5, kind, target=3))
+            case "ack" | "no":
+                day.send(day.vehicle, ack(kind, 0 if word == "ack" else 1))
+            case number:
+                day.send(day.station, item(int(number), kind, target=3))
+    mission = day.answers().mission(kind)
+    found = None if mission is None else [read_back(frame).seq for frame in mission]
+    assert found == expected
+
+
+def test_parameters_that_a_station_read_from_a_file_are_those_of_the_vehicle(day: Day) -> None:
+    day.send(day.vehicle, value("ALPHA", 1.0))
+    day.send((3, 190), value("ALPHA", 2.0), value("BETA", 3.0, 1))
+    found = day.answers().parameters()
+    assert {name: read_back(frame).param_value for name, frame in found.items()} == {
+        "ALPHA": 2.0, "BETA": 3.0,
+    }  # fmt: skip
+
+
+def test_every_message_that_is_requested_by_number_is_known() -> None:
+    for kind in all_messages.mavlink_map.values():
+        text = " ".join((kind.__doc__ or "").split())
+        selects = "REQUEST_MESSAGE" in text and re.search(r"param ?[23]", text)
+        selects = selects or kind.instance_field or "camera_device_id" in kind.fieldnames
+        assert not selects or kind.id in DISTINGUISHED_BY, kind.msgname
+    for command in all_messages.enums["MAV_CMD"].values():
+        older = re.fullmatch(r"MAV_CMD_(REQUEST|GET)_(.*)", command.name)
+        is_other = command.name.endswith(("_MESSAGE", "_INTERVAL", "OPERATOR_CONTROL"))
+        assert not older or is_other or read_request(command_number(command), (0.0,) * 7)
+
+
+def command_number(command: Any) -> int:
+    return int(all_messages.__dict__[command.name])
 
 
 def test_clearing_all_gives_empty_mission_fence_and_rally_points(day: Day) -> None:

@@ -19,6 +19,7 @@ class Station:
     patience = 400
     """Slices of time before it asks again: a busy machine may keep the gateway waiting."""
     ask_again_s = 1.0
+    target = (1, 1)
 
     def __init__(self, sock: socket.socket, version: int = 2) -> None:
         self.version = version

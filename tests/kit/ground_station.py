@@ -7,6 +7,7 @@ verbs, such as the one of the end-to-end tests.
 import math
 import struct
 from collections.abc import Callable, Container, Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -238,39 +239,92 @@ def command_int(number: int, x: int, y: int, z: float, frame: int = 5) -> Any:
     return to_vehicle("COMMAND_INT", frame, number, 0, 0, 0, 0, 0, 0, x, y, z)
 
 
-def qgroundcontrol(station: Any) -> None:
-    """Ask what QGroundControl 4.3 and its successor ask, in their order, with their patience."""
-    for message_id, kind in (
-        (148, "AUTOPILOT_VERSION"),
-        (300, "PROTOCOL_VERSION"),
-        (435, "AVAILABLE_MODES"),
-        (397, "COMPONENT_METADATA"),
-        (395, "COMPONENT_INFORMATION"),
-    ):
-        _request(station, message_id, kind)
-    load_parameters(station)
-    for mission_type in (0, 1, 2) if station.version == 2 else (0,):
-        message = to_vehicle("MISSION_REQUEST_LIST", mission_type)
-        [count] = station.ask(message, "MISSION_COUNT", timeout_s=0.05)[:1]
-        assert count.count == 0
-        station.send(to_vehicle("MISSION_ACK", 0, mission_type))
+@dataclass
+class Ready:
+    """What QGroundControl knows of a vehicle when its initial connection is complete."""
+
+    modes: list[str]
+    parameters: dict[str, float]
+    plans: tuple[int, int, int] = (0, 0, 0)
+    """Number of items of mission, fence and rally points."""
+    cameras: list[int] = field(default_factory=list)
+    """Components that sent CAMERA_INFORMATION."""
 
 
-def _request(station: Any, message_id: int, kind: str) -> None:
-    """Ask for a message until it comes or is refused."""
+def qgroundcontrol(station: Any, *, one_by_one: bool = True) -> Ready:
+    """Ask what QGroundControl asks, in the order of its state machine, with its patience.
+
+    Releases before 2026 request the modes `one_by_one`, and are not ready until the last one has
+    come or one was refused; newer ones request all of them, and wait for the last one. Of an
+    ArduPilot with files, the parameters are first requested as a file.
+    """
+    version = _request(station, 148, "AUTOPILOT_VERSION")
+    assert _request(station, 300, "PROTOCOL_VERSION") is not None, "QGroundControl uses MAVLink 1"
+    modes = _load_modes(station, one_by_one=one_by_one)
+    if _request(station, 397, "COMPONENT_METADATA") is None:
+        assert _request(station, 395, "COMPONENT_INFORMATION") is None
+    if version is not None and version.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_FTP:
+        path = b"@PARAM/param.pck?withdefaults=1"
+        packet = Packet(1, 0, Opcode.OPEN_FILE_RO, len(path), 0, 0, 0, path)
+        station.ask(ftp_message(packet, station.target), "FILE_TRANSFER_PROTOCOL", timeout_s=0.05)
+    parameters = load_parameters(station)
+    plans = [_load_plan(station, kind) for kind in ((0, 1, 2) if station.version == 2 else (0,))]
+    cameras = [
+        component for component in range(100, 106)
+        if any(m.get_srcComponent() == component for m in of_kind(station.inbox, "HEARTBEAT"))
+        and _request(station, 259, "CAMERA_INFORMATION", component=component)
+    ]  # fmt: skip
+    _request(station, 280, "GIMBAL_MANAGER_INFORMATION")
+    mission, fence, rally = *plans, *[0] * (3 - len(plans))
+    return Ready(modes, parameters, (mission, fence, rally), cameras)
+
+
+def _load_modes(station: Any, *, one_by_one: bool) -> list[str]:
+    names: dict[int, str] = {}
+    index, count = 0, 255
+    while index < count:
+        answer = _request(station, 435, "AVAILABLE_MODES", index + 1 if one_by_one else 0)
+        found = of_kind(station.inbox, "AVAILABLE_MODES")
+        names |= {m.payload[9]: bytes(m.payload[11:46]).rstrip(b"\0").decode() for m in found}
+        if answer is None:
+            break
+        assert not one_by_one or answer.payload[9] == index + 1
+        index, count = max(names), answer.payload[8]
+    return list(names.values())
+
+
+def _load_plan(station: Any, kind: int) -> int:
+    listing = to_vehicle("MISSION_REQUEST_LIST", kind, target=station.target)
+    count = station.ask(listing, "MISSION_COUNT", timeout_s=0.05)[-1].count
+    for seq in range(count):
+        request = to_vehicle("MISSION_REQUEST_INT", seq, kind, target=station.target)
+        items = station.ask(request, "MISSION_ITEM_INT", timeout_s=0.05)
+        assert items[-1].seq == seq
+    station.send(to_vehicle("MISSION_ACK", 0, kind, target=station.target))
+    return int(count)
+
+
+def _request(
+    station: Any, message_id: int, kind: str, index: int = 0, component: int = 1
+) -> Any | None:
+    """Ask for a message until it comes; None if it is refused."""
     found: list[Any] = []
+    target = (station.target[0], component)
     for _ in range(8):
-        found += station.send(command(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id))
+        request = command(mavlink.MAV_CMD_REQUEST_MESSAGE, message_id, index, target=target)
+        found += station.send(request)
         for _ in range(station.patience):
+            if any(results(found)):
+                return None
+            if {"COMMAND_ACK", kind} <= set(kinds(found)):
+                return of_kind(found, kind)[-1]
             found += station.wait(station.slice_s)
-            if any(results(found)) or {"COMMAND_ACK", kind} <= set(kinds(found)):
-                return
     raise AssertionError(f"{kind} never came")
 
 
 def load_parameters(station: Any) -> dict[str, float]:
     """List all, then ask for each missing one by its index; the values by name."""
-    listing = mavlink.MAVLink_param_request_list_message(1, 0)
+    listing = mavlink.MAVLink_param_request_list_message(station.target[0], 0)
     first, *_ = station.ask(listing, "PARAM_VALUE", timeout_s=0.05)
     count = first.param_count
 
@@ -285,7 +339,7 @@ def load_parameters(station: Any) -> dict[str, float]:
         # What comes next may be another one: still of the list, or asked for before.
         if not (missing := set(range(count)) - set(had())):
             break
-        read = to_vehicle("PARAM_REQUEST_READ", b"", min(missing))
+        read = to_vehicle("PARAM_REQUEST_READ", b"", min(missing), target=station.target)
         station.ask(read, "PARAM_VALUE", retries=20, timeout_s=0.01)
     assert set(had()) == set(range(count))
     return {m.param_id: m.param_value for m in had().values()}

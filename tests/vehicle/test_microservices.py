@@ -87,6 +87,7 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "request/interval-by-message": (
         command(512, 244, 30), "MESSAGE_INTERVAL", {"interval_us": 20_000, "message_id": 30},
     ),
+    "request/no-such-instance": (command(512, 105, 1), ACK, DENIED),
     "request/no-data": (command(512, 62), ACK, {"result": 1}),
     **{
         f"request/unknown-{number}": (command(512, number), ACK, UNSUPPORTED)
@@ -96,6 +97,8 @@ TABLE: dict[str, tuple[Any, str, dict[str, Any]]] = {
     "metadata/announcement": (command(512, 397), "COMPONENT_METADATA", {}),
     "metadata/deprecated": (command(512, 395), ACK, UNSUPPORTED),
     "modes/available": (command(512, 435, 0), "AVAILABLE_MODES", {}),
+    "modes/by-index": (command(512, 435, 1), "AVAILABLE_MODES", {}),
+    "modes/beyond-the-last": (command(512, 435, 2), ACK, DENIED),
     "modes/current": (command(512, 436), "CURRENT_MODE", {}),
     # parameter.html: read by name or index, set and reported, unknown ones refused.
     "parameter/list": (to_vehicle("PARAM_REQUEST_LIST"), VALUE, {}),
@@ -234,10 +237,15 @@ def test_answers_to_ping_and_timesync_are_not_answered(station: GroundStation) -
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_qgroundcontrol_connects_within_a_second(station: GroundStation, version: int) -> None:
+@pytest.mark.parametrize("one_by_one", [True, False])
+def test_qgroundcontrol_connects_within_a_second(
+    station: GroundStation, version: int, one_by_one: bool
+) -> None:
     station.version = version
     began_us = station.clock.now_us
-    qgroundcontrol(station)
+    ready = qgroundcontrol(station, one_by_one=one_by_one)
+    assert (ready.modes, ready.plans, ready.cameras) == (["Tracking"], (0, 0, 0), [])
+    assert ready.parameters
     assert station.clock.now_us - began_us < 1_000_000
 
 

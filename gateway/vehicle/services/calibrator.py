@@ -41,6 +41,7 @@ from gateway.sensing.calibrating import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S
+from gateway.vehicle.requested_messages import whole
 from gateway.vehicle.service import INFO, Answer, CalibrationMeasured, Service, StatusText
 from gateway.vehicle.services.commands import (
     ACCEPTED,
@@ -51,7 +52,6 @@ from gateway.vehicle.services.commands import (
     UNSUPPORTED,
     Command,
     Outcome,
-    whole,
 )
 from gateway.vehicle.telemetry.announcements import chunks
 

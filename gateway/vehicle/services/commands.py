@@ -23,8 +23,14 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval
 from gateway.units import DEGE7_PER_DEG, NS_PER_US, US_PER_S
-from gateway.vehicle.encoding import MAVLINK_MSG_ID_PROTOCOL_VERSION
 from gateway.vehicle.plan import GLOBAL_FRAMES
+from gateway.vehicle.requested_messages import (
+    REQUEST_MESSAGE,
+    SHORTHANDS,
+    MessageRequest,
+    read_request,
+    whole,
+)
 from gateway.vehicle.service import Answer, RecordingRequest, Reply, Request, Service
 from gateway.vehicle.telemetry.streams import OFF, Stream
 from gateway.vehicle.telemetry.telemetry import CARRIED_MESSAGES, Telemetry
@@ -39,7 +45,6 @@ NOT_IN_CONTROL: Final = 10
 """MAV_RESULT_NOT_IN_CONTROL of MAVLink's common.xml, which pymavlink's dialects lack."""
 
 NO_PROGRESS: Final = 255
-REQUEST_MESSAGE: Final = mavlink.MAV_CMD_REQUEST_MESSAGE
 SET_INTERVAL: Final = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
 GET_INTERVAL: Final = mavlink.MAV_CMD_GET_MESSAGE_INTERVAL
 RESPOND_TO_ALL: Final = 2
@@ -51,12 +56,6 @@ REFUSALS: Final = {
     mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: "The gateway is restarted on its own machine",
 }
 """Commands that are understood but denied, with the reason."""
-SHORTHANDS: Final = {
-    mavlink.MAV_CMD_GET_HOME_POSITION: mavlink.MAVLINK_MSG_ID_HOME_POSITION,
-    mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-    mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION: MAVLINK_MSG_ID_PROTOCOL_VERSION,
-}
-"""Older commands for single messages."""
 Outcome = tuple[int, list[Answer]]
 """Result of a command, and the answers after its acknowledgement."""
 Explain = Callable[[str, int], list[Answer]]
@@ -151,14 +150,9 @@ def read_command(request: Request) -> Command:
     return Command(request, m.command, (*first, m.param5, m.param6, m.param7))
 
 
-def whole(value: float) -> int:
-    """Read an integer parameter; NaN is 0."""
-    return round(value) if math.isfinite(value) else 0
-
-
-def requested_message(command: Command) -> int:
-    """Return the id of the message that a command requests."""
-    return SHORTHANDS.get(command.number) or whole(command.params[0])
+def requested_message(command: Command) -> MessageRequest | None:
+    """Return the message that a command requests, if it is such a command."""
+    return read_request(command.number, command.params)
 
 
 class IntervalService(Service):
@@ -330,18 +324,21 @@ class CommandService(Service):
         return DENIED, self._explain(REFUSALS[command.number], now_us)
 
     def _request_message(self, command: Command, now_us: int) -> Outcome:
-        message_id, request = requested_message(command), command.request
+        wanted, request = requested_message(command), command.request
+        message_id = -1 if wanted is None else wanted.message_id
         if message_id == mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
             # The second parameter is the message whose interval is requested.
             shifted = replace(command, params=(*command.params[1:], 0.0))
             return self._handlers[GET_INTERVAL](shifted, now_us)
-        if not self._telemetry.knows(message_id):
+        if wanted is None or not self._telemetry.knows(message_id):
             return UNSUPPORTED, []
         # The answer to an untrusted client must not load the links of others.
         to_all = command.number == REQUEST_MESSAGE and whole(command.params[6]) == RESPOND_TO_ALL
         client_id = None if to_all and request.may_change else request.client_id
         message = self._telemetry.build(message_id, now_us)
-        return (NOT_NOW, []) if message is None else (ACCEPTED, [Reply(message, client_id)])
+        if message is None:
+            return NOT_NOW, []
+        return (ACCEPTED, [Reply(message, client_id)]) if wanted.selects(message) else (DENIED, [])
 
 
 class RecordingService(Service):

@@ -41,16 +41,9 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
 from gateway.vehicle.encoding import ControlStatus
+from gateway.vehicle.requested_messages import whole
 from gateway.vehicle.service import Answer, Reply, Request, Service
-from gateway.vehicle.services.commands import (
-    ACCEPTED,
-    DENIED,
-    FAILED,
-    Command,
-    Explain,
-    Outcome,
-    whole,
-)
+from gateway.vehicle.services.commands import ACCEPTED, DENIED, FAILED, Command, Explain, Outcome
 from gateway.wire.system_ids import RELEASE_CONTROL, REQUEST_OPERATOR_CONTROL, is_former_control
 
 SYSTEM_MANAGER: Final = 1

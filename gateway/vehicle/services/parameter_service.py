@@ -13,15 +13,9 @@ from typing import Any, Final, Generic, TypeVar
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import RECORDED_ONLY
+from gateway.vehicle.requested_messages import whole
 from gateway.vehicle.service import Answer, Reply, Request, SaveSettings, SettingsChange
-from gateway.vehicle.services.commands import (
-    ACCEPTED,
-    IN_PROGRESS,
-    UNSUPPORTED,
-    Command,
-    Outcome,
-    whole,
-)
+from gateway.vehicle.services.commands import ACCEPTED, IN_PROGRESS, UNSUPPORTED, Command, Outcome
 from gateway.vehicle.services.parameters import (
     Parameter,
     ParameterTable,

@@ -33,6 +33,7 @@ from gateway.vehicle.plan import (
     is_on_earth,
     location_of,
 )
+from gateway.vehicle.requested_messages import whole
 from gateway.vehicle.service import INFO, Answer, SavePlan, StatusText
 from gateway.vehicle.services.commands import (
     ACCEPTED,
@@ -41,7 +42,6 @@ from gateway.vehicle.services.commands import (
     Command,
     CommandService,
     Outcome,
-    whole,
 )
 from gateway.vehicle.services.missions import MissionService
 from gateway.vehicle.telemetry.messages import has_position
