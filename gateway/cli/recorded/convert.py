@@ -1,5 +1,6 @@
 """`mavgate convert` and `fuse`: write files from recordings."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date
@@ -31,15 +32,22 @@ from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.estimation.select import ESTIMATORS
 from gateway.output import write_new
 from gateway.recordings.files import FlightError
-from gateway.recordings.workshop.anonymising import MAX_PLACE_DEG, Anonymiser, Anonymity
+from gateway.recordings.workshop.anonymising import (
+    FIRST_DAY,
+    LAST_DAY,
+    MAX_PLACE_DEG,
+    Anonymiser,
+    Anonymity,
+)
 from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
+from gateway.recordings.workshop.editing import FrameEdit, Renumbering
 from gateway.recordings.workshop.selection import (
     MAX_MARGIN_S,
     FrameChoice,
     StateChoice,
     message_ids_of,
 )
-from gateway.recordings.workshop.tlog_editing import Renumbering, TlogEdits
+from gateway.recordings.workshop.tlog_editing import TlogEdits
 from gateway.wire.system_ids import LAST_ID
 
 app = typer.Typer()
@@ -118,6 +126,9 @@ def convert(
         list[str] | None,
         _option("--as", "OLD:NEW gives a system another id, also where it is addressed."),
     ] = None,
+    merge_systems: Annotated[
+        bool, _option("--merge-systems", "With --as, give several systems the same id.")
+    ] = False,
     anonymise: Annotated[
         bool,
         _option("--anonymise", "Move coordinates and dates, replace texts and identifiers."),
@@ -145,22 +156,23 @@ def convert(
         frozenset(system or ()), frozenset(component or ()),
         message_ids_of(message or ()), message_ids_of(without or ()),
     )  # fmt: skip
+    anonymity = _read_anonymity(place, day, keep_unknown=keep_unknown, wanted=anonymise)
+    anonymiser = None if anonymity is None else Anonymiser(anonymity)
+    renumbering = Renumbering(_read_renames(rename), merge=merge_systems) if rename else None
     edits = TlogEdits(
         choice, _read_state(while_state, modes or [], margin_s), merge,
-        (Renumbering(_read_renames(rename)),) if rename else (),
-        _read_anonymity(place, day, keep_unknown=keep_unknown, wanted=anonymise),
+        tuple(edit for edit in (anonymiser, renumbering) if edit is not None),
     )  # fmt: skip
     _check_edits(edits, output, message or [], system or [])
     of_tlogs = output.suffix in FROM_TLOGS or message
     files = recorded_files(files, "tlogs" if of_tlogs else "tables")
     how = {"system_id": system[0] if system else None, "sensors": read_sensors(sensor)}
-    flight = _write(
+    _write(
         files, output, columns, how, force=force, limits=read_range(begin, end),
         message=message[0] if message else None,
         edits=edits if output.suffix in (".tlog", ".csv") else None,
     )  # fmt: skip
-    if flight.anonymiser is not None:
-        _print_changes(flight.anonymiser)
+    _print_edits(edits.frames)
 
 
 def _write(
@@ -209,6 +221,8 @@ def _read_anonymity(
             found = replace(found, day=date.fromisoformat(day))
         except ValueError:
             raise FlightError(f"--day {day}: write a date as 2020-01-31") from None
+        if not FIRST_DAY <= found.day <= LAST_DAY:
+            raise FlightError(f"--day {day}: from {FIRST_DAY} to {LAST_DAY}")
     if place is not None:
         try:
             lat_deg, lon_deg = map(float, place.split(","))
@@ -222,12 +236,15 @@ def _read_anonymity(
     return found
 
 
-def _print_changes(anonymiser: Anonymiser) -> None:
-    """Print the number of changed fields by message."""
-    table = table_of("message", "field", "changed", left=2)
-    for (message, field), count in sorted(anonymiser.changed.items()):
-        table.add_row(message, field, str(count))
-    console_of().print(table)
+def _print_edits(edits: Sequence[FrameEdit]) -> None:
+    """Print the numbers of changed fields and of frames left out, by message."""
+    table = table_of("message", "field", "changed", "left out", left=2)
+    changed = sum((edit.changed for edit in edits if isinstance(edit, Anonymiser)), Counter())
+    left_out = sum((edit.left_out for edit in edits), Counter[tuple[str, str]]())
+    for key in sorted({*changed, *left_out}):
+        table.add_row(*key, *(str(counts[key] or "") for counts in (changed, left_out)))
+    if table.row_count:
+        console_of().print(table)
 
 
 def _read_renames(texts: Sequence[str]) -> dict[int, int]:
@@ -251,7 +268,7 @@ def _check_edits(edits: TlogEdits, output: Path, message: list[str], system: lis
     ):
         refuse(f"--message is for .tlog, and one message for {', '.join(OF_ONE_MESSAGE)}")
     is_of_message = bool(message) and output.suffix == ".csv"
-    if is_of_message and not (edits.frames or edits.anonymity):
+    if is_of_message and not edits.frames:
         return
     other = replace(edits, choice=replace(edits.choice, systems=frozenset(), messages=frozenset()))
     if other != TlogEdits() or len(system) > 1:

@@ -1,146 +1,75 @@
 """Remove the coordinates, dates and names of the people who flew from recordings.
 
-All coordinates are moved by one offset. Distances are preserved: longitudes are scaled by the ratio
-of the cosines of the two latitudes. Dates are moved by whole days. Texts and identifiers are
-replaced by numbered ones, the same for the same original. Messages with arbitrary content are left
-out.
-
-| found by                                  | fields                                         |
-| ----------------------------------------- | ---------------------------------------------- |
-| unit degE7 in the dialect                 | latitudes and longitudes                       |
-| `OTHER_COORDINATES`                       | coordinates in degrees, or without a unit      |
-| the meaning of the command's parameters   | coordinates of commands and items of missions  |
-| type char in the dialect, except `PLAIN`  | texts and names                                |
-| `IDENTIFIERS`                             | numbers and bytes that identify something      |
-| integers whose value is a date since 2000 | times                                          |
-| `OPAQUE`                                  | messages of unknown content                    |
-
-Heights and values relative to another one are unchanged. Tests check every field of the dialect
-against these lists.
+`private_fields` states what happens to each field; here it is done. Locations are moved by one
+offset, so that distances are preserved: longitudes are scaled by the ratio of the cosines of the
+two latitudes. Dates are moved by whole days. A value that anybody could guess, such as a default
+location or the date of a clock that was never set, would reveal the offset. So locations far from
+all others, and dates more than a year from all others, are moved by offsets of their own.
 """
 
 import math
-import re
+import struct
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
-from datetime import UTC, date, datetime
-from functools import cache
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import date
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.files import LAST_CIVIL_US
+from gateway.gps_time import GPS_EPOCH_UNIX_US
+from gateway.recordings.files import LAST_CIVIL_US, TlogSource
 from gateway.recordings.tlog import DAY_US
+from gateway.recordings.vehicle_reader import VehicleReader
+from gateway.recordings.workshop.editing import FrameEdit
+from gateway.recordings.workshop.private_fields import (
+    Pair,
+    Treatment,
+    is_private,
+    parameters_of,
+    treatment_of,
+)
+from gateway.recordings.workshop.selection import FrameChoice
 from gateway.units import DEGE7_PER_DEG, US_PER_S
-from gateway.vehicle.plan import GLOBAL_FRAMES
 from gateway.vehicle_state.status_texts import text_of
-from gateway.wire.frame_editing import FLAGS, edit_frame
+from gateway.wire.frame_editing import CRC_SIZE, FLAGS, edit_frame
 from gateway.wire.frame_scan import TIME_SIZE
-from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_NAMES, layout_of
-from gateway.wire.mavlink_splitter import SIGNED, START_V2, frame_of
-from gateway.wire.recorded_frames import Batch, fields_of
+from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, base_size, layout_of
+from gateway.wire.mavlink_splitter import (
+    PAYLOAD_V1,
+    PAYLOAD_V2,
+    SIGNED,
+    START_V2,
+    MavFrame,
+    frame_of,
+)
+from gateway.wire.recorded_frames import LENGTH_AT, Batch, columns_of, fields_of
 
 BoolArray = NDArray[np.bool_]
 
-OTHER_COORDINATES: Final[dict[str, tuple[tuple[str, str, float], ...]]] = {
-    "SIM_STATE": (("lat", "lon", 1.0),),
-    "FENCE_POINT": (("lat", "lng", 1.0),),
-    "FW_SOARING_DATA": (("xLat", "xLon", 1.0),),
-}
-"""Latitude, longitude, and their unit in 1/deg, where the unit in the dialect is not degE7."""
-LOCATED: Final = {"MISSION_ITEM": 1.0, **dict.fromkeys(
-    ("MISSION_ITEM_INT", "COMMAND_INT", "COMMAND_INT_STAMPED", "ORBIT_EXECUTION_STATUS"),
-    DEGE7_PER_DEG,
-)}  # fmt: skip
-"""Messages whose x and y are coordinates in a global frame, and their unit in 1/deg."""
-PLAIN: Final = frozenset({
-    "param_id", "mode_name", "tune", "tune2", "busname", "mode_str", "band_str",
-})  # fmt: skip
-"""Names of character fields that do not identify anybody."""
-PLAIN_OF: Final = frozenset({"NAMED_VALUE_FLOAT", "NAMED_VALUE_INT", "NAMED_VALUE_STRING",
-                             "GIMBAL_DEVICE_INFORMATION.vendor_name",
-                             "GIMBAL_DEVICE_INFORMATION.model_name"})  # fmt: skip
-"""Fields that contain the name of a quantity or of a product."""
-IDENTIFIERS: Final[dict[str, tuple[str, ...]]] = {
-    "AUTOPILOT_VERSION": ("uid", "uid2"),
-    "FLIGHT_INFORMATION": ("flight_uuid",),
-    "GIMBAL_DEVICE_INFORMATION": ("uid",),
-    "ADSB_VEHICLE": ("ICAO_address", "squawk"),
-    "AIS_VESSEL": ("MMSI",),
-    "RESOURCE_REQUEST": ("uri", "storage"),
-    "SENS_BATMON": ("serialnumber",),
-    "UAVCAN_NODE_INFO": ("hw_unique_id",),
-    "UTM_GLOBAL_POSITION": ("uas_id",),
-    "UAVIONIX_ADSB_OUT_CFG": ("ICAO",),
-    "UAVIONIX_ADSB_OUT_DYNAMIC": ("squawk",),
-    "UAVIONIX_ADSB_OUT_CONTROL": ("squawk",),
-    "UAVIONIX_ADSB_OUT_STATUS": ("squawk",),
-    "OPEN_DRONE_ID_BASIC_ID": ("id_or_mac", "uas_id"),
-    "OPEN_DRONE_ID_LOCATION": ("id_or_mac",),
-    "OPEN_DRONE_ID_SELF_ID": ("id_or_mac",),
-    "OPEN_DRONE_ID_SYSTEM": ("id_or_mac",),
-    "OPEN_DRONE_ID_OPERATOR_ID": ("id_or_mac",),
-}
-OPAQUE: Final = frozenset({
-    "FILE_TRANSFER_PROTOCOL", "LOG_DATA", "GPS_INJECT_DATA", "GPS_RTCM_DATA", "SERIAL_CONTROL",
-    "ENCAPSULATED_DATA", "DATA16", "DATA32", "DATA64", "DATA96", "REMOTE_LOG_DATA_BLOCK",
-    "V2_EXTENSION", "LOGGING_DATA", "LOGGING_DATA_ACKED", "TUNNEL", "CAN_FRAME", "CANFD_FRAME",
-    "DEVICE_OP_READ_REPLY", "DEVICE_OP_WRITE", "SECURE_COMMAND", "SECURE_COMMAND_REPLY",
-    "OPEN_DRONE_ID_MESSAGE_PACK", "OPEN_DRONE_ID_AUTHENTICATION", "FRSKY_PASSTHROUGH_ARRAY",
-    "PARAM_VALUE_ARRAY", "MEMORY_VECT", "DEBUG_VECT", "DEBUG_FLOAT_ARRAY", "SETUP_SIGNING",
-    "AUTH_KEY", "AIRLINK_AUTH", "CHANGE_OPERATOR_CONTROL", "MOUNT_CONTROL", "CUBEPILOT_RAW_RC",
-    "LED_CONTROL",
-})  # fmt: skip
-"""Messages left out: files, logs, raw device data, keys, and old messages of ambiguous meaning."""
-COMMANDS: Final = frozenset({
-    "COMMAND_LONG", "COMMAND_LONG_STAMPED", "COMMAND_INT", "COMMAND_INT_STAMPED",
-})  # fmt: skip
-"""Messages that contain a command; those with a command of a vendor are left out."""
-NAMED_VALUES: Final = {"PARAM_VALUE": "param_id", "PARAM_SET": "param_id",
-                       "PARAM_EXT_VALUE": "param_id", "PARAM_EXT_SET": "param_id",
-                       "PARAM_EXT_ACK": "param_id", "NAMED_VALUE_FLOAT": "name",
-                       "NAMED_VALUE_INT": "name"}  # fmt: skip
-"""Messages with a value that is named by another field: that field, by message."""
-PRIVATE_NAME: Final = re.compile(
-    r"(?<![A-Z])(LAT|LON|LNG|LATITUDE|LONGITUDE)(?![A-Z])|ICAO|SERIAL_?N|SQUAWK|PASS|SSID|UUID",
-    re.IGNORECASE,
-)
-"""Pattern of the names of values that are left out."""
-TIME_UNITS: Final = {"s": 1, "ms": 1000, "us": 1_000_000, "ns": 1_000_000_000}
-"""Ticks per second of each unit of time."""
-UNITLESS_TIMES: Final = frozenset({"utc_time", "vehicle_timestamp", "time_usec", "timestamp"})
-GPS_WEEKS: Final = {"GPS_RTK": ("wn", "tow"), "GPS2_RTK": ("wn", "tow"),
-                    "GPS_INPUT": ("time_week", "time_week_ms")}  # fmt: skip
+SYSTEM_TIME_ID: Final = MESSAGE_IDS["SYSTEM_TIME"]
+LOCAL_FRAMES: Final = frozenset({1, 4, 7, 8, 9, 12, 20, 21})
+"""Values of MAV_FRAME whose coordinates are in m; all others may be latitudes and longitudes."""
 WEEK_MS: Final = 7 * 86_400_000
-DRONE_ID_TIMES: Final = frozenset({"OPEN_DRONE_ID_SYSTEM", "OPEN_DRONE_ID_SYSTEM_UPDATE"})
-"""Messages whose timestamp counts seconds since 2019."""
-FIRST_CIVIL_S: Final = 946_684_800
-"""The year 2000; earlier times are not civil time."""
+US_PER_MS: Final = 1000
+YEAR_US: Final = 366 * DAY_US
+"""Dates further apart are of different clocks."""
+MAX_APART_DEG: Final = 4.5
+"""Locations further apart, 500 km, are not of one flight: more than ADS-B receives."""
+MAX_GROUPS: Final = 1000
+"""Maximum number of groups of locations or dates; later ones join the first."""
 MAX_NAMES: Final = 60_000
 """Identifiers that get a number of their own; all later ones share one number."""
 MAX_PLACE_DEG: Final = 80.0
 """Greatest latitude to move to: nearer to a pole, a flight would not fit between meridians."""
-_COMMAND_FIELDS: Final[dict[int, dict[str, int]]] = {
-    number: axes
-    for number, entry in mavlink.enums["MAV_CMD"].items()
-    if (
-        axes := {
-            f"param{index}": int("ongitude" in text)
-            for index, text in entry.param.items()
-            if "atitude" in text or "ongitude" in text
-        }
-    )
-}
-"""Parameters that are coordinates, by command; value: 0 for latitude, 1 for longitude."""
-_SIZES: Final = np.full(1 << 16, -1, np.int64)
-"""Size of each known message's payload, by id."""
-_CHANGED: Final = np.zeros(1 << 16, np.bool_)
-"""Whether a message can contain fields to change, by id."""
-_SPECIAL: Final = {*OPAQUE, *LOCATED, *NAMED_VALUES, *GPS_WEEKS, *DRONE_ID_TIMES,
-                   *COMMANDS}  # fmt: skip
+FIRST_DAY, LAST_DAY = date(2000, 1, 1), date(2099, 12, 31)
+"""Days to which recordings can be moved: earlier times are taken for times since boot."""
+NEAR_DEG: Final = 0.002
+"""A named value this close to a coordinate of the flight, 200 m, is taken for it."""
+FULL_TURN_DEG: Final = 360.0
+PARAMETERS: Final = ("param1", "param2", "param3", "param4", "param5", "param6", "param7")
+ITEM_PARAMETERS: Final = (*PARAMETERS[:4], "x", "y", "z")
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,176 +80,261 @@ class Anonymity:
     lon_deg: float = 0.0
     day: date = date(2020, 1, 1)
     keep_unknown: bool = False
-    """Keep messages that are not in the dialect, or longer than the dialect defines them."""
+    """Keep messages that are not in the dialect."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Plan:
-    """The fields of a message that may be changed."""
-
-    coordinates: tuple[tuple[str, str, float], ...]
-    identifiers: tuple[str, ...]
-    times: tuple[tuple[str, int], ...]
-
-    @property
-    def is_empty(self) -> bool:
-        return not (self.coordinates or self.identifiers or self.times)
-
-
-def is_plain(message: str, field: str) -> bool:
-    """Return whether a character field does not identify anybody."""
-    return (
-        field in PLAIN
-        or f"{message}.{field}" in PLAIN_OF
-        or (field == "name" and message in PLAIN_OF)
-    )
-
-
-def longitude_of(latitude: str) -> str:
-    """Return the prefix of the name of the longitude that belongs to a latitude."""
-    return latitude.replace("latitude", "longitude").replace("Lat", "Lon").replace("lat", "lon")
+def first_of(
+    sources: Iterable[TlogSource], choice: FrameChoice
+) -> tuple[tuple[float, float] | None, int | None]:
+    """Return the first valid position of a vehicle, deg, and the first date in SYSTEM_TIME, µs."""
+    location: tuple[float, float] | None = None
+    date_us: int | None = None
+    for source in sources:
+        reader = VehicleReader(source.senders, with_attitude=False)
+        for batch in map(choice.apply, source.batches(strict=True)):
+            if location is None:
+                found = (m.position for m in reader.feed_batch(batch) if m.position is not None)
+                location = next(((at.lat_deg, at.lon_deg) for at in found), None)
+            if date_us is None:
+                rows = np.flatnonzero(batch.message_ids == SYSTEM_TIME_ID)
+                times_us = columns_of(batch, rows, SYSTEM_TIME_ID)["time_unix_usec"]
+                dates = times_us[(times_us > GPS_EPOCH_UNIX_US) & (times_us < LAST_CIVIL_US)]
+                date_us = int(dates[0]) if len(dates) else None
+            if location is not None and date_us is not None:
+                return location, date_us
+    return location, date_us
 
 
-@cache
-def _plan_of(message_id: int) -> _Plan:
-    kind = DEFINITIONS[message_id]
-    name, units = kind.msgname, kind.fieldunits_by_name
-    types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
-    scaled = [field for field in kind.fieldnames if units.get(field) == "degE7"]
-    pairs = [
-        (lat, next(f for f in scaled if f in (lon, lon.replace("lon", "lng"))), DEGE7_PER_DEG)
-        for lat in scaled
-        if (lon := longitude_of(lat)) != lat
-    ]
-    texts = [field for field, code in types.items() if code == "char" and not is_plain(name, field)]
-    times = [
-        (field, TIME_UNITS.get(units.get(field, ""), 1 if field == "utc_time" else 1_000_000))
-        for field, code in types.items()
-        if code in ("uint32_t", "uint64_t", "int64_t")
-        and (units.get(field) in TIME_UNITS or field in UNITLESS_TIMES)
-    ]
-    return _Plan(
-        (*pairs, *OTHER_COORDINATES.get(name, ())),
-        (*texts, *IDENTIFIERS.get(name, ())),
-        tuple(times),
-    )
+class MovedDates:
+    """Dates moved by whole days: the first one of each clock to a given day."""
+
+    def __init__(self, day: date) -> None:
+        self._day = (day - date(1970, 1, 1)).days
+        self._clocks: list[list[int]] = []
+        """Newest time of each clock in µs, and its shift in days."""
+
+    def shift_us(self, time_us: int, *, after_us: int = 0, like: "MovedDates | None" = None) -> int:
+        """Return the shift of a time, which a new clock moves to `after_us` or later.
+
+        A new clock that agrees with one of another object within a day is moved as that one.
+        """
+        if (clock := self.nearest(time_us, YEAR_US)) is None:
+            same = None if like is None else like.nearest(time_us, DAY_US)
+            days = self._day - time_us // DAY_US if same is None else same[1]
+            days += max(0, -((time_us + days * DAY_US - after_us) // DAY_US))
+            clock = [time_us, days]
+            if len(self._clocks) == MAX_GROUPS:
+                clock = self._clocks[0]
+            else:
+                self._clocks.append(clock)
+        clock[0] = time_us
+        return clock[1] * DAY_US
+
+    def nearest(self, time_us: int, within_us: int) -> list[int] | None:
+        """Return the newest time in µs and the shift in days of the clock nearest to a time."""
+        near = min(self._clocks, key=lambda clock: abs(clock[0] - time_us), default=None)
+        return near if near is not None and abs(near[0] - time_us) <= within_us else None
 
 
-for _message_id, _name in MESSAGE_NAMES.items():
-    _SIZES[_message_id] = layout_of(_message_id).itemsize
-    _CHANGED[_message_id] = _name in _SPECIAL or not _plan_of(_message_id).is_empty
+class MovedLocations:
+    """Locations moved to another place, with their distances."""
 
-
-class Anonymiser:
-    """Anonymise the frames of a recording.
-
-    Parameters
-    ----------
-    anonymity : Anonymity
-        Target location and day.
-    reference : tuple of float, optional
-        Latitude and longitude that are moved to the target, deg; default: the first ones found.
-    """
-
-    def __init__(self, anonymity: Anonymity, reference: tuple[float, float] | None = None) -> None:
+    def __init__(self, anonymity: Anonymity) -> None:
         self._anonymity = anonymity
-        self.reference = reference
+        self._groups: list[tuple[float, float]] = []
+        """The first location of each group, deg."""
+        self._newest: list[tuple[float, float]] = []
+
+    def moved(self, lat_deg: float, lon_deg: float) -> tuple[float, float]:
+        """Return the latitude and longitude to which a location is moved."""
+        first_lat, first_lon = self._group_of(lat_deg, lon_deg)
+        to = self._anonymity
+        lat = max(-90.0, min(90.0, to.lat_deg + lat_deg - first_lat))
+        scale = math.cos(math.radians(first_lat)) / math.cos(math.radians(to.lat_deg))
+        return lat, _wrapped(to.lon_deg + _wrapped(lon_deg - first_lon) * scale)
+
+    def _group_of(self, lat_deg: float, lon_deg: float) -> tuple[float, float]:
+        for known in (self._newest, self._groups):
+            for number, at in enumerate(known):
+                if _is_near(*at, lat_deg, lon_deg):
+                    self._newest[number] = lat_deg, lon_deg
+                    return self._groups[number]
+        if len(self._groups) == MAX_GROUPS:
+            return self._groups[0]
+        self._groups.append((lat_deg, lon_deg))
+        self._newest.append((lat_deg, lon_deg))
+        return lat_deg, lon_deg
+
+    def includes(self, value: float) -> bool:
+        """Return whether a number may be a latitude or longitude of a group, in usual units."""
+        if not math.isfinite(value) or not value:
+            return False
+        degrees = (value / DEGE7_PER_DEG, value, math.degrees(value))
+        is_round = abs(value - round(value, 2)) < 1e-6 * abs(value)
+        return any(
+            abs(known) >= 1.0 and abs(each - known) < NEAR_DEG
+            for group in self._groups
+            for known in group
+            for each in degrees[: 1 if is_round else None]
+        )
+
+
+class Anonymiser(FrameEdit):
+    """Anonymise the frames of a recording."""
+
+    def __init__(self, anonymity: Anonymity) -> None:
+        super().__init__()
+        self._keep_unknown = anonymity.keep_unknown
         self.changed: Counter[tuple[str, str]] = Counter()
         """Number of changed fields, by message and field."""
         self._names: dict[bytes, int] = {}
-        self._days: int | None = None
+        self._locations = MovedLocations(anonymity)
+        self._records, self._dates = MovedDates(anonymity.day), MovedDates(anonymity.day)
+        self._first_date_us: int | None = None
+        self._last_us = 0
 
-    def shift_us(self, batch: Batch) -> int:
-        """Return the shift of the recorded times; the first batch determines it."""
-        if self._days is None and len(batch):
-            first = datetime.fromtimestamp(max(int(batch.time_us[0]), 0) / US_PER_S, UTC)
-            self._days = (self._anonymity.day - first.date()).days
-        return (self._days or 0) * DAY_US
+    def prepare(self, sources: Sequence[TlogSource], choice: FrameChoice) -> None:
+        """Find the location and the date that are moved to the target."""
+        location, self._first_date_us = first_of(sources, choice)
+        if location is not None:
+            self._locations.moved(*location)
+
+    def retimed(self, batch: Batch) -> Batch:
+        """Return the next batch with moved times of its records."""
+        if not len(batch):
+            return batch
+        times, moved = batch.time_us, batch.time_us.copy()
+        steps = np.flatnonzero(np.abs(np.diff(times)) > YEAR_US) + 1
+        for begin, end in zip([0, *steps.tolist()], [*steps.tolist(), len(times)], strict=True):
+            moved[begin:end] += self._records.shift_us(int(times[begin]), after_us=self._last_us)
+            self._records.shift_us(int(times[end - 1]))
+            self._last_us = int(moved[end - 1])
+        if self._first_date_us is not None:
+            self._dates.shift_us(self._first_date_us, like=self._records)
+            self._first_date_us = None
+        return replace(batch, time_us=moved)
 
     def affects(self, batch: Batch) -> BoolArray:
         """Return which frames may change."""
         data = np.frombuffer(batch.data, np.uint8)
         starts = batch.starts + TIME_SIZE
         is_signed = (data[starts] == START_V2) & (data[starts + FLAGS] & SIGNED > 0)
-        ids = np.minimum(batch.message_ids, len(_SIZES) - 1)
-        found: BoolArray = is_signed | _CHANGED[ids] | (data[starts + 1] > _SIZES[ids])
+        ids, kinds = np.unique(batch.message_ids, return_inverse=True)
+        sizes = np.array([_kept_size(message_id) for message_id in ids.tolist()])
+        found: BoolArray = is_signed | (data[starts + LENGTH_AT] > sizes[kinds])
         return found
 
     def edit(self, frame: bytes) -> bytes | None:
         """Return the anonymised frame; None if it must be left out."""
         read = frame_of(frame)
-        message_id, name = read.message_id, MESSAGE_NAMES.get(read.message_id)
-        if name is None or frame[1] > _SIZES[message_id]:
-            return frame if self._anonymity.keep_unknown else None
-        if name in OPAQUE:
+        treatment = None if _is_short(read) else treatment_of(read.message_id)
+        if treatment is None:
+            return self._unlisted(read)
+        name, fields = MESSAGE_NAMES[read.message_id], fields_of(frame)
+        if reason := self._private_part(treatment, fields):
+            self.leave_out(name, reason)
             return None
-        fields = fields_of(frame)
-        if name in COMMANDS and fields["command"] not in mavlink.enums["MAV_CMD"]:
-            return None
-        if name in NAMED_VALUES and PRIVATE_NAME.search(text_of(fields[NAMED_VALUES[name]])):
-            return None
-        plan = _plan_of(message_id)
-        changes: dict[str, Any] = {}
-        for lat, lon, unit in plan.coordinates:
-            changes |= self._moved(fields, lat, lon, unit)
-        changes |= self._command(name, fields)
-        for field in plan.identifiers:
-            changes[field] = self._numbered(message_id, field, fields[field])
-        changes |= self._times(name, plan, fields)
-        changes = {
-            field: value for field, value in changes.items() if np.any(value != fields[field])
-        }
-        if not changes and not read.signed:
+        changes = self._changes(treatment, fields, read.message_id)
+        changes = {k: v for k, v in changes.items() if not _is_equal(v, fields[k])}
+        is_longer = frame[LENGTH_AT] > layout_of(read.message_id).itemsize
+        if not changes and not read.signed and not is_longer:
             return frame
         self.changed.update((name, field) for field in changes)
-        if read.signed:
-            self.changed[name, "signature"] += 1
-        edited = edit_frame(read, fields=changes, drop_signature=True)
+        self.changed[name, "signature"] += read.signed
+        self.changed[name, "unknown fields"] += is_longer
+        known = _known_part(read) if is_longer else read
+        edited = edit_frame(known, fields=changes, drop_signature=True)
         return None if edited is None else edited.data
 
-    def _moved(
-        self, fields: Mapping[str, Any], lat: str, lon: str, unit: float
-    ) -> dict[str, float]:
-        """Move a latitude and a longitude; 0, 0 and values out of range mean unknown and stay."""
-        lat_deg, lon_deg = fields[lat] / unit, fields[lon] / unit
-        moved: dict[str, float] = {}
-        if not lat_deg and not lon_deg:
-            return moved
-        if abs(lat_deg) <= 90.0:
-            moved[lat] = self._axis(lat_deg, 0, lat_deg, lon_deg)
-        if abs(lon_deg) <= 180.0:
-            moved[lon] = self._axis(lon_deg, 1, lat_deg, lon_deg)
-        if unit != 1.0:
-            moved = {field: round(value * unit) for field, value in moved.items()}
-        if not any(moved.values()):
-            # One unit (1 cm for degE7) off, because 0, 0 would mean unknown.
-            moved = dict.fromkeys(moved, 1 / unit if unit == 1.0 else 1)
-        return moved
+    def _unlisted(self, frame: MavFrame) -> bytes | None:
+        """Keep a frame of a message that is in no dialect, if wanted; leave out any other."""
+        name = MESSAGE_NAMES.get(frame.message_id)
+        # A signature contains the time, and cannot be removed without a checksum.
+        if name is None and self._keep_unknown and not frame.signed:
+            return frame.data
+        self.leave_out(name or f"unknown message {frame.message_id}")
+        return None
 
-    def _axis(self, value_deg: float, axis: int, lat_deg: float, lon_deg: float) -> float:
-        """Move a latitude (axis 0) or a longitude (axis 1)."""
-        if self.reference is None:
-            self.reference = lat_deg, lon_deg
-        place = self._anonymity
-        offset_deg = value_deg - self.reference[axis]
-        if axis == 0:
-            return max(-90.0, min(90.0, place.lat_deg + offset_deg))
-        scale = math.cos(math.radians(self.reference[0])) / math.cos(math.radians(place.lat_deg))
-        return _wrapped(place.lon_deg + _wrapped(offset_deg) * scale)
+    def _private_part(self, treatment: Treatment, fields: Mapping[str, Any]) -> str:
+        """Return why a message must be left out: its command or its label; empty if it is kept."""
+        if treatment.has_command and _parameters_of(fields) is None:
+            return f"command {fields['command']}"
+        if treatment.label is None:
+            return ""
+        label = fields[treatment.label]
+        value = fields.get("param_value", fields.get("value"))
+        numbers = [value] if isinstance(value, int | float) else []
+        if isinstance(value, float):
+            # PX4 sends integers as their bytes.
+            numbers += struct.unpack("<i", struct.pack("<f", value))
+        return (
+            text_of(label)
+            if is_private(label) or any(map(self._locations.includes, numbers))
+            else ""
+        )
 
-    def _command(self, name: str, fields: Mapping[str, Any]) -> dict[str, float]:
-        """Move the coordinates of a command or of a mission item."""
-        if name in LOCATED:
-            is_global = fields["frame"] in GLOBAL_FRAMES or (
-                fields["frame"] == mavlink.MAV_FRAME_MISSION
-                and fields.get("command") in _COMMAND_FIELDS
+    def _changes(
+        self, treatment: Treatment, fields: Mapping[str, Any], message_id: int
+    ) -> dict[str, Any]:
+        """Return the new values of the fields of a message, also unchanged ones."""
+        changes: dict[str, Any] = dict(treatment.fixed)
+        if treatment.has_command:
+            changes |= self._parameters(fields)
+        for pair in treatment.pairs:
+            if not (pair.framed and fields["frame"] in LOCAL_FRAMES):
+                changes |= self._moved(fields, pair)
+        for field in treatment.numbered:
+            changes[field] = self._numbered(message_id, field, fields[field])
+        if treatment.label is not None:
+            changes[treatment.label] = fields[treatment.label].split(b"\0", 1)[0]
+        for field, per_s, zero_s in treatment.dates:
+            changes[field] = self._moved_date(fields[field], per_s, zero_s, message_id, field)
+        for week, ms in treatment.weeks:
+            if fields[week]:
+                time_us = (fields[week] * WEEK_MS + fields[ms]) * US_PER_MS + GPS_EPOCH_UNIX_US
+                moved_us = time_us + self._dates.shift_us(time_us, like=self._records)
+                moved_ms = max(moved_us - GPS_EPOCH_UNIX_US, 0) // US_PER_MS
+                changes |= {week: moved_ms // WEEK_MS, ms: moved_ms % WEEK_MS}
+        return changes
+
+    def _moved(self, fields: Mapping[str, Any], pair: Pair) -> dict[str, float]:
+        """Move a latitude and a longitude, if both are known; set a single one to 0."""
+        values = fields[pair.lat], fields[pair.lon]
+        is_float, per_deg = isinstance(values[0], float), pair.per_deg
+        if is_float and (abs(values[0]) > 90.0 or abs(values[1]) > 180.0):
+            # Some programs send degE7 as float.
+            per_deg = DEGE7_PER_DEG
+        lat_deg, lon_deg = values[0] / per_deg, values[1] / per_deg
+        is_known = abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0
+        if not (is_known and all(values)):
+            # The largest integers and NaN mean unknown, and so do zeros.
+            names = zip((pair.lat, pair.lon), values, strict=True)
+            return {name: 0 for name, value in names if not _is_unknown(value)}
+        moved = [axis * per_deg for axis in self._locations.moved(lat_deg, lon_deg)]
+        if not is_float:
+            moved = [round(axis) for axis in moved]
+        if not any(moved):
+            # 1 cm off, because 0, 0 would mean unknown.
+            moved = [1, 1] if not is_float else [per_deg / DEGE7_PER_DEG] * 2
+        return dict(zip((pair.lat, pair.lon), moved, strict=True))
+
+    def _parameters(self, fields: Mapping[str, Any]) -> dict[str, float]:
+        """Return the new values of the parameters of a command or mission item."""
+        changes: dict[str, float] = {}
+        names, is_local = _names_of(fields), fields.get("frame") in LOCAL_FRAMES
+        for number, treatment in enumerate(_parameters_of(fields) or ""):
+            name, value = names[number], fields[names[number]]
+            if treatment == "A" and not is_local:
+                per_deg = DEGE7_PER_DEG if isinstance(value, int) else 1.0
+                changes |= self._moved(fields, Pair(name, names[number + 1], per_deg))
+            is_cleared = (
+                (treatment == "0" and not math.isnan(value))
+                or (treatment == "a" and abs(value) > FULL_TURN_DEG)
+                or (treatment == "T" and abs(value) * US_PER_S > GPS_EPOCH_UNIX_US)
             )
-            return self._moved(fields, "x", "y", LOCATED[name]) if is_global else {}
-        if name not in ("COMMAND_LONG", "COMMAND_LONG_STAMPED"):
-            return {}
-        axes = _COMMAND_FIELDS.get(fields["command"], {})
-        pairs = sorted(axes, key=lambda field: axes[field])
-        return self._moved(fields, pairs[0], pairs[-1], 1.0) if len(pairs) > 1 else {}
+            if is_cleared:
+                changes[name] = 0
+        return changes
 
     def _numbered(self, message_id: int, field: str, value: Any) -> Any:
         """Return a numbered identifier in place of the original; an empty one stays empty."""
@@ -342,21 +356,65 @@ class Anonymiser:
             return self._names.get(original, MAX_NAMES)
         return self._names.setdefault(original, len(self._names) + 1)
 
-    def _times(self, name: str, plan: _Plan, fields: Mapping[str, Any]) -> dict[str, int]:
-        days = self._days or 0
-        moved = {
-            field: fields[field] + days * 86_400 * per_s
-            for field, per_s in plan.times
-            if FIRST_CIVIL_S < fields[field] / per_s < LAST_CIVIL_US / US_PER_S
-        }
-        if name in DRONE_ID_TIMES and fields["timestamp"]:
-            moved["timestamp"] = max(fields["timestamp"] + days * 86_400, 1)
-        if name in GPS_WEEKS:
-            week, of_week = GPS_WEEKS[name]
-            if fields[week]:
-                time_ms = fields[week] * WEEK_MS + fields[of_week] + days * 86_400_000
-                moved |= {week: max(time_ms, 0) // WEEK_MS, of_week: max(time_ms, 0) % WEEK_MS}
-        return moved
+    def _moved_date(self, value: int, per_s: int, zero_s: int, message_id: int, field: str) -> int:
+        """Move a time, if it is a date; 0 if the moved date does not fit the field."""
+        time_us = value * US_PER_S // per_s + zero_s * US_PER_S
+        is_date = GPS_EPOCH_UNIX_US < time_us < LAST_CIVIL_US
+        if not value or not is_date:
+            return value
+        shift_s = self._dates.shift_us(time_us, like=self._records) // US_PER_S
+        moved = value + shift_s * per_s
+        limit = np.iinfo(layout_of(message_id)[field]).max
+        return moved if 0 <= moved <= limit else 0
+
+
+def _kept_size(message_id: int) -> int:
+    """Return the largest payload of a message that is kept as it is; -1 if none is."""
+    treatment = treatment_of(message_id)
+    is_kept = treatment is not None and treatment.is_empty
+    return layout_of(message_id).itemsize if is_kept else -1
+
+
+def _known_part(frame: MavFrame) -> MavFrame:
+    """Return an unsigned frame without the bytes after the known fields, and without checksum."""
+    size = layout_of(frame.message_id).itemsize
+    is_v2 = frame.data[0] == START_V2
+    cut = bytearray(frame.data[: (PAYLOAD_V2 if is_v2 else PAYLOAD_V1) + size])
+    cut[LENGTH_AT] = size
+    if is_v2:
+        cut[FLAGS] = 0
+    return frame_of(bytes(cut) + bytes(CRC_SIZE))
+
+
+def _is_unknown(value: float) -> bool:
+    """Return whether a coordinate has a value that messages define as unknown."""
+    return value in (0, (1 << 31) - 1, -(1 << 31)) or not math.isfinite(value)
+
+
+def _names_of(fields: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the parameters of a command or mission item."""
+    return ITEM_PARAMETERS if "x" in fields else PARAMETERS
+
+
+def _parameters_of(fields: Mapping[str, Any]) -> str | None:
+    return parameters_of(fields["command"], fields[_names_of(fields)[-1]])
+
+
+def _is_short(frame: MavFrame) -> bool:
+    """Return whether fields of a MAVLink 1 frame are cut off, which could not be edited."""
+    base = base_size(frame.message_id)
+    return frame.data[0] != START_V2 and base is not None and frame.data[LENGTH_AT] < base
+
+
+def _is_equal(new: Any, old: Any) -> bool:
+    if isinstance(new, int | float | bytes):
+        return bool(new == old or (new != new and old != old))
+    return np.array_equal(new, old)
+
+
+def _is_near(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_deg: float) -> bool:
+    east_deg = _wrapped(other_lon_deg - lon_deg) * math.cos(math.radians(lat_deg))
+    return abs(other_lat_deg - lat_deg) <= MAX_APART_DEG and abs(east_deg) <= MAX_APART_DEG
 
 
 def _wrapped(lon_deg: float) -> float:

@@ -42,11 +42,10 @@ from gateway.recordings.recorded_table import ReadOptions, RecordedTable, aircra
 from gateway.recordings.table import encode_block, encode_head
 from gateway.recordings.tlog import Stamper
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
-from gateway.recordings.workshop.anonymising import Anonymiser
 from gateway.recordings.workshop.joining import joined_tables
 from gateway.recordings.workshop.merging import batched
 from gateway.recordings.workshop.selection import message_ids_of
-from gateway.recordings.workshop.tlog_editing import TlogEditor, TlogEdits, first_position
+from gateway.recordings.workshop.tlog_editing import TlogEditor, TlogEdits
 from gateway.recordings.workshop.trimming import Limits, trimmed
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.recorded_frames import Batch, RecordedFrame
@@ -103,8 +102,6 @@ class FlightToWrite:
         self._remarks: list[str] = []
         self.senders = Senders()
         """Senders of the MAVLink; known once its frames are requested."""
-        self.anonymiser: Anonymiser | None = None
-        """Counts the changed fields; set once a tlog is written."""
         if kinds == {TABLE} and options.system_id is not None:
             self.files = self._files_of(options.system_id)
 
@@ -115,9 +112,8 @@ class FlightToWrite:
     def tlog(self) -> Iterator[bytes]:
         """Yield the selected MAVLink as a tlog, with the edits applied."""
         sources, edits = self._sources, self._edits
-        if edits.anonymity is not None:
-            self.anonymiser = Anonymiser(edits.anonymity, first_position(sources))
-            edits = replace(edits, frames=(self.anonymiser, *edits.frames))
+        for edit in edits.frames:
+            edit.prepare(sources, edits.choice)
         editor = TlogEditor(edits, self._limits, self.remark)
         yield from editor.apply(self._batches(editor, sources), self.senders)
 

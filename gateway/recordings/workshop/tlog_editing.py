@@ -4,64 +4,23 @@ Each step processes the batches of the previous one, so the memory needed does n
 size of the files. Parts that are not edited are copied byte for byte.
 """
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gateway.recordings.files import FlightError, Progress, TlogSource
 from gateway.recordings.tlog import encode_record
-from gateway.recordings.vehicle_reader import VehicleReader
-from gateway.recordings.workshop.anonymising import Anonymiser, Anonymity
+from gateway.recordings.workshop.editing import FrameEdit
 from gateway.recordings.workshop.merging import WINDOW_US, Alignment, Copies, batched, by_time
 from gateway.recordings.workshop.selection import FrameChoice, StateChoice, while_in_state, within
 from gateway.recordings.workshop.trimming import NOTHING_WITHIN, Limits
 from gateway.units import US_PER_S, counted
 from gateway.vehicle_state.senders import Senders
-from gateway.wire.mavlink_messages import MESSAGE_NAMES
-from gateway.wire.mavlink_splitter import frame_of
 from gateway.wire.recorded_frames import Batch
-from gateway.wire.system_ids import FIELDS, rename_systems
-
-BoolArray = NDArray[np.bool_]
 
 NOTHING_LEFT: Final = "no record matches all of these options"
-
-
-def first_position(sources: Sequence[TlogSource]) -> tuple[float, float] | None:
-    """Return latitude and longitude of a vehicle's first valid position, deg."""
-    for source in sources:
-        reader = VehicleReader(source.senders, with_attitude=False)
-        for batch in source.batches():
-            for message in reader.feed_batch(batch):
-                if message.position is not None:
-                    return message.position.lat_deg, message.position.lon_deg
-    return None
-
-
-class Renumbering:
-    """Change system ids in headers and in all fields that contain one."""
-
-    def __init__(self, system_ids: Mapping[int, int]) -> None:
-        self._system_ids = system_ids
-
-    def affects(self, batch: Batch) -> BoolArray:
-        """Return which records may contain a system id that changes."""
-        is_from: BoolArray = np.isin(batch.origins >> 8, [*self._system_ids])
-        return is_from | np.isin(batch.message_ids, [*FIELDS])
-
-    def edit(self, frame: bytes) -> bytes | None:
-        """Return a frame with changed ids; None for an unknown message, as its CRC is unknown."""
-        read = frame_of(frame)
-        sender = self._renamed(read.origin[0])
-        found = rename_systems(read, sender, self._renamed, drop_signature=True)
-        return None if found is None else found.data
-
-    def _renamed(self, system_id: int) -> int:
-        return self._system_ids.get(system_id, system_id)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +32,8 @@ class TlogEdits:
     """If given, keep only the time while a vehicle is in a state."""
     merge: bool | None = None
     """Leave out copies of frames that are in several files; default: if the files overlap."""
-    frames: tuple[Renumbering | Anonymiser, ...] = ()
-    anonymity: Anonymity | None = None
-    """Location and day to which an anonymised recording is moved."""
+    frames: tuple[FrameEdit, ...] = ()
+    """Edits of each frame, in their order."""
 
     @property
     def are_none(self) -> bool:
@@ -88,8 +46,6 @@ class TlogEditor:
 
     def __init__(self, edits: TlogEdits, limits: Limits, remark: Callable[[str], None]) -> None:
         self._edits, self._limits, self._remark = edits, limits, remark
-        self._left_out: Counter[int] = Counter()
-        """Number of frames that could not be edited, by message."""
 
     def joined(
         self, sources: Sequence[TlogSource], progress: Progress | None = None
@@ -105,7 +61,7 @@ class TlogEditor:
         if merge is None:
             overlap_us = alignment.overlap_us(alignment.shifts_us)
             merge = overlap_us > WINDOW_US
-        shifts_us = alignment.shifts_us if merge else [0] * len(sources)
+        shifts_us = _after_1970(alignment) if merge else [0] * len(sources)
         ordered = [sources[number] for number in alignment.order(shifts_us)]
         if alignment.overlap_us(shifts_us) <= 0:
             for source in ordered:
@@ -123,11 +79,8 @@ class TlogEditor:
         for batch in self.chosen(batches, senders):
             total += len(batch)
             yield self._edited(batch)
-        if total == self._left_out.total():
+        if total == self._left_out():
             raise FlightError(NOTHING_LEFT)
-        for message_id, count in sorted(self._left_out.items()):
-            name = MESSAGE_NAMES.get(message_id, f"unknown message {message_id}")
-            self._remark(f"left out {counted(count, 'frame')} of {name}")
 
     def chosen(self, batches: Iterable[Batch], senders: Senders) -> Iterator[Batch]:
         """Yield the selected records, not edited; raises FlightError if no record is left."""
@@ -149,32 +102,34 @@ class TlogEditor:
             is_cut = self._limits != (None, None) and edits.are_none
             raise FlightError(NOTHING_WITHIN if is_cut else NOTHING_LEFT)
         if not edits.are_none:
-            kept -= self._left_out.total()
+            kept -= self._left_out()
             self._remark(f"kept {kept} of {counted(total, 'record')}")
 
+    def _left_out(self) -> int:
+        return sum(edit.left_out.total() for edit in self._edits.frames)
+
     def _edited(self, batch: Batch) -> bytes:
-        for edit in self._edits.frames:
-            if isinstance(edit, Anonymiser):
-                batch = replace(batch, time_us=batch.time_us + edit.shift_us(batch))
-        affected = [edit.affects(batch) for edit in self._edits.frames]
+        edits = self._edits.frames
+        affected = [edit.affects(batch) for edit in edits]
+        for edit in edits:
+            batch = edit.retimed(batch)
         if not len(batch) or not np.any(affected):
             return batch.encoded()
         pieces = []
         is_affected = np.any(affected, axis=0).tolist()
         for record, may_change in zip(batch.records(), is_affected, strict=True):
             frame: bytes | None = record.frame
-            for edit in self._edits.frames if may_change else ():
+            for edit in edits if may_change else ():
                 frame = None if frame is None else edit.edit(frame)
-            if frame is None:
-                self._left_out[frame_of(record.frame).message_id] += 1
-            else:
+            if frame is not None:
                 pieces.append(encode_record(record.time_us, frame))
         return b"".join(pieces)
 
     def _intact(self, source: TlogSource, progress: Progress | None) -> Iterator[Batch]:
         """Yield the records of a file, and report the bytes that belong to no record."""
         runs = size = end = 0
-        for batch in source.batches(progress):
+        # An edit computes the checksum again, so that damaged frames would look intact.
+        for batch in source.batches(progress, strict=bool(self._edits.frames)):
             for damage in batch.damage:
                 # A run may continue in the next batch.
                 runs += damage.offset != end or not runs
@@ -201,3 +156,11 @@ class TlogEditor:
                     f"of {sources[0].path}, by {counted(offset.copies, 'copied frame')}"
                 )
         self._remark(f"left out {counted(copies.count, 'copied frame')}")
+
+
+def _after_1970(alignment: Alignment) -> list[int]:
+    """Return the shifts of a merge, increased if one would move a file before the year 1970."""
+    shifts_us = alignment.shifts_us
+    begins = zip(alignment.samples, shifts_us, strict=True)
+    earliest_us = min((one.first_us or 0) + shift_us for one, shift_us in begins)
+    return [shift_us - min(earliest_us, 0) for shift_us in shifts_us]

@@ -1,0 +1,110 @@
+"""Edits of single frames: the interface of each, and the change of system ids."""
+
+import struct
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.recordings.files import FlightError, TlogSource
+from gateway.recordings.workshop.selection import FrameChoice
+from gateway.vehicle_state.status_texts import text_of
+from gateway.wire.frame_editing import edit_frame
+from gateway.wire.mavlink_messages import MESSAGE_NAMES, ids_of
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
+from gateway.wire.recorded_frames import Batch, fields_of
+from gateway.wire.system_ids import FIELDS, LAST_ID, rename_systems
+
+BoolArray = NDArray[np.bool_]
+
+PARAMETER_IDS: Final = ids_of("PARAM_VALUE", "PARAM_SET")
+ID_PARAMETERS: Final = frozenset({
+    "SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID", "SYSID_MYGCS", "MAV_GCS_SYSID", "FOLL_SYSID",
+})  # fmt: skip
+"""Parameters of ArduPilot and PX4 that are system ids."""
+
+
+class FrameEdit:
+    """One link of a chain of edits."""
+
+    def __init__(self) -> None:
+        self.left_out: Counter[tuple[str, str]] = Counter()
+        """Number of frames left out, by message and by the reason within the message."""
+
+    def prepare(self, sources: Sequence[TlogSource], choice: FrameChoice) -> None:
+        """Read the files, of which a choice is edited, before the first frame."""
+
+    def retimed(self, batch: Batch) -> Batch:
+        """Return the next batch with the times that its records shall have."""
+        return batch
+
+    def affects(self, batch: Batch) -> BoolArray:
+        """Return which frames may change."""
+        raise NotImplementedError
+
+    def edit(self, frame: bytes) -> bytes | None:
+        """Return the edited frame; None if it must be left out."""
+        raise NotImplementedError
+
+    def leave_out(self, message: str, reason: str = "") -> None:
+        """Count a frame that is left out."""
+        self.left_out[message, reason] += 1
+
+
+class Renumbering(FrameEdit):
+    """Change system ids in headers, and in all fields and parameters that contain one.
+
+    `merge` allows that two systems of the recording get the same id.
+    """
+
+    def __init__(self, system_ids: Mapping[int, int], *, merge: bool = False) -> None:
+        super().__init__()
+        self._system_ids, self._merge = system_ids, merge
+
+    def prepare(self, sources: Sequence[TlogSource], choice: FrameChoice) -> None:
+        """Raise FlightError if two systems would get the same id."""
+        systems = {origin >> 8 for source in sources for origin in source.senders.origins}
+        systems &= choice.systems or systems
+        given: dict[int, int] = {}
+        for system in sorted(systems):
+            new = self._system_ids.get(system, system)
+            if new in given and not self._merge:
+                raise FlightError(
+                    f"--as: systems {given[new]} and {system} of the recording would both be "
+                    f"system {new}; give one of them another id, or use --merge-systems"
+                )
+            given[new] = system
+
+    def affects(self, batch: Batch) -> BoolArray:
+        """Return which records may contain a system id that changes."""
+        is_from: BoolArray = np.isin(batch.origins >> 8, [*self._system_ids])
+        return is_from | np.isin(batch.message_ids, [*FIELDS, *PARAMETER_IDS])
+
+    def edit(self, frame: bytes) -> bytes | None:
+        """Return a frame with changed ids; None for an unknown message, as its CRC is unknown."""
+        read = frame_of(frame)
+        sender = self._renamed(read.origin[0])
+        found = rename_systems(read, sender, self._renamed, drop_signature=True)
+        if found is None:
+            self.leave_out(MESSAGE_NAMES.get(read.message_id, f"unknown message {read.message_id}"))
+            return None
+        return self._with_parameter(found) if read.message_id in PARAMETER_IDS else found.data
+
+    def _with_parameter(self, frame: MavFrame) -> bytes:
+        """Return a frame whose parameter follows, if it is a system id."""
+        fields = fields_of(frame.data)
+        value = fields["param_value"]
+        if text_of(fields["param_id"]) not in ID_PARAMETERS:
+            return frame.data
+        # PX4 sends integers as their bytes.
+        (whole,) = struct.unpack("<i", struct.pack("<f", value))
+        new = float(self._renamed(int(value))) if value in range(LAST_ID + 1) else value
+        if whole in range(1, LAST_ID + 1):
+            (new,) = struct.unpack("<f", struct.pack("<i", self._renamed(whole)))
+        edited = edit_frame(frame, fields={"param_value": new})
+        return frame.data if edited is None else edited.data
+
+    def _renamed(self, system_id: int) -> int:
+        return self._system_ids.get(system_id, system_id)
