@@ -242,8 +242,8 @@ def render(settings: GatewaySettings, keys: Sequence[str] = ("",)) -> str:
     """
     head = _comment(
         "Settings of mavgate. Every key may be left out: its value here is the default. "
-        "`mavgate check-config FILE` lists the errors in a file, "
-        "`mavgate check-config --all` shows all settings."
+        "`mavgate doctor FILE` lists the errors in a file, "
+        "`mavgate doctor --template all` shows all settings."
     )
     return "\n".join([*head, *_render_section(settings, "", keys)]) + "\n"
 

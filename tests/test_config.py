@@ -42,7 +42,7 @@ FIELDS = all_fields(GatewaySettings)
 
 
 def test_documented_file_contains_defaults(tmp_path: Path) -> None:
-    """config/gateway.toml shows every setting; `mavgate check-config` writes it."""
+    """config/gateway.toml shows every setting; `mavgate doctor --template all` prints it."""
     assert (ROOT / "config" / "gateway.toml").read_text() == render(GatewaySettings())
     assert load(ROOT / "config" / "gateway.toml") == GatewaySettings()
 

@@ -167,7 +167,7 @@ def hostile_settings(target: Target) -> bool:
     pipe = target.folder / "pipe.toml"
     os.mkfifo(pipe)
     files = [*(target.folder / name for name in texts), pipe, Path("/dev/zero")]
-    return all(_refuses("check-config", str(file)) for file in files)
+    return all(_refuses("doctor", str(file)) for file in files)
 
 
 def packed_comments(target: Target) -> bool:
@@ -185,7 +185,7 @@ def _refuses(*arguments: str) -> bool:
         done = subprocess.run(command, capture_output=True, timeout=COMMAND_S, check=False)
     except subprocess.TimeoutExpired:
         return False
-    return done.returncode not in (0, 1) and b"Traceback" not in done.stderr
+    return done.returncode in (1, 2) and b"Traceback" not in done.stderr
 
 
 Attacks = Mapping[str, Callable[[Target], bool]]

@@ -41,7 +41,7 @@ from gateway.analysis.sweep import parse_axis
 from gateway.batch.catalogue import CATALOGUE_NAME, find_flights, geojson_of, index_folder
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
 from gateway.batch.storage import items_of
-from gateway.batch.tasks import LOOKING, FlightTask, JudgeTask, ResultFolder, SweepTask, run_season
+from gateway.batch.tasks import LOOKING, FlightTask, JudgeTask, ResultFolder, SweepTask, run_batch
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, encode_head
@@ -171,7 +171,7 @@ def measure(folder: Path, part: str, by: str, count: int) -> Cost:
         start_s = time.perf_counter() - began
         cpu_s, _ = workers()
         began = time.perf_counter()
-        results = run_season(task_of(part), items, executor, ResultFolder(out), progress_of(part))
+        results = run_batch(task_of(part), items, executor, ResultFolder(out), progress_of(part))
         wall_s = time.perf_counter() - began
         after_s, worker_mb = workers()
     shutil.rmtree(out)

@@ -433,7 +433,7 @@ COMMANDS: Final = (
     *(("convert", "--force", "-o", f"OUT{end}") for end in (".csv", ".tlog", ".kml", ".gpx")),
     ("fuse", "--force", "--from", "1", "-o", "OUT.csv"),
     ("fuse", "--force", "--estimator", "paper", "-o", "OUT.csv"),
-    ("check-config",),
+    ("doctor",),
 )
 
 

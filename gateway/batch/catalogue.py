@@ -47,22 +47,6 @@ SCHEMA: Final = 2
 """Version of the schema; a catalogue of another version is recreated."""
 BUSY_S: Final = 10.0
 """Time that a writer waits for another one to finish, s."""
-MAX_STEPS: Final = 20_000_000
-"""Maximum steps of SQLite's virtual machine per query; some seconds."""
-_STEPS: Final = 100_000
-MAX_QUERY_S: Final = 5.0
-MAX_QUERY_LENGTH: Final = 10_000
-"""Maximum length of a condition, in characters."""
-MAX_VALUE_BYTES: Final = 100_000
-"""Maximum size of any value that a condition computes."""
-FUNCTIONS: Final = frozenset(
-    {
-        "abs", "coalesce", "date", "datetime", "glob", "ifnull", "instr", "julianday", "length",
-        "like", "lower", "ltrim", "max", "min", "nullif", "round", "rtrim", "strftime", "substr",
-        "time", "trim", "unixepoch", "upper",
-    }
-)  # fmt: skip
-"""Functions allowed in a condition: none returns a value much larger than its arguments."""
 
 _FILE_COLUMNS: Final = {
     "path": "TEXT NOT NULL", "name": "TEXT NOT NULL", "kind": "TEXT", "size": "INTEGER NOT NULL",
@@ -77,7 +61,6 @@ _POSITION: Final = struct.Struct("<iii")
 _UNKNOWN: Final = -(1 << 31)
 """Unknown height; as a latitude, an interruption of the track."""
 _BREAK: Final = _POSITION.pack(_UNKNOWN, 0, 0)
-_ALLOWED: Final = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION}
 _DAMAGED: Final = "if it is damaged or not a catalogue, delete it and index again"
 _NOT_WRITABLE: Final = "make the folder of the recordings writable, or copy them"
 _REMEDIES: Final = {
@@ -276,9 +259,7 @@ def _open_read_only(folder: Path) -> Iterator[sqlite3.Connection]:
     path = folder / CATALOGUE_NAME
     # If the disk is full, indexing leaves an empty file.
     if not path.exists() or not path.stat().st_size:
-        raise CatalogueError(
-            f"{folder} has no catalogue yet; `mavgate catalogue {folder}` creates one"
-        )
+        raise CatalogueError(f"{folder} has no catalogue yet; `mavgate info {folder}` creates one")
     with _catalogue_errors(path):
         db = sqlite3.connect(
             f"file:{quote(str(path.absolute()))}?mode=ro", uri=True, timeout=BUSY_S
@@ -286,7 +267,7 @@ def _open_read_only(folder: Path) -> Iterator[sqlite3.Connection]:
         try:
             if db.execute("PRAGMA user_version").fetchone()[0] != SCHEMA:
                 raise CatalogueError(
-                    f"{path} is of another version; `mavgate catalogue {folder}` recreates it"
+                    f"{path} is of another version; `mavgate info {folder}` recreates it"
                 )
             yield db
         finally:
@@ -294,47 +275,17 @@ def _open_read_only(folder: Path) -> Iterator[sqlite3.Connection]:
 
 
 def _select(db: sqlite3.Connection, columns: str, where: str) -> Sequence[tuple[Any, ...]]:
-    """Run a query that can only read columns of flights and call functions."""
-    steps, selects, deadline_s = 0, 0, time.monotonic() + MAX_QUERY_S
-    timed_out = False
-
-    def allow(action: int, table: str | None, column: str | None, *_: object) -> int:
-        nonlocal selects
-        selects += action == sqlite3.SQLITE_SELECT
-        if selects > 1:
-            # A subquery could sort and store products of the table.
-            return sqlite3.SQLITE_DENY
-        if action == sqlite3.SQLITE_FUNCTION:
-            return sqlite3.SQLITE_OK if column in FUNCTIONS else sqlite3.SQLITE_DENY
-        own = action != sqlite3.SQLITE_READ or table == "flights"
-        return sqlite3.SQLITE_OK if action in _ALLOWED and own else sqlite3.SQLITE_DENY
-
-    def is_too_long() -> int:
-        nonlocal steps, timed_out
-        steps += _STEPS
-        timed_out = steps > MAX_STEPS or time.monotonic() > deadline_s
-        return int(timed_out)
-
-    length = db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
-    db.set_authorizer(allow)
-    db.set_progress_handler(is_too_long, _STEPS)
+    """Run a query with a condition in SQL, on a connection that only reads."""
     condition = f"WHERE ({where}\n)" if where.strip() else ""
     try:
-        if len(where) > MAX_QUERY_LENGTH:
-            raise ValueError(f"it has more than {MAX_QUERY_LENGTH} characters")  # noqa: TRY301
         return db.execute(
             f"SELECT {columns} FROM flights {condition} ORDER BY began, path"
         ).fetchall()
     except (sqlite3.Error, sqlite3.Warning, ValueError) as error:
-        text = "it takes too long" if timed_out else str(error)
         raise CatalogueError(
-            f"--where {where[:200]!r}: {text}; write a condition such as "
+            f"--where {where[:200]!r}: {error}; write a condition such as "
             f"'duration > 300 and loss > 0.05', of {', '.join(COLUMNS)}"
         ) from error
-    finally:
-        db.set_authorizer(None)
-        db.set_progress_handler(None, 0)
-        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, length)
 
 
 @contextmanager

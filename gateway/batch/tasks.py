@@ -121,7 +121,7 @@ class JudgeTask(FlightTask):
 
     def do(self, files: list[Path], name: str) -> Worked:
         """See `FlightTask`."""
-        read = read_season_flight(files, self.options, name)
+        read = read_batch_flight(files, self.options, name)
         case = make_case(read.flight)
         states = fuse(read.flight.samples, estimator_of(read.flight, case.fusion)).states
         lines = fused_lines(read.header, read.flight.time_us, states)
@@ -162,7 +162,7 @@ class SweepTask(FlightTask):
 
     def do(self, files: list[Path], name: str) -> Worked:
         """See `FlightTask`."""
-        read = read_season_flight(files, self.options, name)
+        read = read_batch_flight(files, self.options, name)
         flight = read.flight
         contest = make_contest(
             flight,
@@ -187,7 +187,7 @@ class ReadFlight:
     began: str | None
 
 
-def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -> ReadFlight:
+def read_batch_flight(files: Sequence[Path], options: ReadOptions, name: str) -> ReadFlight:
     """Read the parts of a recording as one flight; raises as `FlightTask.do`."""
     flight, table, aircraft = flight_of_files(
         files, options, name=name, description="One of a season."
@@ -326,7 +326,7 @@ def _lock(descriptor: int, folder: Path) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        text = "another mavgate batch writes its results here; wait, or give another folder"
+        text = "another report writes its results here; wait, or give another folder"
         raise OSError(errno.EBUSY, text, str(folder)) from error
     except OSError:
         # Some network file systems do not support locks.
@@ -351,7 +351,7 @@ def _read(path: Path) -> FlightResult | None:
         return None
 
 
-def run_season(
+def run_batch(
     task: FlightTask,
     items: Sequence[BatchItem],
     executor: Executor,

@@ -33,75 +33,59 @@ MODULES: Final = {
     "live.fleet": ("fleet",),
     "live.first_start": ("setup",),
     "live.calibrate": ("calibrate",),
-    "live.flash": ("ports", "flash"),
-    "live.doctor": ("check-config", "doctor"),
+    "live.flash": ("flash",),
+    "live.doctor": ("doctor",),
     "live.map": ("map",),
     "live.source": ("source",),
-    "recorded.report": ("report", "page"),
+    "recorded.report": ("report",),
     "recorded.sweep": ("sweep",),
     "live.record": ("record",),
-    "recorded.play": ("play", "seek", "player"),
+    "recorded.play": ("play", "player"),
     "recorded.convert": ("convert", "fuse"),
     "recorded.extract": ("extract",),
     "recorded.diff": ("diff",),
     "recorded.info": ("info", "recover"),
-    "recorded.batch": ("batch",),
-    "recorded.catalogue": ("catalogue",),
-    "live.clients": ("status", "clients", "mark", "reload"),
+    "live.clients": ("status", "clients"),
 }
 """Commands by module below `gateway.cli`; the module's `app` contains them."""
 
 HELP: Final = {"help_option_names": ["-h", "--help"]}
 GROUPS: Final = {
     "Fly": {
-        "run": "Run the gateway on the receiver's serial port until interrupted.",
+        "run": "Run the gateway: for receiver, trackers or a router, until interrupted.",
         "demo": "Fly the simulated tracker repeatedly until interrupted.",
         "panel": "Show the aircraft in a browser: instruments, map, link, recordings, calibration, "
         "tuning.",
         "status": "Show the status of the gateway: receiver, nodes, aircraft, clients.",
-        "mark": "Mark a location: ground stations show distance and bearing to it. Without one, "
-        "clear it.",
+        "clients": "List, add and remove clients and sources, and mark a location for them.",
+        "fleet": "Show the vehicles of many sites here, through a Zenoh router.",
     },
     "Recordings": {
         "record": "Start, stop, name and delete recordings, and add remarks.",
         "play": "Play one or several recordings to the ground stations.",
-        "seek": "Seek in the running player.",
         "player": "Control the running player.",
         "info": "Show duration, vehicles, rates, gaps, distance and damage of recordings; "
         "or list all.",
-        "page": "Make one HTML file of a flight, which opens offline in any browser.",
+        "report": "Make figures and tables of flights, or one HTML file of a flight.",
         "convert": "Convert, trim, join, merge and edit recordings.",
         "diff": "Compare recordings, parameter files or running vehicles: parameters, missions, "
         "texts.",
         "extract": "Extract parameters, missions, texts, subtitles and geotags from a recording.",
         "recover": "Write the intact part of a damaged recording to a new file, and list the "
         "damage.",
-    },
-    "Clients and fleet": {
-        "clients": "List, add and remove clients and sources.",
-        "reload": "Apply changed settings of the hub and of signing; other clients stay connected.",
-        "fleet": "Show the vehicles of many sites here, through a Zenoh router.",
-    },
-    "Analysis": {
-        "report": "Make a page of figures and tables of a flight, those of the paper included.",
         "fuse": "Re-run the estimator on recordings, and write them with the new states in any "
         "format.",
         "sweep": "Try settings on one flight or many, and write the best as a settings file.",
-        "batch": "Score every estimator, or try settings, on many recordings at once, here or on "
-        "a cluster.",
-        "catalogue": "Index all recordings under a folder, and list and search their flights.",
     },
     "Set-up": {
         "setup": "Guide through the first start: receiver, sensors, radio, GPS, calibration.",
         "calibrate": "Calibrate an aircraft's sensors and save the result with its residuals.",
-        "check-config": "Check the settings and those of the aircraft, or print a template with "
-        "the defaults.",
-        "ports": "List the serial ports, and the one that `auto` selects.",
         "flash": "Write a ready-made program with its settings to a board, or read them back.",
-        "doctor": "Check this machine and suggest fixes: rights, ports, latency, kernels, time, "
-        "disk.",
+        "doctor": "Check settings and machine and suggest fixes: rights, ports, latency, kernels, "
+        "time, disk.",
         "map": "Fetch an area of a map for the panel, for use without a network.",
-        "source": "Test a tracker that is to be a vehicle.",
+        "source": "Test a tracker: show its data, its rates, and data missing for attitude and "
+        "position.",
     },
 }
 """Summaries of the commands, under the headings of the list."""
@@ -109,7 +93,7 @@ COMMANDS: Final = {name: text for below in GROUPS.values() for name, text in bel
 HOISTED: Final = frozenset({"--config", "-c", "--socket"})
 """Options of `mavgate` itself that may also follow the command."""
 EPILOG: Final = "`mavgate --help` lists the options of all commands: --config, --socket, --verbose."
-SMALL: Final = frozenset({"ports", "flash", "record", *MODULES["live.clients"]})
+SMALL: Final = frozenset({"flash", "record", *MODULES["live.clients"]})
 """Commands that mostly send requests to a gateway; extensions are loaded only with settings."""
 ISO: Final = "%Y-%m-%d %H:%M:%S"
 

@@ -16,7 +16,7 @@ from gateway.hub.endpoint import EndpointKind, parse_endpoint
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, Verbs
 from gateway.live.recorder import Recorder
-from gateway.live.serial_port import SerialPort, SerialStatus, list_serial_ports
+from gateway.live.serial_port import AUTO, SerialPort, SerialStatus, list_serial_ports
 from gateway.live.session import SessionState
 from gateway.live.source_port import SourcePort
 from gateway.recordings.index import Recording, delete_recording, find_recording, list_recordings
@@ -159,7 +159,7 @@ class SerialVerbs:
         self._check_changeable()
         ports = await asyncio.to_thread(list_serial_ports)
         # The port of the settings may be chosen even if this machine does not list it.
-        check_listed(port, {"auto", self._own, *(each.device for each in ports)})
+        check_listed(port, {AUTO, self._own, *(each.device for each in ports)})
         try:
             load_entry_points()
         except LibraryError as error:

@@ -39,7 +39,7 @@ from gateway.live.other_gateways import conflicts, identity_verb, log_other_gate
 from gateway.live.pty_port import PtyPort
 from gateway.live.recorder import Recorder
 from gateway.live.recording_budget import RecordingBudget
-from gateway.live.serial_port import NO_RECEIVER, SerialPort
+from gateway.live.serial_port import AUTO, NO_RECEIVER, SerialPort
 from gateway.live.service import LoopLag, ServiceNotifier, set_realtime_priority
 from gateway.live.session import SessionState
 from gateway.live.source_port import SourcePort, read_map
@@ -115,7 +115,7 @@ class Daemon:
         self._plans = PlanFiles(aircraft_folder(settings), self._announce_plans)
         self._timestamps = TimestampFile(aircraft_folder(settings))
         self._pipeline = self._make_pipeline(aircraft)
-        needed = serial.port != "auto" or not settings.has_other_sources
+        needed = serial.port != AUTO or not settings.has_other_sources
         self._pipeline.disconnect(serial.port if needed else NO_RECEIVER)
         self._hub = Hub(
             settings.hub,

@@ -56,6 +56,8 @@ KNOWN_ADAPTERS: Final = {
     (0x2341, 0x0001): "Arduino Uno",
 }
 """USB serial chips of Arduino-class boards and programming cables."""
+AUTO: Final = "auto"
+"""Setting `port` that selects a known USB adapter, or several that are tried."""
 NO_RECEIVER: Final = "none"
 """Setting `port` of a gateway that only routes."""
 
@@ -70,10 +72,10 @@ class SerialSettings(Settings, frozen=True):
             'number ("usb:1a86:7523", "usb:0403:6001:A50285BI"), "auto" for a known USB adapter, '
             'or "none" for a router without one. With other sources among the endpoints, "auto" '
             "does not report a missing receiver. If several adapters fit, each is opened and "
-            "checked for frames, which resets its board. `mavgate ports` lists them.",
+            "checked for frames, which resets its board. `mavgate doctor` lists them.",
             pattern=r"^(auto|none|/.+|usb:[0-9a-fA-F]{4}:[0-9a-fA-F]{4}(:.+)?)$",
         ),
-    ] = "auto"
+    ] = AUTO
     baud: Annotated[
         int,
         setting("Speed of the line; the receiver's firmware must match.", "baud", ge=9600, le=2e6),
@@ -134,7 +136,7 @@ def fitting_ports(wanted: str, ports: list[Port]) -> list[str]:
     """
     if wanted == NO_RECEIVER:
         raise PortNotFoundError("serial.port = none: no receiver is used")
-    if wanted == "auto":
+    if wanted == AUTO:
         fitting = [port for port in ports if port.known]
     elif wanted.startswith("usb:"):
         vid, pid, *serial_number = wanted.removeprefix("usb:").lower().split(":", 2)

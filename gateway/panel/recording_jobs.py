@@ -57,7 +57,7 @@ FORMATS: Final = {
     "kml": ("KML (Google Earth)", ("convert", "-o"), ".kml"),
     "gpx": ("GPX", ("convert", "-o"), ".gpx"),
     "mcap": ("MCAP (Foxglove)", ("convert", "-o"), ".mcap"),
-    "page": ("Page (one HTML file)", ("page", "-o"), ".html"),
+    "page": ("Page (one HTML file)", ("report", "-o"), ".html"),
     "report": ("Report (figures and tables)", ("report", "-o"), ".zip"),
 }
 """Title, command and ending of the file of each export; the command ends with the option of the
@@ -231,7 +231,7 @@ class RecordingJobs:
 
     async def _index(self, folder: Path) -> None:
         try:
-            await _run([*own_command("catalogue"), "index", str(folder)])
+            await _run([*own_command("info"), str(folder)])
         except ExportError as error:
             log.info("the recordings in %s are not indexed: %s", folder, error)
 

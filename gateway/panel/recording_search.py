@@ -1,11 +1,13 @@
 """Search in the recordings of a folder by name or by the figures of its catalogue."""
 
 import math
+import re
 from pathlib import Path, PurePath
 from typing import Any, Final
 
 from gateway.batch.catalogue import (
     CATALOGUE_NAME,
+    COLUMNS,
     CatalogueError,
     Figures,
     FlightFigures,
@@ -17,7 +19,13 @@ from gateway.geometry.angle import wrap_180
 
 OPERATORS: Final = frozenset("<>=")
 """Characters that make a search a condition."""
-
+TOKEN: Final = re.compile(
+    rf"\b(?:and|or|not|is|null|{'|'.join(COLUMNS)})\b|[-+]?\d+(?:\.\d+)?|'[^']*'|[<>=!]+|[()]",
+    re.IGNORECASE,
+)
+"""Parts of a condition from the network: comparisons of columns with constants, and no function."""
+MAX_CONDITION: Final = 500
+"""Maximum length of a condition, in characters."""
 NO_CATALOGUE: Final = "Duration, distance, height and loss appear once the recordings are indexed."
 THUMBNAIL: Final = (46.0, 24.0)
 """Size of the drawing of a track."""
@@ -39,7 +47,8 @@ class RecordingFacts:
     def look(self, folder: Path, search: str = "") -> None:
         """Reload the catalogue if it changed, and search; some tens of ms for thousands of rows.
 
-        A search is a part of a name, or a condition as for `mavgate catalogue list --where`.
+        A search is a part of a name, or a condition as for `mavgate info --where`, without
+        functions.
         """
         stamp = _stamp(folder)
         if self._searched == (folder, stamp, search):
@@ -52,7 +61,7 @@ class RecordingFacts:
             self._broken = {row["name"] for row in rows if row["error"] is not None}
             self._tracks = {} if stamp is None else _thumbnails(geojson_of(folder))
             self._found = (
-                frozenset(row["name"] for row in find_flights(folder, search))
+                frozenset(row["name"] for row in find_flights(folder, _checked(search)))
                 if is_condition
                 else None
             )
@@ -74,6 +83,18 @@ class RecordingFacts:
         if self._found is not None:
             return name in self._found
         return search.casefold() in name.casefold()
+
+
+def _checked(condition: str) -> str:
+    """Return a condition; raises CatalogueError unless it only compares columns."""
+    other = TOKEN.sub(" ", condition[:MAX_CONDITION]).split()
+    if other or len(condition) > MAX_CONDITION:
+        raise CatalogueError(
+            f"{(other or ['it'])[0][:40]!r} cannot be used here; write a condition such as "
+            f"duration > 300 and loss > 0.05, of at most {MAX_CONDITION} characters, with the "
+            f"columns {', '.join(COLUMNS)}"
+        )
+    return condition
 
 
 def _stamp(folder: Path) -> tuple[int, int] | None:

@@ -82,7 +82,7 @@ class VehicleSettings(Settings, frozen=True):
         setting(
             "MAVLink 2 signing: the same passphrase as in the ground station. Everything sent is "
             "then signed, and changes are accepted only with a signature. Empty for none. "
-            "`mavgate reload` applies a changed one."
+            "`mavgate clients reload` applies a changed one."
         ),
     ] = ""
     node_silent_s: Annotated[

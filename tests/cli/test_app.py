@@ -104,7 +104,6 @@ def test_settings_file_is_read_wherever_it_is_named(words: str, tmp_path: Path) 
         ("fuse x -o x.pdf", ".tlog, .csv, .kml, .gpx, .geojson, .mcap, .parquet"),
         ("convert x -o x.doc", ".tlog, .csv, .kml, .gpx, .geojson, .mcap, .parquet"),
         ("recover x -o x.kml", ".tlog, .csv"),
-        ("page x -o page.pdf", ".html"),
         ("sweep x -o best.csv", ".toml"),
         ("sweep x --table trials.toml", ".csv"),
         ("flash imu -o imu.bin", ".hex"),
@@ -116,7 +115,7 @@ def test_output_of_another_ending_is_refused(words: str, endings: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", [["--help"], ["status"], ["clients", "list"], ["mark", "1", "2"], ["ports"],
+    "words", [["--help"], ["status"], ["clients", "list"], ["clients", "mark", "1", "2"],
               ["record", "status"], ["nonsense"]],
     ids=" ".join,
 )  # fmt: skip
@@ -142,8 +141,11 @@ def test_small_commands_import_nothing_large(words: list[str], tmp_path: Path) -
         ("play x --as 300", "'300': must be at most 249"),
         ("play x --skip-gaps -1", "'-1': must be at least 0"),
         ("fuse x -o y.csv --fuse-with old", "'old' is not one of 'recorded', 'current'"),
-        ("mark north 8", "'north': write a number"),
-        *((f"mark {words}", "write a number") for words in ("nan nan", "inf 0", "47 8 --alt nan")),
+        ("clients mark north 8", "'north': write a number"),
+        *(
+            (f"clients mark {words}", "write a number")
+            for words in ("nan nan", "inf 0", "47 8 --alt nan")
+        ),
         ("runn", "Did you mean 'run'"),
     ],
 )

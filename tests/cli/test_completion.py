@@ -8,7 +8,7 @@ from gateway.cli.app import app
 
 
 @pytest.mark.parametrize(
-    ("typed", "offered"), [("mavgate doc", "doctor"), ("mavgate check-config --he", "--help")]
+    ("typed", "offered"), [("mavgate doc", "doctor"), ("mavgate doctor --he", "--help")]
 )
 def test_shell_completion_offers_commands_and_options(
     typed: str, offered: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -45,8 +45,8 @@ def test_gateway_imports_no_optional_part() -> None:
 
 @pytest.mark.parametrize(
     "module",
-    ["live.first_start", "live.calibrate", "live.demo", "recorded.catalogue", "recorded.convert",
-     "recorded.play", "recorded.report", "recorded.batch", "recorded.sweep"],
+    ["live.first_start", "live.calibrate", "live.demo", "recorded.convert",
+     "recorded.play", "recorded.report", "recorded.sweep"],
 )  # fmt: skip
 def test_analysis_libraries_are_imported_only_where_they_are_used(module: str) -> None:
     found = imported_by("gateway.cli.app", f"gateway.cli.{module}")

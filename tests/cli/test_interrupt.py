@@ -30,7 +30,7 @@ PROGRAM = """
     # A shell's background job begins with Ctrl-C ignored, and so would this program.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.meta_path.insert(0, Interrupt(sys.argv.pop()))
-    sys.argv.append("check-config")
+    sys.argv.append("doctor")
     main()
 """
 
@@ -46,7 +46,7 @@ def test_sigterm_at_any_import_ends_a_background_job(module: str) -> None:
     """Such a job ignores Ctrl-C from the start on; the signal of `kill` ends it at once."""
     program = PROGRAM.replace("SIGINT)", "SIGTERM)")
     program = program.replace("signal.default_int_handler", "signal.SIG_IGN")
-    found = run(program.replace('"check-config"', '"demo"'), module)
+    found = run(program.replace('"doctor"', '"demo"'), module)
     assert (found.returncode, found.stdout, found.stderr) == (-signal.SIGTERM, "", "")
 
 

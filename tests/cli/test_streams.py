@@ -31,13 +31,13 @@ def run(*words: str, stdout: int | None = subprocess.PIPE, closed: int | None = 
 
 @pytest.mark.parametrize("closed", [0, 1, 2])
 def test_command_succeeds_with_a_closed_stream(closed: int) -> None:
-    done = run("check-config", closed=closed)
+    done = run("doctor", "--template", "usual", closed=closed)
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_full_disk_behind_the_output_is_reported() -> None:
     full = os.open("/dev/full", os.O_WRONLY)
-    done = run("check-config", stdout=full)
+    done = run("doctor", "--template", "usual", stdout=full)
     os.close(full)
     assert done.returncode == 1
     assert done.stderr.splitlines()[0] == "output: No space left on device"
@@ -45,7 +45,7 @@ def test_full_disk_behind_the_output_is_reported() -> None:
 
 
 def test_characters_missing_in_the_output_encoding_are_escaped() -> None:
-    done = run("check-config", "--all", PYTHONIOENCODING="ascii")
+    done = run("doctor", "--template", "all", PYTHONIOENCODING="ascii")
     assert done.returncode == 0
     assert r"\u" in done.stdout or r"\x" in done.stdout
 
@@ -77,6 +77,6 @@ def test_log_lines_stay_above_a_progress_bar(monkeypatch: pytest.MonkeyPatch) ->
 def test_found_fonts_are_not_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first report of a machine collects them."""
     reset_logging(monkeypatch)
-    invoke("--verbose", "check-config", code=0)
+    invoke("--verbose", "doctor", "--template", "usual", code=0)
     assert logging.getLogger("gateway").isEnabledFor(logging.DEBUG)
     assert not logging.getLogger("matplotlib.font_manager").isEnabledFor(logging.INFO)

@@ -13,10 +13,10 @@ from tests.kit.process import python
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 NEEDS = {
-    "panel": "panel", "page x": "panel", "run --panel --port none": "panel",
-    "map get --source a --around 1,2": "panel", "report": "plot", "batch report x -o o": "plot",
-    "fleet": "fleet", "batch report --no-pages s3://x -o o": "batch",
-    "batch sweep s3://x -o o --vary alpha=0.1,0.2": "batch",
+    "panel": "panel", "report x -o x.html": "panel", "run --panel --port none": "panel",
+    "map 1,2 --source a": "panel", "report": "plot", "report x y -o o": "plot",
+    "fleet": "fleet", "report --quick s3://x -o o": "batch",
+    "sweep s3://x --vary alpha=0.1,0.2": "batch",
 }  # fmt: skip
 """The commands that need an extra, which they name."""
 PROGRAM = """

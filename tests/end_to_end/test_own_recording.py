@@ -205,7 +205,7 @@ def test_summary_names_vehicles_and_gives_stations_no_distance(tlog: Path) -> No
 
 
 def test_catalogue_is_read_by_sqlite_and_agrees_with_the_summary(folder: Path, tlog: Path) -> None:
-    invoke("catalogue", "index", folder, "--jobs", 1, code=0)
+    invoke("info", folder, code=0)
     with sqlite3.connect(folder / "catalogue.sqlite") as db:
         rows = db.execute("SELECT kind, vehicle, distance, error FROM flights").fetchall()
     assert sorted((kind, vehicle) for kind, vehicle, _, _ in rows) == [
@@ -240,7 +240,7 @@ def test_sweep_of_the_seconds_before_the_take_off_teaches_nothing(
 
 
 def test_folder_is_judged_by_the_batch_command(folder: Path, tmp_path: Path) -> None:
-    invoke("batch", "report", "--no-pages", folder, "-o", tmp_path / "out", "--jobs", 1, code=0)
+    invoke("report", "--quick", folder, "-o", tmp_path / "out", "--jobs", 1, code=0)
     page = (tmp_path / "out" / "index.html").read_text()
     assert all(table.name in page for table in folder.glob("*_01_v?.csv"))
 
@@ -266,7 +266,7 @@ async def test_recording_is_played_in_the_panel(folder: Path, tlog: Path) -> Non
 
 
 def test_page_and_report_are_made(folder: Path, tlog: Path, tmp_path: Path) -> None:
-    invoke("page", tlog, "-o", tmp_path / "f.html", "--no-compare", code=0)
+    invoke("report", tlog, "-o", tmp_path / "f.html", "--quick", code=0)
     assert "<html" in (tmp_path / "f.html").read_text()[:500]
     (table,) = folder.glob("*_01_v1.csv")
     invoke("report", table, "-o", tmp_path / "report", code=0)

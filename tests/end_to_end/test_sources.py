@@ -149,7 +149,7 @@ def test_recorded_bytes_of_a_source_are_decoded_again(
     )
     gateway.end()
     (path,) = folder.glob("*.tlog")
-    done = invoke("source", "test", f"{kind}:file:{path}?id=1", "--seconds", "2")
+    done = invoke("source", f"{kind}:file:{path}?id=1", "--seconds", "2")
     for words in wanted:
         assert words in done.output, done.output
     assert "fault" not in done.output

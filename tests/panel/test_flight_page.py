@@ -109,7 +109,7 @@ def test_page_of_the_last_recording_has_its_name_and_overwrites_none(tmp_path: P
     flight_of(tmp_path, flight_records(30))
     config, output = tmp_path / "gateway.toml", tmp_path / "flight.html"
     config.write_text(f'[recording]\nfolder = "{tmp_path}"\n')
-    words = ("page", "last", "-o", output, "--no-compare", "-c", config)
+    words = ("report", "last", "-o", output, "--quick", "-c", config)
     assert "MB" in invoke(*words, code=0).output
     page = output.read_text()
     assert "<title>day</title>" in page

@@ -1,4 +1,4 @@
-"""`mavgate status`, `clients …`, `mark`, `reload`: the clients of a running gateway."""
+"""`mavgate status` and `clients …`: the status and the clients of a running gateway."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,10 @@ Record = Mapping[str, Any]
 """A dataclass, as decoded from the control socket."""
 
 app = typer.Typer()
-group = typer.Typer(help="List, add and remove clients and sources.", no_args_is_help=True)
+group = typer.Typer(
+    help="List, add and remove clients and sources, and mark a location for them.",
+    no_args_is_help=True,
+)
 app.add_typer(group, name="clients")
 MOST_SYSTEMS: Final = 8
 """Systems shown per client; a client that floods may send as thousands."""
@@ -118,7 +121,7 @@ def remove(name: Annotated[str, typer.Argument(help="Name or URL of the client."
     print(*ask("clients.remove", {"name": name}), sep="\n")
 
 
-@app.command(context_settings=NEGATIVE_NUMBERS)
+@group.command(context_settings=NEGATIVE_NUMBERS)
 def mark(
     lat_deg: Annotated[float | None, typer.Argument(help="Latitude; south is negative.")] = None,
     lon_deg: Annotated[float | None, typer.Argument(help="Longitude; west is negative.")] = None,
@@ -128,7 +131,7 @@ def mark(
         int | None, typer.Option("--aircraft", help="For this aircraft only; by default all.")
     ] = None,
 ) -> None:
-    """Mark a location: ground stations show distance and bearing to it. Without one, clear it."""
+    """Mark a location: clients show distance and bearing to it. Without one, clear the mark."""
     for name, value in (("LAT_DEG", lat_deg), ("LON_DEG", lon_deg), ("--alt", alt)):
         if value is not None and not math.isfinite(value):
             refuse(
@@ -138,9 +141,9 @@ def mark(
     print(ask("mark", location))
 
 
-@app.command()
+@group.command()
 def reload() -> None:
-    """Apply changed settings of the hub and of signing; other clients stay connected."""
+    """Apply changed settings of the hub and of signing; the other clients stay connected."""
     print(ask("reload"))
 
 

@@ -1,4 +1,4 @@
-"""`mavgate doctor` and `check-config`: check the installation, settings, ports and disk."""
+"""`mavgate doctor`: check the installation, settings, ports and disk; print a settings file."""
 
 import grp
 import os
@@ -15,7 +15,7 @@ from enum import StrEnum
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import typer
 
@@ -28,7 +28,6 @@ from gateway.config import (
     GatewaySettings,
     aircraft_folder,
     exposed_secrets,
-    load,
     load_aircraft,
     render,
 )
@@ -37,7 +36,13 @@ from gateway.hub.endpoint import LISTENING, Endpoint, EndpointKind, parse_endpoi
 from gateway.hub.transports.ws_protocol import valid_until_s
 from gateway.live.control_socket import live_sockets
 from gateway.live.part_files import free_bytes_near
-from gateway.live.serial_port import PortNotFoundError, fitting_ports, list_serial_ports
+from gateway.live.serial_port import (
+    AUTO,
+    NO_RECEIVER,
+    PortNotFoundError,
+    fitting_ports,
+    list_serial_ports,
+)
 from gateway.output import PRIVATE, write_new
 from gateway.printable import reason_of
 
@@ -47,12 +52,13 @@ TTY: Final = Path("/sys/class/tty")
 SLOW_LATENCY_MS: Final = 4
 """Greatest acceptable latency timer of an FTDI adapter, which delays bytes; its default is 16."""
 EXTRA_USES: Final = {
-    "plot": "`mavgate report`",
-    "panel": "`mavgate panel`",
+    "plot": "`mavgate report` with figures",
+    "panel": "`mavgate panel`, and `report` as one HTML file",
     "fleet": "`mavgate fleet`",
     "formats": "reading and writing of ULog, MCAP and Parquet",
-    "batch": "`mavgate batch` on a cluster and on URLs",
+    "batch": "many recordings on a cluster or behind URLs",
     "fast": "hub.event_loop = uvloop",
+    "mqtt": "an endpoint mqtt:",
 }
 ENOUGH_HOURS: Final = 4.0
 MB_PER_HOUR: Final = 100.0
@@ -86,25 +92,51 @@ fail: Final = partial(Diagnosis, Grade.FAIL)
 Check = Callable[[GatewaySettings], Iterator[Diagnosis]]
 
 
-def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check the aircraft's files, and write access to them."""
-    folder = aircraft_folder(settings)
+def check_settings(settings: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check the aircraft's files, the rights of secrets, and what no single setting shows."""
+    file = settings_file()
     try:
         found = load_aircraft(settings)
     except ConfigError as error:
-        yield fail("aircraft", str(error))
+        yield from (fail("settings", line) for line in str(error).splitlines())
         return
-    for warning in exposed_secrets(settings_file(), settings, found):
+    for warning in exposed_secrets(file, settings, found):
         yield fail("secrets", warning)
-    yield _writable("aircraft", folder, f"{len(found)} with settings of their own in {folder}")
+    for endpoint in map(parse_endpoint, settings.hub.endpoints):
+        if endpoint.port == 0 and endpoint.kind in LISTENING:
+            yield fail(
+                "settings",
+                f"hub.endpoints: {endpoint.url!r} uses any free port, which no ground station can "
+                "know in advance; set one of 1 to 65535",
+            )
+    text = f"{file}: all settings are valid" if file.exists() else f"no {file}: the defaults"
+    others = f", and of {len(found)} aircraft in {aircraft_folder(settings)}" if found else ""
+    yield ok("settings", f"{text}{others}")
+
+
+def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check write access to the aircraft's files."""
+    folder = aircraft_folder(settings)
+    yield _writable("aircraft", folder, f"calibrations and parameters are stored in {folder}")
 
 
 def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check the receiver's port, and access to it."""
+    """List the USB adapters, and check the receiver's port and access to it."""
+    wanted, found = settings.serial.port, list_serial_ports()
+    for port in found:
+        if port.usb_id:
+            usb = f"usb:{port.usb_id}" + (f":{port.serial_number}" * bool(port.serial_number))
+            yield info("port", f"{port.device}, {usb}, {port.description}")
+    if wanted == NO_RECEIVER:
+        return
     try:
-        fitting = fitting_ports(settings.serial.port, list_serial_ports())
+        fitting = fitting_ports(wanted, found)
     except PortNotFoundError as error:
-        yield fail("receiver", f"{error}; plug it in, or set serial.port")
+        if wanted == AUTO:
+            text = "none is connected; a router, and sources other than our boards, need none"
+            yield info("receiver", text)
+        else:
+            yield fail("receiver", f"{error}; plug it in, or set serial.port")
         return
     if len(fitting) > 1:
         text = f"several adapters match, the gateway tries each: {', '.join(fitting)}"
@@ -116,7 +148,7 @@ def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
 def _check_port(device: str) -> Iterator[Diagnosis]:
     path = Path(device)
     if not path.exists():
-        yield fail("receiver", f"{device} does not exist; `mavgate ports` lists all")
+        yield fail("receiver", f"{device} does not exist; the ports above do")
     elif not os.access(path, os.R_OK | os.W_OK):
         yield fail("receiver", f"{device} may not be opened: {_membership(path)}")
     else:
@@ -274,11 +306,12 @@ def _write_template(text: str) -> None:
     try:
         write_new(file, [text.encode()], rights=PRIVATE)
     except FileExistsError:
-        refuse(f"{file}: exists, and is not overwritten; `mavgate check-config {file}` checks it")
+        refuse(f"{file}: exists, and is not overwritten; `mavgate doctor {file}` checks it")
     print(f"wrote {file}")
 
 
 CHECKS: Final[tuple[Check, ...]] = (
+    check_settings,
     check_receiver,
     check_ports,
     check_aircraft,
@@ -294,15 +327,36 @@ STYLES: Final = {Grade.OK: "green", Grade.INFO: "yellow", Grade.FAIL: "red"}
 
 
 @app.command()
-def doctor() -> None:
-    """Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.
+def doctor(
+    file: Annotated[
+        Path | None,
+        typer.Argument(help="Settings file to check alone; without it, this machine is checked."),
+    ] = None,
+    *,
+    template: Annotated[
+        Literal["usual", "all"] | None,
+        typer.Option(
+            "--template",
+            help="Print a settings file instead, with the defaults of the settings that are "
+            "changed most, or of all.",
+        ),
+    ] = None,
+    write: Annotated[
+        bool, typer.Option("--write", help="Write that file as the settings, if there are none.")
+    ] = False,
+) -> None:
+    """Check settings and machine and suggest fixes: rights, ports, latency, kernels, time, disk.
 
-    It changes nothing. The exit code is 1 if a check fails.
+    Each error in the settings is listed with the allowed values. The exit code is 1 if a check
+    fails.
     """
+    if template or write:
+        text = render(GatewaySettings(), ("",) if template == "all" else USUAL)
+        _write_template(text) if write else print(text, end="")
+        return
     console = console_of()
     failed = False
-    settings = read_settings()
-    for finding in chain.from_iterable(check(settings) for check in CHECKS):
+    for finding in _findings(file):
         failed |= finding.grade is Grade.FAIL
         console.print(f"{finding.grade:4}  ", style=STYLES[finding.grade], end="")
         console.print(f"{finding.what}: {finding.text}")
@@ -310,39 +364,12 @@ def doctor() -> None:
         raise typer.Exit(1)
 
 
-@app.command()
-def check_config(
-    file: Annotated[
-        Path | None,
-        typer.Argument(help="Settings file to check; without it, a template is printed."),
-    ] = None,
-    *,
-    every: Annotated[
-        bool, typer.Option("--all", help="Print all settings with their defaults.")
-    ] = False,
-    write: Annotated[
-        bool,
-        typer.Option("--write", help="Write the template as the settings file if there is none."),
-    ] = False,
-) -> None:
-    """Check the settings and those of the aircraft, or print a template with the defaults.
-
-    All errors are listed at once, each with the allowed values. The template contains the settings
-    that are changed most.
-    """
-    if file is None:
-        text = render(GatewaySettings(), ("",) if every else USUAL)
-        _write_template(text) if write else print(text, end="")
+def _findings(file: Path | None) -> Iterator[Diagnosis]:
+    if file is not None:
+        CONFIG.set(file)
+    try:
+        settings = read_settings()
+    except ConfigError as error:
+        yield from (fail("settings", line) for line in str(error).splitlines())
         return
-    settings = load(file)
-    aircraft = load_aircraft(settings)
-    for warning in exposed_secrets(file, settings, aircraft):
-        console_of(stderr=True).print(warning, style="yellow")
-    for endpoint in map(parse_endpoint, settings.hub.endpoints):
-        if endpoint.port == 0 and endpoint.kind in LISTENING:
-            refuse(
-                f"{file}: hub.endpoints: {endpoint.url!r} uses any free port, which no ground "
-                "station can know in advance; set one of 1 to 65535"
-            )
-    others = f", and of {len(aircraft)} aircraft in {aircraft_folder(settings)}" if aircraft else ""
-    print(f"{file}: all settings are valid{others}")
+    yield from chain.from_iterable(check(settings) for check in CHECKS[: 1 if file else None])

@@ -1,6 +1,5 @@
-"""`mavgate flash` and `ports`: programs and settings of boards, and their serial ports."""
+"""`mavgate flash`: programs and settings of boards."""
 
-import asyncio
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Final, get_args
@@ -20,14 +19,7 @@ from gateway.flashing.boards import (
     SettingsBlock,
     used_by,
 )
-from gateway.live.serial_port import (
-    PortNotFoundError,
-    SerialSettings,
-    find_port,
-    find_receiver,
-    fitting_ports,
-    list_serial_ports,
-)
+from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports
 from gateway.output import write_new
 from gateway.printable import reason_of
 from gateway.settings import Field, fields_of
@@ -288,26 +280,3 @@ def _print(device: str, block: SettingsBlock) -> None:
         text = f"{value:08x}" if field == "radio_address" else str(value)
         table.add_row(field, text, FIELDS[field].unit, OPTIONS.get(field, ""))
     console.print(table)
-
-
-@app.command()
-def ports() -> None:
-    """List the serial ports, and the one that `auto` selects.
-
-    If several USB adapters match, each is opened and checked for the receiver's frames.
-    """
-    found = list_serial_ports()
-    table = table_of("device", "setting by USB id", "serial number", "description", left=4)
-    for port in found:
-        usb = f"usb:{port.usb_id}" if port.usb_id else ""
-        table.add_row(port.device, usb, port.serial_number, port.description)
-    if found:
-        console.print(table)
-    try:
-        fitting = fitting_ports("auto", found)
-        if len(fitting) > 1:
-            console.print(f"checking {', '.join(fitting)} for the receiver's frames")
-            fitting = [asyncio.run(find_receiver(SerialSettings()))]
-        console.print(f'port = "auto" uses {fitting[0]}')
-    except PortNotFoundError as error:
-        console.print(f'port = "auto": {error}')

@@ -1,4 +1,4 @@
-"""`mavgate map get`: copy an area of a map for the panel, for use without a network."""
+"""`mavgate map`: copy an area of a map for the panel, for use without a network."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -9,16 +9,15 @@ from rich.progress import Progress
 
 from gateway.cli.support.options import folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import files_of, name_of
-from gateway.cli.support.terminal import console_of, refuse
+from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of, refuse
 from gateway.extras import require
 
 app = typer.Typer()
-group = typer.Typer(help="Fetch an area of a map for the panel, for use without a network.")
-app.add_typer(group, name="map")
 
 
-@group.command()
-def get(
+@app.command("map", context_settings=NEGATIVE_NUMBERS)
+def get_map(
+    around: Annotated[str, typer.Argument(help="A recording, or LATITUDE,LONGITUDE in degrees.")],
     *,
     source: Annotated[
         str,
@@ -28,18 +27,15 @@ def get(
             "extracts, or a path.",
         ),
     ],
-    around: Annotated[
-        str, typer.Option("--around", help="A recording, or LATITUDE,LONGITUDE in degrees.")
-    ],
     radius: Annotated[str, typer.Option("--radius", help="Margin: 5km, 800m, 3mi.")] = "5km",
     zoom: Annotated[int, typer.Option("--zoom", min=1, max=22, help="Greatest zoom.")] = 16,
     name: Annotated[
         str | None, typer.Option("--name", help="Name of the map style; by default the area's.")
     ] = None,
 ) -> None:
-    """Copy an area of a map into a file that the panel offers as a map style.
+    """Fetch an area of a map for the panel, for use without a network.
 
-    Only what the area needs is fetched, one request at a time.
+    It is offered as a map style. Only what the area needs is fetched, one request at a time.
     """
     require("a map", "panel")
     from gateway.panel import map_area

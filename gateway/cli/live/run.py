@@ -68,7 +68,7 @@ def run_gateway(
         bool, typer.Option("--panel", help="Start the panel too, whatever the settings.")
     ] = False,
 ) -> None:
-    """Run the gateway on the receiver's serial port until interrupted."""
+    """Run the gateway: for receiver, trackers or a router, until interrupted."""
     # Read here: a reload runs in another thread, without the context.
     file = CONFIG.get()
 

@@ -1,4 +1,4 @@
-"""`mavgate source test`: describe the data that a tracker sends."""
+"""`mavgate source`: describe the data that a tracker sends."""
 
 import asyncio
 from typing import Annotated
@@ -15,21 +15,19 @@ from gateway.sources.source import SourceInput
 from gateway.sources.trial import SourceTrial, describe
 
 app = typer.Typer()
-group = typer.Typer(help="Test a tracker that is to be a vehicle.", no_args_is_help=True)
-app.add_typer(group, name="source")
 
 SHOWN = 5
 """Records of each kind that are shown; further ones are counted."""
 
 
-@group.command("test")
+@app.command("source")
 def try_source(
     url: Annotated[str, typer.Argument(help="Such as lines:/dev/ttyUSB0 or crsf:/dev/ttyACM0.")],
     seconds: Annotated[
         float, typer.Option("--seconds", min=0.1, max=3600, help="Duration of the test, s.")
     ] = 10.0,
 ) -> None:
-    """Show the data of a tracker, its rates, and data missing for attitude and position.
+    """Test a tracker: show its data, its rates, and data missing for attitude and position.
 
     The exit code is 1 if nothing was received.
     """

@@ -18,8 +18,16 @@ from gateway.cli.support.recording_options import (
     ForceOption,
     progress_of,
     recorded_files,
+    refuse_unused,
 )
-from gateway.cli.support.terminal import console_of, duration_text, print_json, refuse, table_of
+from gateway.cli.support.terminal import (
+    console_of,
+    duration_text,
+    print_json,
+    progress_bar,
+    refuse,
+    table_of,
+)
 from gateway.output import write_new
 from gateway.printable import UNKNOWN, figure
 from gateway.recordings.files import (
@@ -39,11 +47,14 @@ from gateway.recordings.table import TableFault, TableHeader, TableReader, encod
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
-    from gateway.batch.catalogue import FlightFigures
+    from gateway.batch.catalogue import FlightFigures, IndexReport, Row
+    from gateway.batch.executors import Executor
     from gateway.recordings.recorded_table import ReadOptions
 
 app = typer.Typer()
 
+WHOLE: Final = ("vehicle", "duration", "highest", "gps_outages", "faults")
+"""Columns of the catalogue that are shown without decimals."""
 SHOWN: Final = 8
 """Gaps and damaged ranges that are listed individually."""
 
@@ -58,20 +69,40 @@ def info(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Recordings, by name or file; without one, all recordings are listed.",
+            help="Recordings, by name or file, or a folder to index; without one, all recordings "
+            "are listed.",
             show_default=False,
         ),
     ] = None,
     *,
     columns: ColumnsOption = None,
+    where: Annotated[
+        str,
+        typer.Option(
+            "--where", help="List flights of a folder by SQL: 'duration > 300 and loss > 0.05'."
+        ),
+    ] = "",
+    geojson: Annotated[
+        bool, typer.Option("--geojson", help="The tracks of a folder's flights, for maps.")
+    ] = False,
     json: Annotated[bool, typer.Option("--json", help="For programs: one line per file.")] = False,
 ) -> None:
-    """Show duration, vehicles, rates, gaps, distance and damage of recordings; or list all."""
+    """Show duration, vehicles, rates, gaps, distance and damage of recordings; or list all.
+
+    All recordings below a folder are indexed in its file catalogue.sqlite, and its flights listed.
+    """
+    files = files or []
+    folder = next(filter(Path.is_dir, files), None)
+    if folder is not None or ((where or geojson) and not files):
+        if len(files) > 1:
+            refuse(f"{folder}: is a folder; give one folder, or recordings")
+        folder = (folder or recordings_folder()).expanduser()
+        _list_flights(folder, columns, where, geojson=geojson, json=json)
+        return
+    refuse_unused("recordings: give their folder", {"--where": where, "--geojson": geojson})
     if not files:
         _list_all(json=json)
         return
-    if (folder := next(filter(Path.is_dir, files), None)) is not None:
-        refuse(f"{folder}: is a folder; `mavgate catalogue {folder}` indexes it")
     # Files need no settings, which would import all stages.
     files = recorded_files(files, "all")
     with progress_of(files) as advance:
@@ -260,26 +291,84 @@ def _when(found: FileInfo) -> str:
 
 def _figures(recordings: list[Recording]) -> dict[str, dict[int, FlightFigures]]:
     """Update the catalogue of the recordings, and return figures from it."""
-    from gateway.batch.catalogue import CatalogueError, figures_of, find_flights, index_folder
+    from gateway.batch.catalogue import CatalogueError, figures_of, find_flights
     from gateway.batch.executors import ThisProcess
 
     folder = recordings[0].files[0].parent
-    console = console_of(stderr=True)
-    with console.status("reading new recordings") as shown:
+    try:
+        _index(folder, None, ThisProcess())
+        found = figures_of(find_flights(folder))
+    except (CatalogueError, OSError) as error:
+        console_of(stderr=True).print(f"no figures of the flights: {error}")
+        return {}
+    return {
+        str(path): {vehicle: one for vehicle, one in flown.items() if vehicle is not None}
+        for path, flown in found.items()
+    }
+
+
+def _index(folder: Path, columns: Path | None, executor: Executor) -> IndexReport:
+    """Update the catalogue of a folder, with a progress bar."""
+    from gateway.batch.catalogue import index_folder
+
+    with progress_bar() as progress:
+        task = progress.add_task("reading new recordings", total=None)
 
         def show(done: int, total: int) -> None:
-            shown.update(f"reading new recordings: {done} of {total} files")
+            progress.update(task, completed=done, total=total, refresh=True)
 
-        try:
-            index_folder(folder, read_options(read_settings()), ThisProcess(), show)
-            found = figures_of(find_flights(folder))
-            return {
-                str(path): {vehicle: one for vehicle, one in flown.items() if vehicle is not None}
-                for path, flown in found.items()
-            }
-        except (CatalogueError, OSError) as error:
-            console.print(f"no figures of the flights: {error}")
-            return {}
+        return index_folder(folder, read_options(read_settings(), columns), executor, show)
+
+
+def _list_flights(
+    folder: Path, columns: Path | None, where: str, *, geojson: bool, json: bool
+) -> None:
+    """Index a folder, and list the flights that satisfy a condition."""
+    from gateway.batch.catalogue import CatalogueError, find_flights, geojson_of
+    from gateway.batch.executors import LocalProcesses
+
+    console = console_of(stderr=True)
+    try:
+        done = _index(folder, columns, LocalProcesses(None))
+        console.print(
+            f"{folder}: {done.unchanged} unchanged, {done.read - done.broken} new, "
+            f"{done.gone} removed, {done.broken} unreadable"
+        )
+    except CatalogueError as error:
+        # A catalogue of a folder that cannot be written is read.
+        console.print(str(error), style="yellow")
+    if geojson or json:
+        print_json(geojson_of(folder, where) if geojson else find_flights(folder, where))
+    else:
+        _show_flights(find_flights(folder, where))
+
+
+def _show_flights(rows: list[Row]) -> None:
+    from gateway.batch.catalogue import figures_of
+
+    grid = table_of(
+        "file", "kind", "began (UTC)", "aircraft", "duration, s", "distance, km", "highest, m",
+        "fastest, m/s", "GPS outages", "faults", "loss", left=3,
+    )  # fmt: skip
+    for row in rows:
+        if row["error"] is not None:
+            grid.add_row(row["path"], "unreadable", row["error"], *[UNKNOWN] * 8)
+            continue
+        km = None if row["distance"] is None else row["distance"] / 1000.0
+        whole = {key: figure(row[key], ".0f") for key in WHOLE}
+        grid.add_row(
+            row["path"], row["kind"], row["began"] or UNKNOWN, whole["vehicle"], whole["duration"],
+            figure(km, ".2f"), whole["highest"], figure(row["fastest"], ".1f"),
+            whole["gps_outages"], whole["faults"], figure(row["loss"], ".1%"),
+        )  # fmt: skip
+    console_of().print(grid)
+    lasted_s = [one.duration for flown in figures_of(rows).values() for one in flown.values()]
+    files = len({row["path"] for row in rows})
+    broken = sum(row["error"] is not None for row in rows)
+    console_of().print(
+        f"{counted(len(lasted_s), 'flight')}, {sum(lasted_s) / 3600.0:.2f} h, in "
+        f"{counted(files, 'file')}; {broken} unreadable"
+    )
 
 
 def _show_list(recordings: list[Recording], figures: dict[str, dict[int, FlightFigures]]) -> None:

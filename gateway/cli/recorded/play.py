@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import typer
 from rich.console import Group
@@ -103,7 +103,7 @@ def play(
     recording. A table is fused again while it plays, so what was recorded and what other settings
     make of it can be compared on one map. An autopilot's own log is played with its own estimates,
     parameters and mission, unless --fuse or --beside is given. The parts of a recording are one
-    flight. `mavgate seek` and `mavgate player` control the running player.
+    flight. `mavgate player` controls the running player.
     """
     gateway = with_endpoints(read_settings(), endpoint)
     if with_commands and not yes:
@@ -155,13 +155,13 @@ def _ask_for_commands(settings: GatewaySettings) -> None:
 app.add_typer(group, name="player")
 
 
-@app.command(context_settings=NEGATIVE_NUMBERS)
+@group.command(context_settings=NEGATIVE_NUMBERS)
 def seek(
     to: Annotated[
         str, typer.Argument(help="80 or 1:20 from the start, +10 or -0:30 from here, or a date.")
     ],
 ) -> None:
-    """Seek in the running player."""
+    """Go to a moment."""
     _show(ask("seek", {"to": to}, of="play"))
 
 
@@ -193,11 +193,9 @@ def set_speed(speed: Annotated[str, typer.Argument(help="0.1 to 100, or max.")])
 
 
 @group.command("loop")
-def set_loop(
-    *, on: Annotated[bool, typer.Option("--on/--off", help="Restart at the end.")] = True
-) -> None:
+def set_loop(on: Annotated[Literal["on", "off"], typer.Argument()] = "on") -> None:
     """Set whether to restart at the end."""
-    _show(ask("play.loop", {"on": on}, of="play"))
+    _show(ask("play.loop", {"on": on == "on"}, of="play"))
 
 
 _add_verb("status", "Show the status of the player.")

@@ -1,78 +1,155 @@
-"""`mavgate report`: figures and tables of a flight; `mavgate page`: a flight as one HTML file."""
+"""`mavgate report`: figures and tables of flights, or one flight as an HTML file."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from rich.progress import TimeElapsedColumn
 
-from gateway.cli.support.options import folder_of, output_file, read_options, read_settings
+from gateway.cli.support.options import folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
-    FlightArgument,
+    FlightsArgument,
     ForceOption,
     FuseWithOption,
+    JobsOption,
     ReferenceOption,
+    SchedulerOption,
     SmoothOption,
     SystemOption,
+    are_many,
     files_of,
     fusion_of,
     load_flight,
     name_of,
     print_remarks,
     progress_of,
+    refuse_unused,
 )
-from gateway.cli.support.terminal import progress_bar
-from gateway.extras import require
+from gateway.cli.support.terminal import console_of, progress_bar, refuse, table_of
+from gateway.config import GatewaySettings
+from gateway.extras import how_to_add, missing, require
 from gateway.output import check_folder, write_new
+from gateway.printable import figure
 from gateway.recordings.fuse import with_reference
 from gateway.recordings.recorded_fusion import smoothed_latency_in_words
+from gateway.recordings.recorded_table import ReadOptions
+
+if TYPE_CHECKING:
+    from gateway.batch.statistics import Versus
+    from gateway.batch.tasks import FlightResult
 
 app = typer.Typer()
-
-OutputOption = Annotated[
-    Path, typer.Option("--output", "-o", help="Folder for the page, its figures and tables.")
-]
+HTML: Final = ".html"
+"""Suffix of the output that selects the page of one flight."""
+SETTINGS: Final = ".toml"
+"""Suffix of settings to compare with."""
+FLIGHTS_CSV: Final = "flights.csv"
+UNUSED: Final = {
+    "an HTML file": ("--against", "--reference", "--system", "--smooth", "--jobs", "--scheduler"),
+    "many recordings": ("--reference", "--system", "--smooth"),
+    "one recording": ("--jobs", "--scheduler"),
+}
+"""Options that have no effect, by kind of report."""
 
 
 @app.command()
 def report(
-    flight: FlightArgument = None,
+    flights: FlightsArgument = None,
     *,
-    output: OutputOption = Path("report"),
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="A folder for figures and tables, or NAME.html for one flight to replay in a "
+            "browser.",
+        ),
+    ] = Path("report"),
     against: Annotated[
-        Path | None, typer.Option("--against", help="Another recording to compare with.")
-    ] = None,
-    against_config: Annotated[
-        Path | None, typer.Option("--against-config", help="Other settings to compare with.")
+        list[Path] | None,
+        typer.Option(
+            "--against",
+            help="Compare with another recording or other settings (.toml); many recordings with "
+            "the folder of an earlier report.",
+        ),
     ] = None,
     reference: ReferenceOption = None,
     columns: ColumnsOption = None,
     system: SystemOption = None,
     smooth: SmoothOption = False,
     fuse_with: FuseWithOption = "recorded",
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help="Leave out the comparison of estimators in NAME.html, or the pages of many "
+            "recordings.",
+        ),
+    ] = False,
+    jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Make a page of figures and tables of a flight, those of the paper included.
+    """Make figures and tables of flights, or one HTML file of a flight.
 
-    Without a flight the built-in simulated one is used.
+    The figures and tables include those of the paper; without a recording, the built-in simulated
+    flight is used. Of many recordings or a folder, every estimator is scored on every flight;
+    finished ones are not repeated, and the exit code is 1 if one failed. The HTML file opens
+    offline in any browser: instruments, 3D, plan, plots and events.
     """
+    names, others = flights or [], against or []
+    kind = "many recordings" if are_many(names) else "one recording"
+    kind = "an HTML file" if output.suffix == HTML else kind
+    given = {
+        "--against": others, "--reference": reference, "--system": system, "--smooth": smooth,
+        "--jobs": jobs, "--scheduler": scheduler,
+    }  # fmt: skip
+    refuse_unused(kind, {name: given[name] for name in UNUSED[kind]})
+    gateway = read_settings()
+    options = read_options(gateway, columns, choice=fuse_with, system_id=system)
+    if kind == "many recordings":
+        _report_many(names, output, options, others, quick=quick, jobs=jobs, cluster=scheduler)
+        return
+    one = Path(names[0]) if names else None
+    if kind == "an HTML file":
+        if one is None or len(names) > 1:
+            refuse(f"{output}: give the one recording that it shows")
+        _write_html(one, gateway, output, options, compare=not quick, force=force)
+        return
     require("a report", "plot")
+    check_folder(output, overwrite=force)
+    _report_one(one, gateway, output, options, others, reference, smooth=smooth)
+
+
+def _report_one(
+    path: Path | None,
+    gateway: GatewaySettings,
+    output: Path,
+    options: ReadOptions,
+    against: Sequence[Path],
+    reference: Path | None,
+    *,
+    smooth: bool,
+) -> None:
+    """Write the folder with page, figures and tables of one flight."""
     # These require the extra, and take a second to import.
     from gateway.analysis.case import make_case
     from gateway.analysis.reporting.compose import make_report
     from gateway.analysis.reporting.page import count_pictures, write_report
 
-    check_folder(output, overwrite=force)
-    gateway = read_settings()
-    options = read_options(gateway, columns, choice=fuse_with, system_id=system)
-    loaded = load_flight(flight, gateway, options, reference)
-    other = loaded if against is None else load_flight(against, gateway, options)
+    settings = [each for each in against if each.suffix == SETTINGS]
+    recordings = [each for each in against if each.suffix != SETTINGS]
+    if len(settings) > 1 or len(recordings) > 1:
+        refuse("--against: give at most one recording and one settings file")
+    loaded = load_flight(path, gateway, options, reference)
+    other = load_flight(recordings[0], gateway, options) if recordings else loaded
     others = None
-    if against_config is not None:
-        others = fusion_of(read_settings(against_config))
-        if flight is None:
+    if settings:
+        others = fusion_of(read_settings(settings[0]))
+        if path is None:
             others = with_reference(others, gps_latency_s=loaded.latency_s)
     with progress_bar(TimeElapsedColumn()) as progress:
         task = progress.add_task("fusing", total=None)
@@ -94,44 +171,104 @@ def report(
     print(page)
 
 
-@app.command()
-def page(
-    flight: Annotated[
-        Path, typer.Argument(help="A recording by its name, or any flight log.", show_default=False)
-    ],
+def _write_html(
+    path: Path,
+    gateway: GatewaySettings,
+    output: Path,
+    options: ReadOptions,
     *,
-    output: Annotated[Path, output_file("The HTML file.", (".html",))] = Path("flight.html"),
-    compare: Annotated[
-        bool,
-        typer.Option(
-            "--compare/--no-compare",
-            help="Also fuse the sensor data with every estimator, and show the differences.",
-        ),
-    ] = True,
-    columns: ColumnsOption = None,
-    fuse_with: FuseWithOption = "recorded",
-    force: ForceOption = False,
+    compare: bool,
+    force: bool,
 ) -> None:
-    """Make one HTML file of a flight, which opens offline in any browser.
-
-    It contains the instruments, the flight in 3D and on a plan, a slider, plots and events.
-    """
-    require("a page", "panel")
+    """Write the HTML file of one flight."""
+    require(f"{output}", "panel")
     # These take a second to import.
     from gateway.panel.flight_page import add_comparison, begin_comparison, read_flight, render_page
 
-    gateway = read_settings()
-    files = files_of([flight], folder_of(gateway), "tlogs")
-    options = read_options(gateway, columns, choice=fuse_with)
+    files = files_of([path], folder_of(gateway), "tlogs")
     comparison = None
     if compare:
         # Runs on another core at the same time.
-        tables = files_of([flight], folder_of(gateway), "tables")
-        comparison = begin_comparison(tables, options)
+        comparison = begin_comparison(files_of([path], folder_of(gateway), "tables"), options)
     with progress_of(files) as advance:
-        made = read_flight(files, replace(options, progress=advance), name_of(flight, files))
+        made = read_flight(files, replace(options, progress=advance), name_of(path, files))
         if comparison is not None:
             add_comparison(made, comparison)
     print_remarks(made.remarks)
     write_new(output, [render_page(made).encode()], overwrite=force, inputs=files)
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
+
+
+def _report_many(
+    names: Sequence[str],
+    output: Path,
+    options: ReadOptions,
+    against: Sequence[Path],
+    *,
+    quick: bool,
+    jobs: int | None,
+    cluster: str | None,
+) -> None:
+    """Score every estimator on every flight, and write the folder of the results."""
+    # Imported here: these import pandas.
+    from gateway.batch.statistics import (
+        errors_by_group,
+        flight_table,
+        why_leads,
+        write_flights_page,
+    )
+    from gateway.batch.tasks import JudgeTask, without_secrets
+    from gateway.cli.support.batch_work import BatchWork, exit_if_failed
+
+    if not quick:
+        require("a report", "plot")
+    if len(against) > 1:
+        refuse("--against: give the folder of one earlier report")
+    work = BatchWork(names, jobs, cluster)
+    results = work.run(JudgeTask(without_secrets(options), not quick), work.items(), output)
+    compared = _compare(results, against[0]) if against else None
+    grid = table_of(
+        "aircraft", "estimator", "flights", "median, m", "9 in 10, m", "worst, m", left=2
+    )
+    for aircraft, name, flights, *errors_m in errors_by_group(results).itertuples(index=False):
+        grid.add_row(
+            aircraft, name, str(flights), *(figure(error_m, ".3f") for error_m in errors_m)
+        )
+    console = console_of()
+    console.print(grid)
+    if text := why_leads(results):
+        console.print(text)
+    if compared is not None:
+        _show_versus(compared)
+    rows = flight_table(results).to_csv(index=False).encode()
+    write_new(output / FLIGHTS_CSV, [rows], overwrite=True)
+    if not missing("plot"):
+        print(write_flights_page(results, output, compared))
+    else:
+        print(output / FLIGHTS_CSV)
+        console.print(how_to_add("a page of the flights", "plot"))
+    exit_if_failed(results)
+
+
+def _compare(results: "Sequence[FlightResult]", against: Path) -> "Versus":
+    from gateway.batch.statistics import versus
+    from gateway.batch.tasks import read_results
+
+    found = versus(results, read_results(against))
+    if not found.compared:
+        refuse(f"{against}: contains no result of any of these recordings")
+    return found
+
+
+def _show_versus(compared: "Versus") -> None:
+    console = console_of()
+    for change in compared.medians.itertuples():
+        console.print(
+            f"{change.estimator}: median error {change.after_m:.3f} m, {change.before_m:.3f} m in "
+            "the other results"
+        )
+    for change in compared.worse.itertuples():
+        console.print(
+            f"worse: {change.location}, {change.estimator}: {change.before_m:.3f} m before, "
+            f"{change.after_m:.3f} m now",
+        )

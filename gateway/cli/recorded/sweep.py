@@ -27,19 +27,22 @@ from gateway.analysis.sweep import (
     with_estimator_of,
     with_values,
 )
-from gateway.batch.storage import is_url
-from gateway.batch.tasks import FlightResult, SweepTask
-from gateway.cli.support.batch_work import HoldOutOption, IntervalOption, SeasonWork, season_options
+from gateway.batch.tasks import SweepTask, without_secrets
+from gateway.cli.support.batch_work import BatchWork, HoldOutOption, IntervalOption, exit_if_failed
 from gateway.cli.support.options import output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
+    FlightsArgument,
     ForceOption,
     FuseWithOption,
     JobsOption,
     ReferenceOption,
+    SchedulerOption,
     SystemOption,
+    are_many,
     fusion_of,
     load_flight,
+    refuse_unused,
 )
 from gateway.cli.support.terminal import console_of, progress_bar, refuse, table_of
 from gateway.config import GatewaySettings, render
@@ -52,7 +55,7 @@ from gateway.units import counted
 if TYPE_CHECKING:
     import pandas as pd
 
-    from gateway.batch.statistics import Choice, FloatArray
+    from gateway.batch.statistics import Choice
 
 app = typer.Typer()
 SHOWN: Final = 10
@@ -71,22 +74,14 @@ HEADINGS: Final = {
 
 @app.command()
 def sweep(
-    flights: Annotated[
-        list[str] | None,
-        typer.Argument(
-            help="Recordings by name, flight logs, or a folder; by default the built-in "
-            "simulated flight.",
-            show_default=False,
-        ),
-    ] = None,
+    flights: FlightsArgument = None,
     *,
-    alpha: Annotated[
-        str | None, typer.Option(help="Weight of the acceleration: 0.1:0.9:9 or 0.1,0.5.")
-    ] = None,
-    beta: Annotated[str | None, typer.Option(help="Weight of the velocity, likewise.")] = None,
     vary: Annotated[
         list[str] | None,
-        typer.Option(help="Any other setting: gps_latency_s=0:0.4:9, accel_filter=chebyshev,…"),
+        typer.Option(
+            help="NAME=FROM:TO:COUNT or NAME=VALUE,VALUE: alpha=0.1:0.9:9, estimator=eskf,paper; "
+            "may be repeated."
+        ),
     ] = None,
     optimise: Annotated[
         int, typer.Option(help="Search the ranges for this many generations, instead of a grid.")
@@ -101,6 +96,7 @@ def sweep(
     hold_out: HoldOutOption = 5,
     gps_interval: IntervalOption = 0.0,
     jobs: JobsOption = None,
+    scheduler: SchedulerOption = None,
     output: Annotated[Path, output_file("Settings file for the best.", (".toml",))] = Path(
         "best.toml"
     ),
@@ -116,23 +112,21 @@ def sweep(
     """Try settings on one flight or many, and write the best as a settings file.
 
     Without a flight the built-in simulated one is used. The filter runs causally and is scored by
-    fixes that are withheld from it. With many flights, the choice is scored by flights of other
-    aircraft and days.
+    fixes that are withheld from it. Of many flights each has the same weight.
     """
     current = read_settings()
-    named = [(name, text) for name, text in (("alpha", alpha), ("beta", beta)) if text]
     options = SweepOptions(
-        named, vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table, force
+        vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table, force
     )
     given = flights or []
-    if len(given) > 1 or any(Path(name).is_dir() or is_url(name) for name in given):
-        if reference is not None or system is not None:
-            refuse("--reference and --system belong to one flight")
-        read = season_options(columns, fuse_with)
-        run_season_sweep(SeasonWork(given, jobs), read, current, options)
-        return
-    path = Path(given[0]) if given else None
     read = read_options(current, columns, choice=fuse_with, system_id=system)
+    if are_many(given):
+        refuse_unused("many recordings", {"--reference": reference, "--system": system})
+        work = BatchWork(given, jobs, scheduler)
+        run_sweep_of_many(work, without_secrets(read), current, options)
+        return
+    refuse_unused("one recording", {"--scheduler": scheduler})
+    path = Path(given[0]) if given else None
     run_sweep(path, current, options, lambda: load_flight(path, current, read, reference))
 
 
@@ -140,10 +134,8 @@ def sweep(
 class SweepOptions:
     """Options of the command line for a sweep."""
 
-    named: Sequence[tuple[str, str]]
-    """The paper's own weights, with their values as text."""
     vary: Sequence[str]
-    """Further settings as `NAME=VALUES`."""
+    """Settings as `NAME=VALUES`."""
     generations: int
     """Number of generations to search; 0 for a grid."""
     metric: Metric
@@ -222,14 +214,14 @@ def _cell(value: object) -> str:
 
 def _parse_axes(options: SweepOptions) -> list[Axis]:
     """Parse the axes to vary; raises SweepError for invalid ones."""
-    wanted = list(options.named)
+    wanted = list[tuple[str, str]]()
     for item in options.vary:
         name, equals, text = item.partition("=")
         if not equals:
             raise SweepError(f"--vary {item}: write NAME=VALUES")
         wanted.append((name, text))
     if not wanted:
-        raise SweepError("nothing to vary: give --alpha, --beta or --vary NAME=VALUES")
+        raise SweepError("nothing to vary: give --vary NAME=VALUES, such as --vary alpha=0.1:0.9:9")
     return [parse_axis(name, text) for name, text in wanted]
 
 
@@ -288,32 +280,33 @@ def _show(results: "pd.DataFrame", contest: Contest, metric: Metric) -> None:
     console_of().print(title, shown, sep="\n")
 
 
-def run_season_sweep(
-    work: SeasonWork,
-    read: ReadOptions,
-    settings: GatewaySettings,
-    options: SweepOptions,
-    kept: Path | None = None,
-) -> list[FlightResult]:
+def run_sweep_of_many(
+    work: BatchWork, read: ReadOptions, settings: GatewaySettings, options: SweepOptions
+) -> None:
     """Score every point on every flight, show the point that is best overall, and write it."""
     import pandas as pd
 
-    if kept is not None:
-        kept.mkdir(parents=True, exist_ok=True)
+    from gateway.batch.statistics import choose
+
     _check_outputs(options)
     if options.generations:
         refuse("--optimise searches on one flight; give a grid for many")
-    fusion = fusion_of(settings)
     axes = tuple(_parse_axes(options))
     points, keys = grid(axes), [axis.key for axis in axes]
-    fusion = with_estimator_of(fusion, keys)
+    fusion = with_estimator_of(fusion_of(settings), keys)
     column = COLUMN_OF[options.metric]
     task = SweepTask(read, axes, column, options.hold_out, options.gps_interval_s)
-    results = work.run(task, work.items(), kept)
+    results = work.run(task, work.items(), None)
     swept = [result for result in results if result.error is None]
     if not swept:
         refuse("the sweep failed on all flights")
-    base, choice = _chosen(swept)
+    # JSON represents an unknown score as null.
+    errors = np.array([result.figures["scores"] for result in swept], float)
+    base = np.array([result.figures["base"] for result in swept], float)
+    try:
+        choice = choose(errors, base)
+    except ValueError as error:
+        refuse(f"{error}; choose another --metric")
     _show_choice(axes, points, choice, column, len(swept))
     best = with_values(fusion, keys, points[choice.winner])
     table = pd.DataFrame(
@@ -322,25 +315,11 @@ def run_season_sweep(
             "aircraft": [result.vehicle for result in swept],
             "began": [result.began for result in swept],
             "recorded settings": base,
-            "chosen by others": choice.judged,
+            "best settings": errors[:, choice.winner],
         }
     )
     _write(options, settings, best, keys, table)
-    return results
-
-
-def _chosen(swept: Sequence[FlightResult]) -> "tuple[FloatArray, Choice]":
-    """Return the errors with the recorded settings, and the choice of the best point."""
-    from gateway.batch.statistics import choose, group_of
-
-    # JSON represents an unknown score as null.
-    errors = np.array([result.figures["scores"] for result in swept], float)
-    base = np.array([result.figures["base"] for result in swept], float)
-    groups = [group_of(result) for result in swept]
-    try:
-        return base, choose(errors, base, groups)
-    except ValueError as error:
-        refuse(f"{error}; choose another --metric")
+    exit_if_failed(results)
 
 
 def _show_choice(
@@ -354,17 +333,7 @@ def _show_choice(
         grid_.add_row(*map(_cell, points[number]), _cell(float(choice.means[number])))
     console.print(grid_)
     console.print(
-        f"{counted(len(points), 'point')} on {counted(flights, 'flight')}, "
-        f"in {choice.folds} folds by aircraft and day; "
-        f"the same point wins without {choice.stable} of the {choice.folds}"
+        f"{counted(len(points), 'point')} on {counted(flights, 'flight')}; "
+        f"mean with the recorded settings: {_cell(choice.base_mean)}. The best of many points "
+        "leads a little by chance: try it on other flights"
     )
-    if choice.over_base is not None:
-        console.print(
-            "against the recorded settings, each flight scored only with settings that the "
-            f"others chose: {choice.over_base.text}",
-        )
-    if choice.over_second is not None:
-        console.print(
-            f"the winner against the second, on the flights that chose both: "
-            f"{choice.over_second.text}",
-        )

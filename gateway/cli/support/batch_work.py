@@ -11,28 +11,12 @@ import typer
 
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
 from gateway.batch.storage import BatchItem, is_url, items_of
-from gateway.batch.tasks import FlightResult, FlightTask, ResultFolder, run_season, without_secrets
-from gateway.cli.support.options import read_options, read_settings
+from gateway.batch.tasks import FlightResult, FlightTask, ResultFolder, run_batch
 from gateway.cli.support.recording_options import recorded_files
 from gateway.cli.support.terminal import console_of, progress_bar, refuse
 from gateway.extras import require
 from gateway.printable import printable
-from gateway.recordings.files import SettingsChoice
-from gateway.recordings.recorded_table import ReadOptions
-
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--scheduler", help="Work on a Dask cluster: tcp://HOST:8786.", show_default=False
-    ),
-]
-SeasonFiles = Annotated[
-    list[str],
-    typer.Argument(
-        help="Recordings by name or file, folders of them, and URLs: s3://, gs://, sftp://, …",
-        show_default=False,
-    ),
-]
+from gateway.units import counted
 
 HoldOutOption = Annotated[
     int, typer.Option("--hold-out", help="Withhold every n-th fix; 0 for none.", min=0)
@@ -51,7 +35,7 @@ SHOWN_FAILURES: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
-class SeasonWork:
+class BatchWork:
     """Recordings, and the processes or cluster for the work on them."""
 
     names: Sequence[str]
@@ -107,7 +91,7 @@ class SeasonWork:
                 progress.update(bar, description=text, completed=done, total=total, refresh=True)
 
             try:
-                results = run_season(task, items, executor, folder, report)
+                results = run_batch(task, items, executor, folder, report)
             except KeyboardInterrupt:
                 if folder is not None:
                     text = "interrupted; finished results are kept: repeat the command to continue"
@@ -117,14 +101,11 @@ class SeasonWork:
         return results
 
 
-def season_options(columns: Path | None, choice: SettingsChoice) -> ReadOptions:
-    """Return the settings for reading a season's flights, without secrets."""
-    return without_secrets(read_options(read_settings(), columns, choice=choice))
-
-
-def failures(results: Sequence[FlightResult]) -> int:
-    """Return the number of recordings without figures."""
-    return sum(result.error is not None for result in results)
+def exit_if_failed(results: Sequence[FlightResult]) -> None:
+    """End the command with exit code 1 if there is no result of a recording."""
+    if count := sum(result.error is not None for result in results):
+        console_of(stderr=True).print(f"{count} of {counted(len(results), 'recording')} failed")
+        raise typer.Exit(1)
 
 
 def _print_failures(results: Sequence[FlightResult]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from rich.progress import DownloadColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from gateway.cli.support.control import recordings_folder
 from gateway.cli.support.options import folder_of
-from gateway.cli.support.terminal import console_of, progress_bar
+from gateway.cli.support.terminal import console_of, progress_bar, refuse
 from gateway.recordings.files import TABLE, TLOG, FlightError, Position, SettingsChoice, format_of
 from gateway.recordings.index import NEWEST, RecordingError, find_recording, recording_name
 from gateway.recordings.moment import Moment, parse_moment
@@ -46,7 +46,7 @@ FromOption = Annotated[
 ]
 ToOption = Annotated[str | None, typer.Option("--to", help="End, written like --from.")]
 JobsOption = Annotated[
-    int | None, typer.Option("--jobs", help="Local processes; by default one per core.", min=1)
+    int | None, typer.Option("--jobs", help="Processes; by default one per core.", min=1)
 ]
 ColumnsOption = Annotated[
     Path | None, typer.Option("--columns", help="Column map of another program's CSV (TOML).")
@@ -67,12 +67,20 @@ PositionOption = Annotated[
     Position,
     typer.Option("--position", help="Position as live, or on straight lines between fixes."),
 ]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        help="For many recordings, a Dask cluster: tcp://HOST:8786.",
+        show_default=False,
+    ),
+]
 Wanted = Literal["tlogs", "tables", "all"]
 """Files of a recording to use; if it has none of these, the others are used."""
-FlightArgument = Annotated[
-    Path | None,
+FlightsArgument = Annotated[
+    list[str] | None,
     typer.Argument(
-        help="A recording by its name, or any flight log; "
+        help="Recordings by name or file, folders of them, and URLs: s3://, sftp://, …; "
         "by default the built-in simulated flight.",
         show_default=False,
     ),
@@ -118,6 +126,17 @@ def read_range(begin: str | None, end: str | None) -> tuple[Moment | None, Momen
         if low is not None and high is not None and low >= high:
             raise FlightError(f"the range from --from {begin} to --to {end} is empty")
     return first, last
+
+
+def are_many(names: Sequence[str]) -> bool:
+    """Return whether these are several recordings, a folder or a URL."""
+    return len(names) > 1 or any("://" in name or Path(name).is_dir() for name in names)
+
+
+def refuse_unused(kind: str, options: Mapping[str, object]) -> None:
+    """End the command if an option is set that has no effect on such an output."""
+    if used := [name for name, value in options.items() if value]:
+        refuse(f"{', '.join(used)}: not possible for {kind}")
 
 
 @contextmanager

@@ -98,7 +98,7 @@ MAX_WAITING: Final = 16
 """Ground stations that may wait for the recorder."""
 SIGNING_SETUP: Final = (
     "Signing is not set up by MAVLink: set vehicle.signing_passphrase in the settings file "
-    "and run mavgate reload"
+    "and run mavgate clients reload"
 )
 SINGLE: Final = {
     "AUTOPILOT_VERSION_REQUEST": mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,

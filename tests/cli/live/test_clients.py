@@ -156,7 +156,7 @@ async def test_clients_are_listed_added_removed_and_applied_again(asked: list[ob
     reported = "observers: Address already in use; trying again until it works"
     assert reported in (await run("clients", "add", CLOSED.endpoint))
     assert "no endpoint is called 'phone'" in await run("clients", "remove", "phone", code=2)
-    assert "settings of the hub applied" in await run("reload")
+    assert "settings of the hub applied" in await run("clients", "reload")
 
 
 def test_client_fits_on_one_line_of_a_narrow_terminal() -> None:
@@ -186,9 +186,9 @@ async def test_piped_tables_and_texts_are_never_wrapped(
 
 
 async def test_mark_accepts_negative_coordinates(asked: list[object]) -> None:
-    assert (await run("mark", "-7.76", "-110.4", "--alt", "-3")) == "marked\n"
+    assert (await run("clients", "mark", "-7.76", "-110.4", "--alt", "-3")) == "marked\n"
     assert asked == [(-7.76, -110.4, -3.0, None)]
-    await run("mark", "--hight", "3", code=2)
+    await run("clients", "mark", "--hight", "3", code=2)
 
 
 async def test_added_client_is_saved_on_request(asked: list[object], tmp_path: Path) -> None:

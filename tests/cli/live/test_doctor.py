@@ -17,6 +17,8 @@ from gateway.cli.live import doctor
 from gateway.cli.live.doctor import Diagnosis, Grade
 from gateway.compiled.entry_point import LibraryError
 from gateway.config import GatewaySettings
+from gateway.extras import EXTRAS
+from gateway.live.serial_port import Port
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
@@ -60,7 +62,7 @@ def test_port_is_wrong_with_a_hint_if_missing_or_without_rights(
     text: str,
 ) -> None:
     missing = one(doctor.check_receiver, settings)
-    assert (missing.grade, "`mavgate ports`" in missing.text) == (Grade.FAIL, True)
+    assert (missing.grade, "does not exist" in missing.text) == (Grade.FAIL, True)
     Path(settings.serial.port).touch()
     assert one(doctor.check_receiver, settings).grade is Grade.OK
     monkeypatch.setattr(os, "access", lambda *_: False)
@@ -86,9 +88,9 @@ def test_long_latency_timer_of_an_adapter_is_wrong(
 def test_invalid_aircraft_file_is_wrong(settings: GatewaySettings) -> None:
     folder = Path(settings.aircraft_folder)
     folder.mkdir()
-    assert one(doctor.check_aircraft, settings).grade is Grade.OK
+    assert one(doctor.check_settings, settings).grade is Grade.OK
     (folder / "3.toml").write_text("[vehicle]\nnope = 1\n")
-    found = one(doctor.check_aircraft, settings)
+    found = one(doctor.check_settings, settings)
     assert (found.grade, "3.toml: vehicle.nope" in found.text) == (Grade.FAIL, True)
 
 
@@ -172,6 +174,31 @@ def test_missing_extras_are_named(
     monkeypatch.setitem(sys.modules, "nicegui", None)
     found = one(doctor.check_extras, settings)
     assert (found.grade, "needs the extra panel" in found.text) == (Grade.INFO, True)
+    assert set(doctor.EXTRA_USES) == set(EXTRAS)
+
+
+@pytest.mark.parametrize(
+    ("port", "grades"), [("auto", [Grade.INFO]), ("none", []), ("usb:1:2", [Grade.FAIL])]
+)
+def test_receiver_is_missing_only_where_it_is_configured(
+    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, port: str, grades: list[Grade]
+) -> None:
+    monkeypatch.setattr(doctor, "list_serial_ports", list)
+    found = doctor.check_receiver(changed(settings, "serial", port=port))
+    assert [each.grade for each in found] == grades
+
+
+def test_ports_and_adapters_that_match_are_listed(
+    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ports = [
+        Port(f"/dev/none{n}", f"1a86:{n}523", "A5" * n, "CH340", known=n < 2) for n in range(3)
+    ]
+    monkeypatch.setattr(doctor, "list_serial_ports", lambda: ports)
+    found = list(doctor.check_receiver(changed(settings, "serial", port="auto")))
+    assert found[1] == doctor.info("port", "/dev/none1, usb:1a86:1523:A5, CH340")
+    assert "the gateway tries each: /dev/none0, /dev/none1" in found[3].text
+    assert [each.grade for each in found[4:]] == [Grade.FAIL] * 2
 
 
 @pytest.mark.parametrize("grade", list(Grade))
@@ -222,23 +249,27 @@ def test_template_is_written_once_into_a_new_folder(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     file = tmp_path / ".config" / "mavgate" / "gateway.toml"
-    assert invoke("check-config", "--write").output == f"wrote {file}\n"
+    assert invoke("doctor", "--write").output == f"wrote {file}\n"
     template = file.read_text()
-    assert (template, file.stat().st_mode & 0o777) == (invoke("check-config").output, 0o600)
+    assert (template, file.stat().st_mode & 0o777) == (
+        invoke("doctor", "--template", "usual").output,
+        0o600,
+    )
     file.write_text("# mine")
-    again = invoke("check-config", "--write")
+    again = invoke("doctor", "--write")
     assert (again.exit_code, f"{file}: exists, and is not overwritten" in again.output) == (2, True)
     assert file.read_text() == "# mine"
-    assert invoke("check-config", "--all").output.count("\n[") > template.count("\n[")
+    assert invoke("doctor", "--template", "all").output.count("\n[") > template.count("\n[")
 
 
 @pytest.mark.parametrize(
     ("endpoint", "code", "words"),
     [
-        ("udp-listen:127.0.0.1:0", 2, "uses any free port"),
+        ("udp-listen:127.0.0.1:0", 1, "uses any free port"),
+        ("udp:127.0.0.1:0", 1, "port must be 1 to 65535"),
         ("udp-listen:127.0.0.1:14550", 0, "all settings are valid"),
     ],
 )
 def test_settings_are_checked(tmp_path: Path, endpoint: str, code: int, words: str) -> None:
     (file := tmp_path / "gateway.toml").write_text(f'[hub]\nendpoints = ["{endpoint}"]\n')
-    assert words in invoke("check-config", file, code=code).output
+    assert words in invoke("doctor", file, code=code).output

@@ -62,7 +62,7 @@ def test_range_without_samples_is_refused(
 @pytest.mark.parametrize(
     "words",
     ["convert {} -o out.tlog", "fuse {} -o out.csv", "extract {} --params out.param",
-     "diff {} {} --html out.html", "sweep {} --beta 0.1,0.9 -o out.toml", "report {} -o out"],
+     "diff {} {} --html out.html", "sweep {} --vary beta=0.1,0.9 -o out.toml", "report {} -o out"],
 )  # fmt: skip
 def test_existing_output_is_overwritten_only_with_force(
     table: Path, monkeypatch: pytest.MonkeyPatch, words: str

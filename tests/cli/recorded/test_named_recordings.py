@@ -92,7 +92,7 @@ def test_play_accepts_a_name(config: Path, tmp_path: Path, monkeypatch: pytest.M
 
 def test_sweep_accepts_a_name(config: Path, tmp_path: Path) -> None:
     best = tmp_path / "best.toml"
-    words = ("--beta", "0.5", "--jobs", "1", "--metric", "interpolated", "-o", best)
+    words = ("--vary", "beta=0.5", "--jobs", "1", "--metric", "interpolated", "-o", best)
     run("sweep", "alps", *words, "--config", config)
     assert "beta_velocity" in best.read_text()
 
@@ -104,7 +104,7 @@ def test_demo_flies_the_named_recording(config: Path) -> None:
 
 
 def test_folder_or_unknown_name_is_refused_with_the_command_for_it(tmp_path: Path) -> None:
-    assert f"`mavgate catalogue {tmp_path}` indexes it" in run("info", tmp_path, code=2)
+    assert "give one folder" in run("info", tmp_path, "sea", code=2)
     assert "`mavgate info` lists them" in run("info", "sea", code=2)
 
 

@@ -269,5 +269,4 @@ def test_text_of_a_recording_cannot_control_the_terminal(tmp_path: Path) -> None
 def test_names_in_brackets_are_no_markup_for_the_catalogue(tmp_path: Path) -> None:
     (tmp_path / "x[").mkdir()
     table(tmp_path / "x[" / "y].csv")
-    run("catalogue", tmp_path, "--jobs", 1)
-    assert "x[/y].csv" in run("catalogue", "list", "-d", tmp_path)
+    assert "x[/y].csv" in run("info", tmp_path)

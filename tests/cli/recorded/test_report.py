@@ -23,7 +23,7 @@ def test_recording_is_compared_with_other_settings(
     recording = write_table(tmp_path / "flight.csv", TableHeader(), rows(raw=True))
     other, folder = tmp_path / "other.toml", tmp_path / "out"
     other.write_text('[estimation]\nestimator = "paper"\n')
-    words = ("--against-config", other, "--reference", recording, "-o", folder)
+    words = ("--against", other, "--reference", recording, "-o", folder)
     invoke("report", recording, *words, code=0)
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Flight report: flight.csv" in page

@@ -24,7 +24,16 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_best_settings_are_written_as_a_settings_file(recording: Path, tmp_path: Path) -> None:
     best, table = tmp_path / "best.toml", tmp_path / "trials.csv"
-    arguments = ["--alpha", "0.1,0.9", "--beta", "0.1:0.9:3", "-o", best, "--table", table]
+    arguments = [
+        "--vary",
+        "alpha=0.1,0.9",
+        "--vary",
+        "beta=0.1:0.9:3",
+        "-o",
+        best,
+        "--table",
+        table,
+    ]
     result = invoke("sweep", recording, *arguments, code=0)
     assert "Best of 6 trials, by the error at withheld fixes" in result.output
     trials = pd.read_csv(table)
@@ -46,13 +55,13 @@ def test_flight_at_rest_is_reported(tmp_path: Path) -> None:
         for row in rows(raw=False)
     ]
     path = write_table(tmp_path / "rest.csv", TableHeader(), resting)
-    result = invoke("sweep", path, "--alpha", "0.1,0.9", "-o", tmp_path / "best.toml", code=0)
+    result = invoke("sweep", path, "--vary", "alpha=0.1,0.9", "-o", tmp_path / "best.toml", code=0)
     assert "at rest throughout, at most 0.2 m/s by GPS: it contains no information" in result.output
 
 
 def test_search_writes_its_best_settings(recording: Path, tmp_path: Path) -> None:
     best = tmp_path / "best.toml"
-    arguments = ["--beta", "0:1", "--optimise", "2", "-o", str(best), "--jobs", "1"]
+    arguments = ["--vary", "beta=0:1", "--optimise", "2", "-o", str(best), "--jobs", "1"]
     invoke("sweep", recording, *arguments, code=0)
     # On this short, smooth flight the withheld fixes are nearest at 0.7; 0 and 1 are both worse.
     assert 0.5 < load(best).estimation.paper.beta_velocity < 0.9
@@ -83,10 +92,10 @@ def test_setting_without_effect_is_reported(recording: Path, tmp_path: Path) -> 
     ("arguments", "text"),
     [
         ([], "nothing to vary"),
-        (["--alpha", "1:2:3"], "alpha_accel = 1.5"),
+        (["--vary", "alpha=1:2:3"], "alpha_accel = 1.5"),
         (["--vary", "alpha_accel"], "write NAME=VALUES"),
         (["--vary", "gama=1"], "no setting ends in 'gama'"),
-        (["--alpha", "0.1,0.2", "--metric", "reference"], "no reference of the position"),
+        (["--vary", "alpha=0.1,0.2", "--metric", "reference"], "no reference of the position"),
     ],
 )
 def test_impossible_sweep_is_reported(recording: Path, arguments: list[str], text: str) -> None:
