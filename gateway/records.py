@@ -38,6 +38,8 @@ EVERYBODY: Final = (0, 0)
 HEARTBEAT_TYPE_OFFSET: Final = 4
 _TYPE_GCS: Final = bytes((6,))
 """MAV_TYPE_GCS as a byte."""
+_TYPE_TRACKER: Final = bytes((5,))
+"""MAV_TYPE_ANTENNA_TRACKER as a byte."""
 _NO_AUTOPILOT: Final = bytes((8,))
 """MAV_AUTOPILOT_INVALID as a byte."""
 TXBUF_OFFSET: Final = 6
@@ -486,6 +488,11 @@ class MavFrame(msgspec.Struct, frozen=True, gc=False):
         """Whether this HEARTBEAT is from an autopilot, not from a station or a companion."""
         autopilot = self.payload[HEARTBEAT_TYPE_OFFSET + 1 : HEARTBEAT_TYPE_OFFSET + 2]
         return not self.is_station_heartbeat and autopilot != _NO_AUTOPILOT
+
+    @property
+    def is_tracker_heartbeat(self) -> bool:
+        """Whether this HEARTBEAT is from an antenna tracker."""
+        return self.payload[HEARTBEAT_TYPE_OFFSET : HEARTBEAT_TYPE_OFFSET + 1] == _TYPE_TRACKER
 
     @property
     def free_percent(self) -> int:

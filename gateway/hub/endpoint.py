@@ -28,7 +28,7 @@ treated like TCP clients.
 
 import ipaddress
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
@@ -72,7 +72,7 @@ SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
 """A segment of a Zenoh key or of a path without special characters."""
 COMMON_OPTIONS: Final = frozenset(
     {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted", "monitor", "mavlink"}
-    | {*FILTER_OPTIONS, "as", "cache"}
+    | {*FILTER_OPTIONS, "also", "as", "cache"}
 )
 ALIASES: Final = {
     "udpin": "udp-listen",
@@ -282,8 +282,9 @@ def parse_endpoint(url: str) -> Endpoint:
     Options are `name`, `allow`, `deny` (message names or numbers, separated by commas), `rate`
     (`NAME:hertz`, separated by commas), `pack` (bytes), `wait` (milliseconds), `budget` (bytes a
     second), `trusted`, `monitor` and `cache` (yes or no), `mavlink` (1 or 2), `systems`,
-    `not-systems`, `components` (ids, separated by commas), `as` (see `new_ids_from`), and of some
-    kinds `origins` (separated by commas), `path`, `site`, `keys` and `config`.
+    `not-systems`, `components` (ids, separated by commas), `also` (messages), `as` (see
+    `new_ids_from`), and of some kinds `origins` (separated by commas), `path`, `site`, `keys` and
+    `config`.
 
     Raises ValueError if a part of it is invalid; the text gives the allowed values.
     """
@@ -306,7 +307,7 @@ def parse_endpoint(url: str) -> Endpoint:
             name=name_from(options.get("name", location)),
             allow=messages_from(options.get("allow", "")),
             deny=messages_from(options.get("deny", "")),
-            systems=system_filter_from(*(options.get(key, "") for key in FILTER_OPTIONS)),
+            systems=selection_from(options),
             new_ids=new_ids_from(options.get("as", "")),
             interval_us=intervals_from(options.get("rate", "")),
             pack_bytes=number_from(options.get("pack", "0"), "pack", 0, MAX_PACK_BYTES),
@@ -327,6 +328,13 @@ def parse_endpoint(url: str) -> Endpoint:
     except ValueError as error:
         raise ValueError(f"endpoint {url!r}: {error}") from None
     return endpoint
+
+
+def selection_from(options: Mapping[str, str]) -> SystemFilter:
+    """Read the options that select systems; raises ValueError."""
+    also = messages_from(options.get("also", ""))
+    only, without, components = (options.get(key, "") for key in FILTER_OPTIONS)
+    return system_filter_from(only, without, components, also)
 
 
 def host_and_port(host: object, port: object) -> str:

@@ -75,11 +75,20 @@ class _Subscription:
     def carries(self, frame: MavFrame) -> bool:
         """Return whether the client gets this system, and its MAVLink version has the message."""
         endpoint, renumbering = self.client.endpoint, self.client.renumbering
-        if endpoint.systems and not endpoint.systems.has(frame.origin):
+        if endpoint.systems and not endpoint.systems.carries(frame):
             return False
         if renumbering is not None and not renumbering.has_room_for(frame.origin[0]):
             return False
         return not self.client.is_mavlink1 or base_size(frame.message_id) is not None
+
+    @property
+    def bounds_others(self) -> bool:
+        """Whether its link carries no telemetry of vehicles that are not received on it.
+
+        So it is if its capacity is known, unless its options select some systems.
+        """
+        endpoint = self.client.endpoint
+        return endpoint.budget > 0 and not (endpoint.systems or endpoint.monitor)
 
     def lets_out(self, frame: MavFrame) -> bool:
         """Return whether the client's filter passes a frame that is addressed, or a station's."""
@@ -180,6 +189,8 @@ class Fanout:
         self._is_metered = False
         """Whether `_offered` is needed."""
         self._signer = signer
+        self.hears_only_others: Callable[[int, int], bool] = lambda _client_id, _system: False
+        """Returns whether a client brings only vehicles, and all are others than a system."""
         self._subscriptions: dict[int, _Subscription] = {}
         self._monitors: list[Client] = []
         self._planned_us = 0
@@ -321,7 +332,7 @@ class Fanout:
             self.clear()
         targets: list[tuple[Client, RateLimit | None]] = []
         for subscription in self._subscriptions.values():
-            interval_us = subscription.interval_us(frame, is_ours=False)
+            interval_us = self._interval_us(subscription, frame, is_ours=False)
             if subscription.client is source or not reaches(subscription.client.client_id):
                 continue
             if interval_us != NO_MESSAGES:
@@ -388,12 +399,22 @@ class Fanout:
         self._is_metered = any(each.bandwidth for each in subscriptions)
         self._monitors = [each.client for each in subscriptions if each.client.endpoint.monitor]
 
+    def _interval_us(self, each: _Subscription, frame: MavFrame, *, is_ours: bool) -> int:
+        """Return the least time between two frames to a client, of those like this one."""
+        if (
+            each.bounds_others
+            and frame.message_id not in each.client.endpoint.systems.also
+            and self.hears_only_others(each.client.client_id, frame.origin[0])
+        ):
+            return NO_MESSAGES
+        return each.interval_us(frame, is_ours=is_ours)
+
     def _make_own_route(self, frame: MavFrame) -> OwnRoute:
         if len(self._own) >= MAX_KINDS:
             self.clear()
         route = OwnRoute(frame.message_id)
         for subscription in self._subscriptions.values():
-            interval_us = subscription.interval_us(frame, is_ours=True)
+            interval_us = self._interval_us(subscription, frame, is_ours=True)
             gap = subscription.gap_of(frame.origin)
             if interval_us == NO_MESSAGES:
                 route.closed.append(gap)

@@ -28,7 +28,7 @@ from gateway.hub.routing_table import (
     SystemPath,
 )
 from gateway.hub.stats import HubCounters
-from gateway.hub.systems import commands
+from gateway.hub.systems import Reach
 from gateway.hub.transports.base import Client, HubContext, OnForeign
 from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
@@ -71,6 +71,9 @@ class Router:
         self._on_foreign = on_foreign
         self._rejects = rejects
         self._table = RoutingTable(fanout.clear)
+        fanout.hears_only_others = lambda key, system: self._table.systems(key).are_only_others(
+            system
+        )
         self._untrusted = RoutingTable(max_origins=MAX_UNTRUSTED_SYSTEMS)
         self._duplicates = DuplicateFilter()
         self._round_trips: FrameMemory[int] = FrameMemory(MEMORY_US, MAX_ASKED)
@@ -100,7 +103,7 @@ class Router:
             origin[0]
             for client_id in self._clients
             for origin in self._table.origins(client_id)
-            if origin[0] and not self._table.is_station(origin)
+            if origin[0] and not self._table.is_station(client_id, origin)
         }
 
     def charge(self, client_id: int | None, size: int) -> None:
@@ -144,32 +147,37 @@ class Router:
             return
         round_trip_us = self._round_trip.read(frame, now_us)
         measures = round_trip_us is not None or is_of_gateway(frame)
-        if client.endpoint.systems and not (measures or self._admits(client, frame, now_us)):
+        reach = Reach.EVERYWHERE if measures else self._reach(client, frame, now_us)
+        if reach is Reach.NOWHERE:
             self.counters.unroutable += 1
             return
         if round_trip_us is not None:
             client.round_trip_us = round_trip_us
             client.prove()
         if not is_of_gateway(frame):
-            self._route(client, frame, now_us, is_answer=round_trip_us is not None)
+            self._route(client, frame, now_us, reach, is_answer=round_trip_us is not None)
         elif round_trip_us is None:
             # Its system has no path here: links are measured in the name of any system.
             self._note_request(client, frame, now_us)
             self._ask(client, frame, forwarded=False)
 
-    def _route(self, client: Client, frame: MavFrame, now_us: int, *, is_answer: bool) -> None:
+    def _route(
+        self, client: Client, frame: MavFrame, now_us: int, reach: Reach, *, is_answer: bool
+    ) -> None:
         """Route a frame of a system that is not ours, unless it answers the hub itself."""
         table, origin = self._table if client.trusted else self._untrusted, frame.origin
         path = table.register(client.client_id, origin, now_us)
         if path is not None and frame.message_id == HEARTBEAT_ID:
-            path.is_station = frame.is_station_heartbeat
+            table.read_heartbeat(client.client_id, path, frame, now_us)
         is_rejected = path is not None and self._is_rejected(client, path, frame, now_us)
         if is_rejected or is_answer:
             return
         if frame.target[0]:
-            self._route_addressed(client, frame, now_us)
+            if path is not None:
+                path.note_address(frame.target)
+            self._route_addressed(client, frame, reach, now_us)
         else:
-            self._route_broadcast(client, path, frame, table.is_station(origin), now_us)
+            self._route_broadcast(client, path, frame, reach, now_us)
 
     def _note_request(self, client: Client, frame: MavFrame, now_us: int) -> None:
         """Pair two links that bring the same round-trip request of another gateway."""
@@ -183,27 +191,44 @@ class Router:
         elif first != client.client_id:
             self._pair(first, client, now_us)
 
-    def _admits(self, client: Client, frame: MavFrame, now_us: int) -> bool:
-        """Return whether the filter of a client's endpoint passes a frame received from it."""
-        tables, own = (self._table, self._untrusted), self._vehicles.systems(now_us)
-        from_station = any(table.is_station(frame.origin) for table in tables)
+    def _reach(self, client: Client, frame: MavFrame, now_us: int) -> Reach:
+        """Return where the filter of a client's endpoint lets a frame received from it pass."""
+        systems = client.endpoint.systems
+        if not systems:
+            return Reach.EVERYWHERE
+        sender, client_id = frame.origin[0], client.client_id
+        if not systems.has_system(sender) and self._is_vehicle(sender, client_id, now_us):
+            # A station that uses the id of an excluded vehicle.
+            return Reach.NOWHERE
+        table = self._table if client.trusted else self._untrusted
+        from_station = table.is_station(client_id, frame.origin)
         if frame.message_id == HEARTBEAT_ID:
             from_station = frame.is_station_heartbeat
-        others = self._clients.keys() - {client.client_id}
-        return client.endpoint.systems.lets_in(
-            frame,
-            from_station=from_station,
-            is_vehicle=lambda system: (
-                system in own or any(system in self._table.vehicles(key) for key in others)
-            ),
+        return systems.reach(frame, from_station=from_station)
+
+    def _is_vehicle(self, system: int, source_id: int, now_us: int) -> bool:
+        """Return whether a system is a vehicle of ours, or of another client than the source."""
+        return system in self._vehicles.systems(now_us) or any(
+            system in self._table.systems(key).vehicles for key in self._clients if key != source_id
         )
 
-    def _may_reach(self, client: Client, frame: MavFrame, other_id: int) -> bool:
-        """Return whether the filter of its source allows a broadcast to reach another client."""
-        allowed = client.endpoint.systems
-        if not allowed or not commands(frame.message_id):
-            return True
-        return all(map(allowed.has_system, self._table.vehicles(other_id)))
+    def _may_reach(self, client: Client, frame: MavFrame, reach: Reach, other_id: int) -> bool:
+        """Return whether a frame without a target may be sent to another client."""
+        there = self._table.systems(other_id)
+        match reach:
+            case Reach.STATIONS:
+                return there.has_station and there.has_only_stations
+            case Reach.DISPLAYS:
+                return not there.are_only_others(frame.origin[0])
+            case Reach.SELECTED:
+                return all(map(client.endpoint.systems.has_system, there.vehicles))
+        return True
+
+    def _reaches_ours(self, client: Client, reach: Reach, now_us: int) -> bool:
+        """Return whether a frame without a target may be processed by our vehicles."""
+        own = self._vehicles.systems(now_us)
+        is_selected = all(map(client.endpoint.systems.has_system, own))
+        return reach is Reach.EVERYWHERE or (reach is Reach.SELECTED and is_selected)
 
     def clash_notes(self, now_us: int) -> dict[int, str]:
         """Return, by client, a text on how to separate its vehicle from another of the same id."""
@@ -292,12 +317,14 @@ class Router:
         self._cache_timer = None
         self._send_cached(self._cache.poll(self._context.now_us()))
 
-    def _route_addressed(self, client: Client, frame: MavFrame, now_us: int) -> None:
+    def _route_addressed(self, client: Client, frame: MavFrame, reach: Reach, now_us: int) -> None:
         self._keep(client, frame, now_us)
-        ours = frame.target[0] in self._vehicles.systems(now_us)
-        clients = (
-            self._table.clients_to(frame.target, client.client_id, now_us) if client.trusted else []
-        )
+        to_stations, table = reach is Reach.STATIONS, self._table
+        ours = not to_stations and frame.target[0] in self._vehicles.systems(now_us)
+        clients = table.clients_to(frame.target, client.client_id, now_us) if client.trusted else []
+        if to_stations:
+            asked = client.endpoint.systems.has
+            clients = [key for key in clients if table.awaits_answer(key, frame.target, asked)]
         if ours or clients:
             client.prove()
         if ours:
@@ -318,36 +345,29 @@ class Router:
         client: Client,
         path: SystemPath | None,
         frame: MavFrame,
-        from_station: bool,
+        reach: Reach,
         now_us: int,
     ) -> None:
         message_id = frame.message_id
         self._keep(client, frame, now_us)
         telemetry = message_id not in TARGET_OFFSETS and message_id not in UNADDRESSED_REQUESTS
-        own = self._vehicles.systems(now_us)
-        allowed = client.endpoint.systems
-        if allowed and commands(frame.message_id) and not all(map(allowed.has_system, own)):
-            self.counters.unroutable += 1
-        elif from_station or not telemetry:
+        from_station = path is not None and path.is_station
+        if (from_station or not telemetry) and self._reaches_ours(client, reach, now_us):
             self._ask(client, frame, forwarded=client.trusted)
         if not client.trusted:
             return
+        reaches = partial(self._may_reach, client, frame, reach)
         if from_station:
             self._count(frame)
             clients = self._table.clients_with_vehicles(client.client_id)
-            clients = [key for key in clients if self._may_reach(client, frame, key)]
-            self._fanout.deliver(frame, clients, client.client_id)
+            self._fanout.deliver(frame, [*filter(reaches, clients)], client.client_id)
             return
         source_id, key = client.client_id, frame.key
         route = self._fanout.others.get((source_id, key))
         if route is None:
-            if path is not None and telemetry and not path.is_vehicle:
-                path.is_vehicle = True
-                self._fanout.clear()
             path = path or SystemPath(now_us, now_us)
             is_shared = self._table.is_shared(frame.origin, now_us)
             rejects = partial(self._is_rejected, client, path) if is_shared else None
-            reaches = partial(self._may_reach, client, frame)
             route = self._fanout.make_route(frame, client, path, rejects, reaches)
             is_kept = client.endpoint.cache and self._cache.reads(message_id)
             is_plain = self._rejects is None or not client.may_return

@@ -17,6 +17,7 @@ Only trusted clients belong in the routing table: it decides who receives which 
 from array import array
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from typing import Final, Generic, TypeVar
 
 from gateway.units import US_PER_S
@@ -60,6 +61,23 @@ GREETING: Final = (HEARTBEAT_ID, HOME_POSITION_ID)
 """Messages of a greeting, in this order: the vehicle exists, and its home."""
 OWN_FRESH_US: Final = 5 * US_PER_S
 """Time without a sent heartbeat after which a system is no longer ours: a playback has ended."""
+
+
+class SenderKind(Enum):
+    """What the heartbeats of a system and component on one path show."""
+
+    UNKNOWN = auto()
+    STATION = auto()
+    VEHICLE = auto()
+    """An autopilot, not that of an antenna tracker."""
+    OTHER = auto()
+
+
+def _kind_of(heartbeat: MavFrame) -> SenderKind:
+    if heartbeat.is_station_heartbeat:
+        return SenderKind.STATION
+    is_vehicle = heartbeat.is_autopilot_heartbeat and not heartbeat.is_tracker_heartbeat
+    return SenderKind.VEHICLE if is_vehicle else SenderKind.OTHER
 
 
 @dataclass(slots=True)
@@ -106,14 +124,15 @@ class SystemPath:
     heard_us: int
     stream: FrameStream = field(default_factory=FrameStream)
     """Frames of the system on all its paths."""
-    is_station: bool = False
-    """Whether the last heartbeat on this path was a ground station's."""
+    kind: SenderKind = SenderKind.UNKNOWN
+    other_us: int = -ROUTE_FRESH_US
+    """When the newest heartbeat was received that is not a ground station's."""
+    addressed: set[Origin] = field(default_factory=set)
+    """Systems and components that it has addressed."""
     lag_us: int = 0
     """Delay relative to the fastest path, measured by the newest copy."""
     copied_us: int = 0
     """When the newest copy was received."""
-    is_vehicle: bool = False
-    """Whether telemetry was received on this path."""
     booted_us: int | None = None
     """When the system started, computed from the newest frame with its time since start."""
     booted_heard_us: int = 0
@@ -125,6 +144,30 @@ class SystemPath:
         self.stream.count += frames
         if heard_us >= self.stream.newest_us:
             self.stream.newest_us, self.stream.leader = heard_us, client_id
+
+    @property
+    def is_station(self) -> bool:
+        """Whether it is a ground station's."""
+        return self.kind is SenderKind.STATION
+
+    def read_heartbeat(self, frame: MavFrame, now_us: int) -> bool:
+        """Note the kind of a heartbeat's sender; return whether it has changed.
+
+        A station that shares its id with another program counts as that one: if each heartbeat
+        changed the kind, each would change the routes.
+        """
+        kind, before = _kind_of(frame), self.kind
+        if kind is not SenderKind.STATION:
+            self.other_us = now_us
+        elif now_us - self.other_us < ROUTE_FRESH_US:
+            return False
+        self.kind = kind
+        return kind is not before
+
+    def note_address(self, target: Origin) -> None:
+        """Note that it has addressed a system and component."""
+        if len(self.addressed) < MAX_ORIGINS:
+            self.addressed.add(target)
 
     def note_boot(self, frame: MavFrame, now_us: int) -> None:
         """Compute when the system started, if a frame contains its time since start."""
@@ -155,11 +198,47 @@ class SystemPath:
         return max(self.lag_us, now_us - self.copied_us) <= REPEAT_US
 
 
+@dataclass(frozen=True, slots=True)
+class LinkSystems:
+    """The systems received from one client, by the kinds of their components."""
+
+    all: frozenset[int] = frozenset()
+    vehicles: frozenset[int] = frozenset()
+    others: frozenset[int] = frozenset()
+    """Those that have sent a heartbeat that is neither a vehicle's nor a station's."""
+    has_station: bool = False
+    has_only_stations: bool = True
+    """Also where nothing is received."""
+
+    def are_only_others(self, system: int) -> bool:
+        """Return whether there are vehicles, all others than a system, and nothing else."""
+        has_display = self.has_station or not self.others <= self.vehicles
+        return bool(self.vehicles) and not has_display and system not in self.all
+
+
+NO_SYSTEMS: Final = LinkSystems()
+
+
+def _systems_of(paths: dict[Origin, SystemPath]) -> LinkSystems:
+    def having(kind: SenderKind) -> frozenset[int]:
+        return frozenset(origin[0] for origin, path in paths.items() if path.kind is kind)
+
+    stations = sum(path.is_station for path in paths.values())
+    return LinkSystems(
+        frozenset(origin[0] for origin in paths),
+        having(SenderKind.VEHICLE),
+        having(SenderKind.OTHER),
+        stations > 0,
+        stations == len(paths),
+    )
+
+
 class RoutingTable:
     """The clients from which frames of each system were received.
 
-    `changed` is called when cached routes may be wrong: a system has one path more, or fewer. Of
-    more than `max_origins` systems of a client, the one received longest ago is replaced.
+    `changed` is called when cached routes may be wrong: a system has one path more, or fewer, a
+    client has another system, or a sender proves to be a station or a vehicle. Of more than
+    `max_origins` systems of a client, the one received longest ago is replaced.
     """
 
     def __init__(
@@ -170,19 +249,25 @@ class RoutingTable:
         self._of_client: dict[int, dict[Origin, SystemPath]] = {}
         self._to: dict[Origin, dict[int, SystemPath]] = {}
         """The same paths by system and component."""
+        self._systems: dict[int, LinkSystems] = {}
+        """The systems by client, until the next change."""
 
     def register(self, client_id: int, origin: Origin, now_us: int) -> SystemPath | None:
         """Register a client's frame of a system; return the path, or None without room for it."""
         paths = self._to.get(origin)
         path = paths.get(client_id) if paths else None
+        is_other = False
         if path is None:
+            before = self.systems(client_id)
             path = self._discover(client_id, origin, now_us)
+            self._systems.pop(client_id, None)
+            is_other = self.systems(client_id) != before
         elif not path.is_fresh(now_us):
             path.since_us = path.heard_us = now_us
         else:
             path.heard_us = now_us
             return path
-        if path is not None and len(self._to[origin]) > 1:
+        if path is not None and (is_other or len(self._to[origin]) > 1):
             self._changed()
         return path
 
@@ -193,25 +278,56 @@ class RoutingTable:
             return False
         return sum(path.is_fresh(now_us) for path in paths.values()) > 1
 
-    def is_station(self, origin: Origin) -> bool:
-        """Return whether a system and component is a ground station."""
-        paths = self._to.get(origin)
-        return paths is not None and any(path.is_station for path in paths.values())
+    def read_heartbeat(
+        self, client_id: int, path: SystemPath, frame: MavFrame, now_us: int
+    ) -> None:
+        """Note the kind of a heartbeat's sender."""
+        if path.read_heartbeat(frame, now_us):
+            self._systems.pop(client_id, None)
+            self._changed()
+
+    def is_station(self, client_id: int, origin: Origin) -> bool:
+        """Return whether a system and component of a client is a ground station."""
+        path = self._of_client.get(client_id, {}).get(origin)
+        return path is not None and path.is_station
+
+    def systems(self, client_id: int) -> LinkSystems:
+        """Return the systems of a client by their kinds."""
+        paths = self._of_client.get(client_id)
+        if not paths:
+            return NO_SYSTEMS
+        found = self._systems.get(client_id)
+        if found is None:
+            found = self._systems[client_id] = _systems_of(paths)
+        return found
 
     def clients_with_vehicles(self, source_id: int) -> list[int]:
-        """Return the clients, except the source, behind which there are vehicles."""
+        """Return the clients, except the source, that have more than stations."""
         return [
             client_id
-            for client_id, paths in self._of_client.items()
-            if client_id != source_id and not all(path.is_station for path in paths.values())
+            for client_id in self._of_client
+            if client_id != source_id and not self.systems(client_id).has_only_stations
         ]
 
-    def vehicles(self, client_id: int) -> set[int]:
-        """Return the systems of a client that have sent telemetry and are not ground stations."""
+    def awaits_answer(
+        self, client_id: int, target: Origin, asked: Callable[[Origin], bool]
+    ) -> bool:
+        """Return whether a target of a client is a station, or a program that has sent a request.
+
+        `asked` returns whether a system and component that it addressed is one of those asked. If
+        the component is unknown, the whole system must be such.
+        """
         paths = self._of_client.get(client_id, {})
-        return {
-            origin[0] for origin, path in paths.items() if path.is_vehicle and not path.is_station
-        }
+        found = (
+            [paths[target]]
+            if target in paths
+            else [path for origin, path in paths.items() if origin[0] == target[0]]
+        )
+        return bool(found) and all(
+            path.is_station
+            or (path.kind is not SenderKind.VEHICLE and any(map(asked, path.addressed)))
+            for path in found
+        )
 
     def clashes(self, now_us: int) -> dict[int, tuple[int, int]]:
         """Return the clients with a vehicle whose id an earlier vehicle of another client has.
@@ -230,6 +346,7 @@ class RoutingTable:
         """Remove all paths of a client."""
         for origin in self._of_client.pop(client_id, {}):
             self._drop(client_id, origin)
+        self._systems.pop(client_id, None)
         self._changed()
 
     def origins(self, client_id: int) -> tuple[Origin, ...]:

@@ -1,16 +1,20 @@
 """Systems of an endpoint: which of them pass, and the ids that they have on its link.
 
-Two options select and one renumbers. They apply to both directions:
+Some options select and one renumbers. They apply to both directions:
 
 | option                    | frames to the endpoint           | frames from the endpoint      |
 | ------------------------- | -------------------------------- | ----------------------------- |
-| `systems=`, `components=` | of these, and addressed to these | the same, and of its stations |
+| `systems=`, `components=` | of these, and addressed to these | addressed to these; of these, |
+|                           |                                  | to stations and displays      |
 | `not-systems=`            | neither of these nor to these    | the same                      |
+| `also=`                   | these messages too               | the same                      |
 | `as=LINK:HERE`            | HERE becomes LINK                | LINK becomes HERE             |
 
-`systems=` and `not-systems=` name ids of this side. A frame that addresses all systems and comes
-from a link with a filter must not reach an excluded vehicle: it is sent only to links without one.
-Frames without a target field, such as a heartbeat, command nothing.
+All options name ids of this side. Selection uses the header of each frame, and excludes a system
+that has not been received so far. Vehicles are sent from an endpoint that selects only frames that
+address a selected one, and those of `HARMLESS`: a frame without a target, or with target 0, would
+reach an excluded vehicle as well. Answers pass to stations, and to programs that have addressed a
+selected system. `Reach` has the rules for frames without a target.
 
 A renumbered frame is another frame: it gets a new checksum, and a new signature if its own is
 genuine by a key that the gateway has. Otherwise it is refused, since the gateway cannot sign it.
@@ -18,6 +22,7 @@ genuine by a key that the gateway has. Otherwise it is refused, since the gatewa
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from typing import Final
 
 from gateway.hub.routing_table import ROUTE_FRESH_US, Origin
@@ -25,13 +30,28 @@ from gateway.wire.frame_editing import Sign
 from gateway.wire.mavlink_messages import CRC_EXTRA, HEARTBEAT_ID, NO_TARGET, TARGET_OFFSETS, ids_of
 from gateway.wire.mavlink_splitter import MavFrame
 from gateway.wire.system_ids import LAST_ID, rename_systems
+from gateway.wire.vehicle_inputs import acts
 
-HARMLESS: Final = ids_of("TIMESYNC", "PING")
-"""Messages with a target field that command nothing."""
+HARMLESS: Final = ids_of("HEARTBEAT", "SYSTEM_TIME", "TIMESYNC", "PING")
+"""Messages that vehicles may receive from systems behind any endpoint."""
 MAX_NEIGHBOURS: Final = 64
 """Maximum other systems and components of a link that are known by their heartbeats."""
 WAITS: Final = "as=: no autopilot has sent a heartbeat on this link so far"
 FILTER_OPTIONS: Final = ("systems", "not-systems", "components")
+
+
+class Reach(Enum):
+    """The links to which a frame from an endpoint that selects may be sent."""
+
+    NOWHERE = auto()
+    STATIONS = auto()
+    """Those on which only ground stations are received; an addressed frame also goes to a program
+    that has addressed a selected system."""
+    DISPLAYS = auto()
+    """All but those on which only other vehicles are received."""
+    SELECTED = auto()
+    """All but those on which an excluded vehicle is received."""
+    EVERYWHERE = auto()
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +61,8 @@ class SystemFilter:
     only: frozenset[int] = frozenset()
     without: frozenset[int] = frozenset()
     components: frozenset[int] = frozenset()
+    also: frozenset[int] = frozenset()
+    """Messages without a target that pass in addition, by message id."""
 
     def __bool__(self) -> bool:
         return bool(self.only or self.without or self.components)
@@ -54,51 +76,60 @@ class SystemFilter:
         """Return whether a system passes."""
         return system not in self.without and (not self.only or system in self.only)
 
+    def carries(self, frame: MavFrame) -> bool:
+        """Return whether a frame without a target passes to the endpoint."""
+        is_added = frame.message_id in self.also and frame.origin[0] not in self.without
+        return is_added or self.has(frame.origin)
+
     def lets_out(self, frame: MavFrame) -> bool:
         """Return whether a frame that is addressed, or a station's, passes to the endpoint."""
-        if frame.origin[0] in self.without or frame.target[0] in self.without:
+        if self._excludes(frame):
             return False
-        if self.has(frame.origin):
-            return True
-        return self.lets_send(frame.message_id, frame.target)
-
-    def lets_in(
-        self, frame: MavFrame, *, from_station: bool, is_vehicle: Callable[[int], bool]
-    ) -> bool:
-        """Return whether a frame passes from the endpoint.
-
-        `is_vehicle` returns whether a system is a vehicle that is not behind this endpoint.
-        """
-        sender, target = frame.origin[0], frame.target[0]
-        if sender in self.without or target in self.without:
-            return False
-        if target and self.lets_send(frame.message_id, frame.target):
-            return True
-        if target and is_vehicle(target):
-            return False
-        return self.has(frame.origin) or (from_station and not is_vehicle(sender))
+        return self.has(frame.origin) or self.lets_send(frame.message_id, frame.target)
 
     def lets_send(self, message_id: int, target: Origin) -> bool:
-        """Return whether a message addresses only systems that pass, or is not a command.
+        """Return whether a message may reach vehicles: by its target, or since it is harmless.
 
         Messages without a target component are for the autopilot.
         """
         if not target[0]:
-            return not commands(message_id)
+            return message_id in HARMLESS or message_id in self.also
         has_component = TARGET_OFFSETS[message_id][1] != NO_TARGET
         return self.has(target) if has_component else self.has_system(target[0])
+
+    def reach(self, frame: MavFrame, *, from_station: bool) -> Reach:
+        """Return where a frame from the endpoint may be sent.
+
+        `from_station` is whether its sender is a ground station behind the endpoint.
+        """
+        is_selected, message_id = self.has(frame.origin), frame.message_id
+        if self._excludes(frame):
+            return Reach.NOWHERE
+        if frame.target[0] and self.lets_send(message_id, frame.target):
+            return Reach.EVERYWHERE
+        if not (is_selected or from_station):
+            return Reach.NOWHERE
+        if frame.target[0]:
+            return Reach.STATIONS
+        if message_id in HARMLESS:
+            return Reach.EVERYWHERE
+        if message_id in self.also:
+            return Reach.SELECTED
+        if not is_selected:
+            return Reach.NOWHERE
+        return Reach.STATIONS if acts(message_id) else Reach.DISPLAYS
+
+    def _excludes(self, frame: MavFrame) -> bool:
+        return frame.origin[0] in self.without or frame.target[0] in self.without
 
 
 NO_FILTER: Final = SystemFilter()
 
 
-def commands(message_id: int) -> bool:
-    """Return whether a message that addresses all systems may be a command."""
-    return message_id in TARGET_OFFSETS and message_id not in HARMLESS
-
-
-def system_filter_from(only: str, without: str, components: str) -> SystemFilter:
-    """Read the options `systems`, `not-systems` and `components`.
+def system_filter_from(
+    only: str, without: str, components: str, also: frozenset[int]
+) -> SystemFilter:
+    """Read the options `systems`, `not-systems` and `components`; `also` has message ids.
 
     Raises ValueError if one is no list of ids.
     """
@@ -106,6 +137,7 @@ def system_filter_from(only: str, without: str, components: str) -> SystemFilter
         ids_from("systems", only),
         ids_from("not-systems", without),
         ids_from("components", components),
+        also,
     )
     if both := found.only & found.without:
         raise ValueError(f"system {min(both)} is in both systems= and not-systems=")

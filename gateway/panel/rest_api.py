@@ -15,7 +15,7 @@ import asyncio
 import json
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Set
+from collections.abc import AsyncIterator, Callable, Iterator, Set
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -32,7 +32,8 @@ from starlette.status import WS_1008_POLICY_VIOLATION
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gateway import __version__
-from gateway.hub.systems import FILTER_OPTIONS, NO_FILTER, SystemFilter, system_filter_from
+from gateway.hub.endpoint import selection_from
+from gateway.hub.systems import NO_FILTER, SystemFilter
 from gateway.panel.access import ROLE
 from gateway.panel.admission import Role
 from gateway.panel.uplink import Uplink
@@ -304,7 +305,7 @@ class RestApi:
     async def read(self, request: Request, path: str) -> Response:
         """Return a part of that: `vehicles/1/components/1/messages/ATTITUDE/message/roll`."""
         try:
-            systems = _systems_of(request.query_params)
+            systems = selection_from(request.query_params)
             async with self._encoding:
                 found = self._book.look_up(path, systems)
                 await asyncio.sleep(0)
@@ -334,7 +335,7 @@ class RestApi:
         if request.scope[ROLE] is not Role.OPERATOR:
             return Response(NOT_ALLOWED, HTTPStatus.FORBIDDEN)
         try:
-            systems = _systems_of(request.query_params)
+            systems = selection_from(request.query_params)
             self._send(_read_json5((await request.body()).decode()), systems)
         except UnicodeDecodeError as error:
             return _refused(f"Failed to parse input as UTF-8 string: {error}")
@@ -345,12 +346,13 @@ class RestApi:
     async def follow(self, socket: WebSocket) -> None:
         """Send messages with names that match a regular expression; accept messages to send.
 
-        `systems`, `not-systems` and `components` select, both of those sent and those accepted.
+        `systems`, `not-systems` and `components` select, both of those sent and those accepted;
+        `also` names messages without a target to accept too.
         """
         await socket.accept()
         try:
             names = names_matching(socket.query_params.get("filter", EVERYTHING))
-            systems = _systems_of(socket.query_params)
+            systems = selection_from(socket.query_params)
         except ValueError as error:
             await socket.send_text(pretty({"error": str(error)}))
             await socket.close(WS_INVALID)
@@ -398,14 +400,17 @@ class RestApi:
     def _send(self, given: Any, systems: SystemFilter) -> int:
         """Send a message and return its size; raises BadMessageError if it is invalid.
 
-        One that addresses a system that does not pass, or all systems, is invalid too.
+        One that may reach a system that does not pass is invalid too.
         """
         if not isinstance(given, dict):
             raise BadMessageError("it is an object with 'header' and 'message'")
         message = from_json(given.get("message"))
         target = _target(message)
         if systems and not systems.lets_send(message.get_msgId(), target):
-            raise BadMessageError(f"systems= or components= excludes its target {target}")
+            raise BadMessageError(
+                f"{message.get_type()} to {target} may reach vehicles that systems= or components= "
+                "excludes; also= lets a message without a target pass"
+            )
         system_id, component_id = _sender(given.get("header"))
         if self._book.has_heard(system_id, component_id):
             # Ids of a known system must not be used: the gateway would detect a loop.
@@ -472,10 +477,6 @@ def _target(message: Any) -> tuple[int, int]:
     """Return the addressed system and component; 0 is all."""
     target = getattr(message, "target_system", getattr(message, "target", 0))
     return target, getattr(message, "target_component", 0)
-
-
-def _systems_of(query: Mapping[str, str]) -> SystemFilter:
-    return system_filter_from(*(query.get(key, "") for key in FILTER_OPTIONS))
 
 
 def _sender(header: Any) -> tuple[int, int]:

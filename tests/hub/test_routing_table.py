@@ -21,8 +21,9 @@ from gateway.hub.routing_table import (
     SystemPath,
 )
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import MavFrame
-from tests.kit.mavlink import numbered
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
+from tests.kit.mavlink import numbered, packed
+from tests.kit.messages import beat
 
 FAST, SLOW = 1, 2
 """Two links to one vehicle."""
@@ -78,13 +79,17 @@ def test_removed_client_has_no_paths(table: RoutingTable) -> None:
 
 
 def test_stations_are_distinguished_from_vehicles(table: RoutingTable) -> None:
-    table.register(4, (255, 190), 0)
     path = table.register(4, (255, 190), 0)
-    path.is_station = True
-    assert table.is_station((255, 190))
+    gcs, plane = (frame_of(packed(beat(kind), 255, 190)) for kind in (6, 1))
+    table.read_heartbeat(4, path, gcs, 0)
+    assert table.is_station(4, (255, 190))
     assert table.clients_with_vehicles(1) == [2, 3]
-    path.is_station = False
+    table.read_heartbeat(4, path, plane, 1)
+    # Another program with its id: each of its heartbeats must not change the routes.
+    table.read_heartbeat(4, path, gcs, 2)
     assert table.clients_with_vehicles(1) == [2, 3, 4]
+    table.read_heartbeat(4, path, gcs, 1 + ROUTE_FRESH_US)
+    assert table.clients_with_vehicles(1) == [2, 3]
 
 
 def test_path_begins_again_after_a_timeout(table: RoutingTable) -> None:
@@ -121,14 +126,17 @@ class TestBounds:
         assert table.origins(1) == ((1, 1), (2, 1), (3, 1))
         assert changes == []
 
-    def test_only_a_second_path_and_a_removal_change_routes(self) -> None:
+    def test_another_system_its_kind_and_a_removal_change_routes(self) -> None:
         changes: list[int] = []
         table = RoutingTable(lambda: changes.append(1))
-        for client_id, system, expected in ((1, 10, 0), (2, 10, 1), (2, 10, 1), (2, 11, 1)):
-            table.register(client_id, (system, 1), 0)
+        for client_id, component, expected in ((1, 1, 1), (2, 1, 2), (2, 1, 2), (2, 2, 2)):
+            path = table.register(client_id, (10, component), 0)
             assert len(changes) == expected
+        for _ in range(2):
+            table.read_heartbeat(2, path, frame_of(packed(beat(6))), 0)
+            assert len(changes) == 3
         table.remove(2)
-        assert len(changes) == 2
+        assert len(changes) == 4
 
 
 def frame(number: int, content: bytes | None = None) -> MavFrame:

@@ -7,7 +7,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.endpoint import parse_endpoint
-from gateway.hub.systems import WAITS, SystemTranslation
+from gateway.hub.systems import WAITS, Reach, SystemTranslation
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.hub import receive
@@ -52,39 +52,61 @@ def test_wrong_option_is_refused(options: str, text: str) -> None:
         parse_endpoint(f"udp:h:1?{options}")
 
 
+STATION_ID, ONE, TWO = (255, STATION), (1, 1), (2, 1)
+CORRECTIONS = mavlink.MAVLink_gps_rtcm_data_message(0, 0, bytes(180))
+ODOMETRY = mavlink.MAVLink_vision_position_estimate_message(0, 0, 0, 0, 0, 0, 0)
+ACCEPTED = mavlink.MAVLink_command_ack_message(400, 0)
+
+
 @pytest.mark.parametrize("version", [V1, V2])
 @pytest.mark.parametrize(
-    ("options", "message", "sender", "passes"),
+    ("options", "message", "sender", "reach", "lets_out"),
     [
-        ("systems=1", command(1), (255, STATION), True),
-        ("systems=1", command(2), (255, STATION), False),
-        ("systems=1", attitude(), (1, 1), True),
-        ("systems=1", command(255, STATION), (1, 1), True),
-        ("systems=1", command(255, STATION), (2, 1), False),
-        ("systems=1", GCS, (255, STATION), True),
-        ("systems=1", command(0, 0), (255, STATION), False),
-        ("not-systems=2", command(1), (255, STATION), True),
-        ("not-systems=2", command(2), (255, STATION), False),
-        ("not-systems=2", command(255, STATION), (2, 1), False),
-        ("components=1", command(3, 1), (255, STATION), True),
-        ("components=1", command(3, 154), (255, STATION), False),
-        ("components=1", command(3, 0), (255, STATION), False),
-        ("components=1", mavlink.MAVLink_set_mode_message(3, 1, 0), (255, STATION), True),
-        ("components=1", command(255, STATION), (3, 154), False),
+        ("systems=1", command(1), STATION_ID, Reach.EVERYWHERE, True),
+        ("systems=1", command(2), STATION_ID, Reach.STATIONS, False),
+        ("systems=1", command(1), TWO, Reach.EVERYWHERE, True),
+        ("systems=1", attitude(), ONE, Reach.DISPLAYS, True),
+        ("systems=1", attitude(), TWO, Reach.NOWHERE, False),
+        ("systems=1", ODOMETRY, ONE, Reach.STATIONS, True),
+        ("systems=1", ACCEPTED, ONE, Reach.DISPLAYS, True),
+        ("systems=1", command(255, STATION), ONE, Reach.STATIONS, True),
+        ("systems=1", command(255, STATION), TWO, Reach.NOWHERE, False),
+        ("systems=1", GCS, STATION_ID, Reach.EVERYWHERE, True),
+        ("systems=1", CORRECTIONS, STATION_ID, Reach.NOWHERE, False),
+        ("systems=1&also=GPS_RTCM_DATA", CORRECTIONS, STATION_ID, Reach.SELECTED, True),
+        ("systems=1", command(0, 0), STATION_ID, Reach.NOWHERE, False),
+        ("systems=1", command(0, 0), ONE, Reach.STATIONS, True),
+        ("not-systems=2", command(1), STATION_ID, Reach.EVERYWHERE, True),
+        ("not-systems=2", command(0), STATION_ID, Reach.STATIONS, True),
+        ("not-systems=2", command(2), STATION_ID, Reach.NOWHERE, False),
+        ("not-systems=2", command(255, STATION), TWO, Reach.NOWHERE, False),
+        ("not-systems=2&also=VISION_POSITION_ESTIMATE", ODOMETRY, TWO, Reach.NOWHERE, False),
+        ("components=1", command(3, 1), STATION_ID, Reach.EVERYWHERE, True),
+        ("components=1", command(3, 154), STATION_ID, Reach.STATIONS, False),
+        ("components=1", command(3, 0), STATION_ID, Reach.STATIONS, False),
+        ("components=1", command(0, 0), STATION_ID, Reach.NOWHERE, False),
+        (
+            "components=1",
+            mavlink.MAVLink_set_mode_message(3, 1, 0),
+            STATION_ID,
+            Reach.EVERYWHERE,
+            True,
+        ),
+        ("components=1", command(255, STATION), (3, 154), Reach.NOWHERE, False),
     ],
 )
 def test_filter_lets_frames_pass_in_both_directions(
-    options: str, message: Any, sender: tuple[int, int], passes: bool, version: int
+    options: str,
+    message: Any,
+    sender: tuple[int, int],
+    reach: Reach,
+    lets_out: bool,
+    version: int,
 ) -> None:
-    """Systems 1 to 9 are vehicles somewhere else, and 255 is a known station."""
     wanted = parse_endpoint(f"udp:h:1?{options}").systems
     frame = frame_of(packed(message, *sender, version=version))
-    assert wanted.lets_out(frame) == passes
-    if frame.target != (0, 0) or frame.message_id == 0:
-        received = wanted.lets_in(
-            frame, from_station=sender[1] == STATION, is_vehicle=lambda system: system < 10
-        )
-        assert received == passes
+    assert wanted.reach(frame, from_station=sender == STATION_ID) == reach
+    assert wanted.lets_out(frame) == lets_out
 
 
 def translation(text: str, *keys: bytes) -> SystemTranslation:
@@ -239,6 +261,71 @@ class TestHub:
         await self.say(rig, (seat, command(0, 0), 255, STATION), (seat, command(1), 255, STATION))
         assert len(rig.incoming) == before
         assert self.origins(seat) == []
+
+    async def test_answers_reach_a_program_that_has_asked_a_selected_vehicle(
+        self, rig: Any
+    ) -> None:
+        _, first, second, seat = await self.open(rig, "systems=1", "")
+        await self.say(rig, (first, heartbeat(), 1, 1), (second, heartbeat(), 2, 1))
+        accepted = mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 254, 0)
+        await self.say(rig, (seat, attitude(), 254, 0))
+        seat.received()
+        await self.say(rig, (first, accepted, 1, 1), (seat, command(1), 254, 0))
+        assert (1, 77) not in self.origins(seat)
+        await self.say(rig, (first, accepted, 1, 1))
+        assert self.origins(seat) == [(1, 77)]
+        # Also a vehicle may have addressed it, and is excluded nevertheless.
+        await self.say(rig, (second, command(1), 2, 1), (first, command(2), 1, 1))
+        assert (1, 76) not in self.origins(second)
+
+    async def test_heartbeat_of_a_station_with_the_id_of_a_vehicle_changes_nothing(
+        self, rig: Any
+    ) -> None:
+        _, first, second, seat = await self.open(rig, "systems=1", "")
+        await self.say(rig, (first, GCS, 2, 1), (second, heartbeat(), 2, 1))
+        seat.received()
+        await self.say(rig, (first, GCS, 2, 1), (second, attitude(), 2, 1))
+        assert self.origins(seat) == [(2, 30)]
+        assert self.origins(first) == []
+
+    @pytest.mark.parametrize(
+        ("options", "drone", "passing"),
+        [
+            ("", heartbeat(), [(1, 30), (2, 0), (2, 30), (2, 144)]),
+            ("budget=5000", heartbeat(), []),
+            ("budget=5000&also=FOLLOW_TARGET", heartbeat(), [(2, 144)]),
+            ("budget=5000&systems=2,3", heartbeat(), [(2, 0), (2, 30), (2, 144)]),
+            ("budget=5000", heartbeat(mavlink.MAV_TYPE_ANTENNA_TRACKER), None),
+            ("budget=5000", GCS, None),
+        ],
+    )
+    async def test_link_of_a_vehicle_with_a_capacity_gets_no_telemetry_of_others(
+        self, rig: Any, options: str, drone: Any, passing: list[tuple[int, int]] | None
+    ) -> None:
+        hub, first, second, seat = await self.open(rig, options, "")
+        follow = mavlink.MAVLink_follow_target_message(
+            0, 1, 0, 0, 0, [0] * 3, [0] * 3, [1, 0, 0, 0], [0] * 3, [0] * 3, 0
+        )
+        radio = mavlink.MAVLink_radio_status_message(0, 0, 100, 0, 0, 0, 0)
+        await self.say(rig, (first, radio, 51, 68), (first, drone, 3, 1))
+        first.received()
+        rig.publish(hub, rig.vehicle.attitude())
+        for message in (heartbeat(), attitude(), follow):
+            await self.say(rig, (second, message, 2, 1))
+        expected = [(1, 30), (2, 0), (2, 30), (2, 144)] if passing is None else passing
+        assert self.origins(first) == expected
+        await self.say(rig, (seat, GCS, 255, STATION), (seat, command(3), 255, STATION))
+        assert self.origins(first)[:1] == [(255, 0)]
+
+    async def test_station_gets_no_corrections_of_another_after_its_heartbeat(
+        self, rig: Any
+    ) -> None:
+        _, first, second, seat = await self.open(rig, "", "")
+        await self.say(rig, (first, heartbeat(), 1, 1), (second, GCS, 254, STATION))
+        await self.say(rig, (seat, CORRECTIONS, 255, STATION), (seat, GCS, 255, STATION))
+        first.received(), second.received()
+        await self.say(rig, (seat, CORRECTIONS, 255, STATION))
+        assert (self.origins(first), self.origins(second)) == ([(255, 233)], [])
 
     async def test_own_frames_leave_no_gap_behind_a_filter_and_are_renumbered(
         self, rig: Any

@@ -117,7 +117,7 @@ async def test_client_that_returns_on_another_port_replaces_its_old_entry(rig: A
     before.send(before.sender.heartbeat())
     await rig.until(lambda: len(rig.incoming) == 1)
     rig.clock.now_us = 4_000_000
-    after.send(after.sender.attitude())
+    after.send(after.sender.heartbeat())
     await rig.until(lambda: len(rig.incoming) == 2)
     await rig.until(lambda: len(hub.clients()) == 1)
     assert hub.clients()[0].remote == f"127.0.0.1:{after.port}"

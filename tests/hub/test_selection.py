@@ -1,0 +1,195 @@
+"""A client behind `systems=1` reaches system 1 and no other, with every message of the dialect."""
+
+import asyncio
+import json
+import socket
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any
+from unittest.mock import MagicMock
+
+import pytest
+from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.hub.hub import Hub
+from gateway.hub.systems import HARMLESS, SystemFilter
+from gateway.panel.rest_api import RestApi
+from gateway.wire.frame_editing import edit_frame
+from gateway.wire.mavlink_json import template
+from gateway.wire.mavlink_messages import (
+    CRC_EXTRA,
+    DEFINITIONS,
+    MESSAGE_NAMES,
+    NO_TARGET,
+    TARGET_OFFSETS,
+    layout_of,
+)
+from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, SIGNED, MavFrame, frame_of, to_mavlink1
+from gateway.wire.vehicle_inputs import acts
+from tests.kit.hub import Rig, Station
+from tests.kit.mavlink import STATION, packed
+from tests.kit.messages import beat
+
+pytestmark = pytest.mark.io
+
+ALLOWED, EXCLUDED = 1, 2
+SENDERS = ((255, STATION), (ALLOWED, 1), (EXCLUDED, STATION))
+"""A station, one that uses the id of the selected vehicle, and one with that of the other."""
+AT_ONCE = 40
+"""Frames at a time: more would overflow the buffer of a socket."""
+GCS = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
+Send = Callable[[list[MavFrame]], Awaitable[None]]
+
+
+def _with_target(message_id: int, target: int) -> MavFrame:
+    """Return a frame of a message whose other fields are 0."""
+    size = layout_of(message_id).itemsize
+    head = bytes((0xFD, size, 0, 0, 0, 0, 0)) + message_id.to_bytes(3, "little")
+    blank = frame_of(head + bytes(size) + bytes(2))
+    names = [n for n in ("target", "target_system") if n in (layout_of(message_id).names or ())]
+    fields = dict.fromkeys(names, target)
+    if target and TARGET_OFFSETS[message_id][1] != NO_TARGET:
+        fields["target_component"] = 1
+    edited = edit_frame(blank, fields=fields) if fields else blank
+    assert edited
+    return edited
+
+
+def _messages() -> Iterator[MavFrame]:
+    for message_id in sorted(DEFINITIONS):
+        for target in (0, ALLOWED, EXCLUDED) if message_id in TARGET_OFFSETS else (0,):
+            yield _with_target(message_id, target)
+
+
+MESSAGES = tuple(_messages())
+
+
+def _from(frame: MavFrame, sender: tuple[int, int], *, signed: bool) -> MavFrame:
+    data = bytearray(frame.data)
+    data[2] = SIGNED if signed else 0
+    data[5:7] = sender
+    data[-2:] = mcrf4xx(bytes(data[1:-2]) + CRC_EXTRA[frame.message_id]).to_bytes(2, "little")
+    return frame_of(bytes(data) + bytes(SIGNATURE_SIZE if signed else 0))
+
+
+class Bench:
+    """A hub with a selected and an excluded vehicle, and one client behind `systems=1`."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.vehicles = [rig.station() for _ in (ALLOWED, EXCLUDED)]
+        self.got: list[set[tuple[int, tuple[int, int], int]]] = [set(), set()]
+        """What each vehicle was sent: message, sender and target."""
+
+    async def open(self, door: str) -> tuple[Hub, Send]:
+        urls = [f"udp:127.0.0.1:{each.port}" for each in self.vehicles]
+        kind = {"rest": "udp", "mavlink1": "udp", "signed": "udp"}.get(door, door)
+        url = f"{kind}-listen:127.0.0.1:0?trusted=yes"
+        if kind == "zenoh":
+            url = "zenoh:tcp/127.0.0.1:1?site=x&trusted=yes"
+        hub = self.rig.hub(*urls, url if door == "rest" else f"{url}&systems={ALLOWED}")
+        await self.rig.until(lambda: [one.state for one in hub.clients()][:2] == ["open"] * 2)
+        for number, vehicle in enumerate(self.vehicles):
+            hub.send(self.rig.out(self.rig.sender(9).attitude(), hub.clients()[number].client_id))
+            await vehicle.receive()
+        if kind == "zenoh":
+            client: Any = list(hub._clients.values())[2]
+            return hub, _each(lambda data: client._handle((data, len(data))))
+        if kind == "udp":
+            station = self.rig.station(hub.listening_ports()[0])
+            return hub, _rest(station) if door == "rest" else _each(station.send)
+        sock = await self.rig.connect(hub.listening_ports()[0])
+        if kind == "tcp":
+            return hub, _each(sock.send)
+        await _shake_hands(sock)
+        return hub, _each(lambda data: sock.send(_masked(data)))
+
+    async def report(self, number: int, state: str) -> None:
+        """Send the frames of a vehicle in a state."""
+        vehicle = self.vehicles[number - 1]
+        if state != "unheard":
+            vehicle.send(packed(beat(), number))
+        if state == "telemetry":
+            vehicle.send(packed(mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0), number))
+        await self.rig.quiet()
+
+    async def collect(self) -> None:
+        await self.rig.quiet_some()
+        for number, vehicle in enumerate(self.vehicles):
+            for data in vehicle.received():
+                frame = frame_of(data)
+                self.got[number].add((frame.message_id, frame.origin, frame.target[0]))
+
+
+def _each(send: Callable[[bytes], object]) -> Send:
+    async def send_all(frames: list[MavFrame]) -> None:
+        for frame in frames:
+            send(frame.data)
+
+    return send_all
+
+
+def _rest(station: Station) -> Send:
+    """Post messages to a REST API, and send those that it accepts from a client without options."""
+    uplink = MagicMock()
+    uplink.send.side_effect = lambda message, *sender: station.send(packed(message, *sender))
+    api = RestApi(uplink)
+    systems = SystemFilter(only=frozenset({ALLOWED}))
+
+    async def post_all(frames: list[MavFrame]) -> None:
+        for frame in frames:
+            system, component = frame.origin
+            message = template(MESSAGE_NAMES[frame.message_id])
+            for name in ("target", "target_system"):
+                if name in message:
+                    message[name] = frame.target[0]
+            if "target_component" in message:
+                message["target_component"] = frame.target[1]
+            header = {"system_id": system, "component_id": component}
+            api._answer(json.dumps({"header": header, "message": message}), systems)
+
+    return post_all
+
+
+def _masked(data: bytes) -> bytes:
+    """Return a binary WebSocket message; a mask of zeros changes nothing."""
+    size = len(data)
+    length = bytes((0x80 | size,)) if size < 126 else b"\xfe" + size.to_bytes(2, "big")
+    return b"\x82" + length + bytes(4) + data
+
+
+async def _shake_hands(sock: socket.socket) -> None:
+    sock.send(
+        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+    )
+    await asyncio.get_running_loop().sock_recv(sock, 4096)
+
+
+@pytest.mark.parametrize("state", ["unheard", "heartbeat", "telemetry"])
+@pytest.mark.parametrize("door", ["udp", "tcp", "ws", "rest", "zenoh", "mavlink1", "signed"])
+async def test_no_message_acts_on_an_excluded_vehicle(rig: Rig, door: str, state: str) -> None:
+    bench = Bench(rig)
+    _, send = await bench.open(door)
+    await bench.report(ALLOWED, "telemetry")
+    await bench.report(EXCLUDED, state)
+    sent = set()
+    for sender in SENDERS:
+        frames = [_from(each, sender, signed=door == "signed") for each in MESSAGES]
+        if door == "mavlink1":
+            frames = [frame_of(data) for f in frames if (data := to_mavlink1(f.data))]
+        if door == "rest":
+            frames = [f for f in frames if f.message_id in mavlink.mavlink_map]
+        else:
+            await send([frame_of(packed(GCS, *sender, sequence=1))])
+        for begin in range(0, len(frames), AT_ONCE):
+            await send(frames[begin : begin + AT_ONCE])
+            await bench.collect()
+        sent |= {(f.message_id, f.origin, f.target[0]) for f in frames}
+    await rig.quiet()
+    await bench.collect()
+    allowed, excluded = bench.got
+    assert not {each for each in excluded if acts(each[0]) and each[0] not in HARMLESS}
+    assert not {each for each in excluded if each[2]}
+    assert {each[0] for each in excluded if each[1] != (ALLOWED, 1)} <= HARMLESS
+    assert {each for each in sent if each[2] == ALLOWED and each[1] == SENDERS[0]} <= allowed
