@@ -142,7 +142,7 @@ def measure_page(browser: Browser, folder: Path, seconds: float) -> list[dict[st
     port = free_port()
     found = []
     connect = f"udp-listen:127.0.0.1:{port}"
-    options = ("panel", "--connect", connect, "--port", "0")
+    options = ("panel", "--connect", connect, "--tcp-port", "0")
     with Process(folder, *options, config="[panel]\nmap_styles = []\n") as panel:
         process, link = panel.process, panel.link()
         vehicle = Vehicle(port)
@@ -179,7 +179,7 @@ def measure_clicks(browser: Browser, folder: Path) -> dict[str, float]:
     """Measure the time from a click in the rail until the view is drawn."""
     vehicle = Vehicle(free_port())
     vehicle.start()
-    options = ("panel", "--connect", f"udp-listen:127.0.0.1:{vehicle.port}", "--port", "0")
+    options = ("panel", "--connect", f"udp-listen:127.0.0.1:{vehicle.port}", "--tcp-port", "0")
     with Process(folder, *options, config="[panel]\nmap_styles = []\n") as panel:
         (page,) = open_pages(browser, panel.link(), 1)
         views = page.locator(".rail button").evaluate_all("all => all.map((b) => b.dataset.view)")

@@ -10,6 +10,7 @@ import io
 import logging
 import os
 import sys
+from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -90,6 +91,11 @@ GROUPS: Final = {
 }
 """Summaries of the commands, under the headings of the list."""
 COMMANDS: Final = {name: text for below in GROUPS.values() for name, text in below.items()}
+ALSO: Final = {
+    "route": "run", "router": "run", "start": "run", "replay": "play", "log": "record",
+    "export": "convert", "cut": "convert", "merge": "convert", "list": "info", "check": "doctor",
+}  # fmt: skip
+"""Other words for commands, for the suggestion after an unknown name."""
 HOISTED: Final = frozenset({"--config", "-c", "--socket"})
 """Options of `mavgate` itself that may also follow the command."""
 EPILOG: Final = "`mavgate --help` lists the options of all commands: --config, --socket, --verbose."
@@ -167,11 +173,11 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find a command; the error for an unknown name suggests the nearest one."""
-        self.commands = cast(Any, dict.fromkeys(COMMANDS))
-        try:
-            return super().resolve_command(ctx, args)
-        finally:
-            self.commands = {}
+        if (name := args[0]) not in COMMANDS:
+            near = get_close_matches(name, [*COMMANDS, *ALSO], n=1)
+            hint = f" Did you mean '{ALSO.get(near[0], near[0])}'?" if near else ""
+            ctx.fail(f"No such command {name!r}.{hint}")
+        return super().resolve_command(ctx, args)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
         """Return a command; only its summary while the list is written."""

@@ -264,7 +264,8 @@ def _bound(settings: PanelSettings, *, or_any: bool) -> socket.socket:
         if or_any and error.errno == errno.EADDRINUSE:
             log.warning("%s is in use; the panel takes another port", address)
             return _bound(msgspec.structs.replace(settings, port=0), or_any=False)
-        raise PanelError(f"panel on {address}: {error.strerror}; --port takes another") from error
+        reason = f"panel on {address}: {error.strerror}; --tcp-port takes another"
+        raise PanelError(reason) from error
     return sock
 
 

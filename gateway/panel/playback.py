@@ -284,7 +284,7 @@ class Playback:
         arguments = ["play", *map(str, files), "--loop", "--attached"]
         arguments += ["--endpoint", f"udp:127.0.0.1:{self._uplink.playback_port}"]
         for system_id in firsts:
-            arguments += ["--as", str(system_id)]
+            arguments += ["--id", str(system_id)]
         child = self._child = await asyncio.create_subprocess_exec(
             *own_command(*arguments),
             stdin=asyncio.subprocess.PIPE,

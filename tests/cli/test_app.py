@@ -138,15 +138,18 @@ def test_small_commands_import_nothing_large(words: list[str], tmp_path: Path) -
     [
         ("sweep --hold-out x", "'x': write a whole number"),
         ("sweep --gps-interval x", "'x': write a number"),
-        ("play x --as 300", "'300': must be at most 249"),
+        ("play x --id 300", "'300': must be at most 249"),
         ("play x --skip-gaps -1", "'-1': must be at least 0"),
         ("fuse x -o y.csv --fuse-with old", "'old' is not one of 'recorded', 'current'"),
         ("clients mark north 8", "'north': write a number"),
         *(
             (f"clients mark {words}", "write a number")
-            for words in ("nan nan", "inf 0", "47 8 --alt nan")
+            for words in ("nan nan", "inf 0", "47 8 nan")
         ),
         ("runn", "Did you mean 'run'"),
+        ("rout", "Did you mean 'run'"),
+        ("replay", "Did you mean 'play'"),
+        ("xyzzy", "No such command 'xyzzy'."),
     ],
 )
 def test_invalid_value_is_named_with_what_is_allowed(words: str, text: str) -> None:

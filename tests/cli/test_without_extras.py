@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 NEEDS = {
     "panel": "panel", "report x -o x.html": "panel", "run --panel --port none": "panel",
-    "map 1,2 --source a": "panel", "report": "plot", "report x y -o o": "plot",
+    "map 1,2 a": "panel", "report": "plot", "report x y -o o": "plot",
     "fleet": "fleet", "report --quick s3://x -o o": "batch",
     "sweep s3://x --vary alpha=0.1,0.2": "batch",
 }  # fmt: skip

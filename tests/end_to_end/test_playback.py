@@ -126,7 +126,7 @@ def test_two_recordings_are_played_as_two_vehicles(
 ) -> None:
     port = free_port()
     client = connect(port)
-    play(str(tlog), str(tlog), "--as", "3", "--as", "7", "--speed", "10", port=port)
+    play(str(tlog), str(tlog), "--id", "3", "--id", "7", "--speed", "10", port=port)
     systems: set[int] = set()
     while systems != {3, 7}:
         systems |= {message.get_srcSystem() for message in client.receive()}

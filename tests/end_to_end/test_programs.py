@@ -64,7 +64,7 @@ def apis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Apis]:
     connect = ("--connect", f"udp:127.0.0.1:{gateway.listen_port}")
     try:
         station.until(lambda seen: "GLOBAL_POSITION_INT" in seen)
-        with Process(panel_folder, "panel", "--port", "0", *connect, config="") as panel:
+        with Process(panel_folder, "panel", "--tcp-port", "0", *connect, config="") as panel:
             address = panel.link().partition("//")[2].rstrip("/")
             yield Apis(station, connect[1].removeprefix("udp:"), f"127.0.0.1:{web}", address)
     finally:

@@ -31,7 +31,7 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 async def test_mavsdk_sees_a_crsf_vehicle(start_gateway: Callable[..., Gateway]) -> None:
     config = CONFIG + '[vehicle]\nautopilot = "ardupilotmega"\n'
-    gateway = start_gateway("demo", "--source", "crsf", config=config)
+    gateway = start_gateway("demo", "--tracker", "crsf", config=config)
     async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
         attitude = await anext(telemetry.subscribe_attitude_euler())
@@ -54,7 +54,7 @@ async def test_mavsdk_sees_a_crsf_vehicle(start_gateway: Callable[..., Gateway])
 def test_mavproxy_sees_a_crsf_vehicle(
     start_gateway: Callable[..., Gateway], start_mavproxy: Callable[[int], MavProxy]
 ) -> None:
-    gateway = start_gateway("demo", "--source", "crsf")
+    gateway = start_gateway("demo", "--tracker", "crsf")
     proxy = start_mavproxy(gateway.port)
     proxy.until(r"Detected vehicle 1:1")
     proxy.until(r"(STABILIZE|AUTO)>")
@@ -76,7 +76,7 @@ async def test_mavsdk_and_mavproxy_see_a_vehicle_of_samples(
     start_gateway: Callable[..., Gateway],
     start_mavproxy: Callable[[int], MavProxy],
 ) -> None:
-    gateway = start_gateway("demo", "--source", kind)
+    gateway = start_gateway("demo", "--tracker", kind)
     async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
         position = await first_position(telemetry)
@@ -97,7 +97,7 @@ async def test_mavsdk_and_mavproxy_see_a_vehicle_of_samples(
 def test_samples_of_a_source_are_fused_and_seen(
     kind: str, start_gateway: Callable[..., Gateway], connect: Callable[..., Client]
 ) -> None:
-    gateway = start_gateway("demo", "--source", kind)
+    gateway = start_gateway("demo", "--tracker", kind)
     wanted = {"ATTITUDE", "GLOBAL_POSITION_INT", "HIGHRES_IMU", "GPS_RAW_INT", "ESTIMATOR_STATUS"}
     seen = connect(gateway.port).until(lambda seen: set(seen) >= wanted)
     assert seen["GLOBAL_POSITION_INT"].lat / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
@@ -143,7 +143,7 @@ def test_recorded_bytes_of_a_source_are_decoded_again(
 ) -> None:
     folder = tmp_path / "recordings"
     config = CONFIG + f'[recording]\nfolder = "{folder}"\nsource_bytes = true\n'
-    gateway = start_gateway("demo", "--record", "--source", kind, config=config)
+    gateway = start_gateway("demo", "--record", "--tracker", kind, config=config)
     connect(gateway.port).until(
         lambda seen: "ATTITUDE" in seen and seen["ATTITUDE"].time_boot_ms > 3000
     )

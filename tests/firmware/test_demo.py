@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 @pytest.fixture(params=["nrf24", "sx1276"])
 def gateway(programs: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Gateway]:
-    started = Gateway(tmp_path, "demo", "--firmware", "--radio", request.param)
+    started = Gateway(tmp_path, "demo", "--firmware", request.param)
     yield started
     if started.process.poll() is None:
         started.process.kill()

@@ -74,7 +74,7 @@ def test_boards_flashed_through_optiboot_fly_with_their_settings(
     flashed.write_bytes(NEW_BOOTLOADER.with_suffix(".hex").read_bytes() + b"\n" + image)
     rig, node = imu_rig(receiver=str(flashed.with_suffix("")), program=str(NEW_BOOTLOADER))
     usb = plugged(node)
-    flash(usb, "imu", "--vehicle", "2", "--channel", "80", "--rate", "250", "--send-rate", "60")
+    flash(usb, "imu", "--vehicle", "2", "--channel", "80", "--air-rate", "250", "--send-rate", "60")
     shown = flash(usb, "--show")
     settings = ("vehicle_id       2", "radio_channel    80", "imu_send_hz      60")
     for text in ("imu, version", *settings):

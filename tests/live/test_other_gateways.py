@@ -105,7 +105,7 @@ async def test_vehicle_that_another_gateway_sends_is_refused(
     words = [command, *([file] if command == "play" else []), "--endpoint", STATION]
     done = await asyncio.to_thread(invoke, *words, code=2)
     assert f"vehicle 1 is sent to {STATION} by another gateway" in done.output
-    assert "--force" in done.output
+    assert "--duplicate-ids" in done.output
 
 
 async def test_status_lists_all_gateways(listen: Open) -> None:

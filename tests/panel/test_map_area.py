@@ -117,7 +117,7 @@ def test_unusable_source_is_refused(
 def test_command_writes_into_the_folder_of_tiles(world: Path, tmp_path: Path) -> None:
     config = tmp_path / "gateway.toml"
     config.write_text(f'[panel]\ntiles_folder = "{tmp_path}/tiles"\n')
-    words = ("47.0,8.0", "--source", world, "--name", "Home field", "-c", config)
+    words = ("47.0,8.0", world, "--name", "Home field", "-c", config)
     invoke("map", *words, code=0)
     assert (tmp_path / "tiles" / "Home field.pmtiles").is_file()
     assert "already" in invoke("map", *words, code=2).output

@@ -115,7 +115,7 @@ def calibrate(
     ] = None,
     field_ut: Annotated[
         float | None,
-        typer.Option("--field", min=10.0, max=100.0, help="Strength of the field here, uT."),
+        typer.Option("--field-strength", min=10.0, max=100.0, help="Of the field here, uT."),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show the result, but do not save it.")

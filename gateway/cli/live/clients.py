@@ -125,19 +125,24 @@ def remove(name: Annotated[str, typer.Argument(help="Name or URL of the client."
 def mark(
     lat_deg: Annotated[float | None, typer.Argument(help="Latitude; south is negative.")] = None,
     lon_deg: Annotated[float | None, typer.Argument(help="Longitude; west is negative.")] = None,
+    alt_amsl_m: Annotated[float | None, typer.Argument(help="Height AMSL in m.")] = None,
     *,
-    alt: Annotated[float | None, typer.Option("--alt", help="Height AMSL in m.")] = None,
-    aircraft: Annotated[
-        int | None, typer.Option("--aircraft", help="For this aircraft only; by default all.")
+    vehicle: Annotated[
+        int | None, typer.Option("--vehicle", help="For this vehicle only; by default all.")
     ] = None,
 ) -> None:
     """Mark a location: clients show distance and bearing to it. Without one, clear the mark."""
-    for name, value in (("LAT_DEG", lat_deg), ("LON_DEG", lon_deg), ("--alt", alt)):
+    for name, value in (("LAT_DEG", lat_deg), ("LON_DEG", lon_deg), ("ALT_AMSL_M", alt_amsl_m)):
         if value is not None and not math.isfinite(value):
             refuse(
                 f"{name} {value}: write a number; without LAT_DEG and LON_DEG the mark is cleared"
             )
-    location = {"lat_deg": lat_deg, "lon_deg": lon_deg, "alt_amsl_m": alt, "vehicle_id": aircraft}
+    location = {
+        "lat_deg": lat_deg,
+        "lon_deg": lon_deg,
+        "alt_amsl_m": alt_amsl_m,
+        "vehicle_id": vehicle,
+    }
     print(ask("mark", location))
 
 

@@ -23,15 +23,15 @@ from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import begin_copy
 from gateway.cli.live.panel import launched_panel
 from gateway.cli.live.run import (
+    DuplicateIdsOption,
     EndpointOption,
-    ForceOption,
     PlainOption,
     refuse_conflicts,
     serve,
     with_endpoints,
 )
 from gateway.cli.support.options import CONFIG, RadioName, folder_of, read_options, read_settings
-from gateway.cli.support.recording_options import ColumnsOption, files_of, progress_of
+from gateway.cli.support.recording_options import files_of, progress_of
 from gateway.cli.support.terminal import refuse
 from gateway.clock import unix_time_us
 from gateway.compiled.entry_point import load_entry_points
@@ -51,8 +51,8 @@ AT_ONCE: Final = 16
 CHECKOUT: Final = Path(__file__).resolve().parents[3]
 
 
-class SourceName(StrEnum):
-    """Kinds of simulated sources."""
+class TrackerName(StrEnum):
+    """Kinds of simulated trackers other than our boards."""
 
     CRSF = "crsf"
     LINES = "lines"
@@ -69,19 +69,18 @@ def demo(
         Path | None,
         typer.Option("--flight", "-f", help="Fly a recording instead: by its name, or any file."),
     ] = None,
-    columns: ColumnsOption = None,
     firmware: Annotated[
-        bool, typer.Option("--firmware", help="Run the boards' own programs on simulated chips.")
-    ] = False,
-    radio: Annotated[
-        RadioName, typer.Option("--radio", help="The boards' radio, with --firmware.")
-    ] = RadioName.NRF24,
-    source: Annotated[
-        SourceName | None,
-        typer.Option("--source", help="Fly it through the bytes of another kind of tracker."),
+        RadioName | None,
+        typer.Option(
+            "--firmware", help="Run the boards' own programs on simulated chips, with this radio."
+        ),
+    ] = None,
+    tracker: Annotated[
+        TrackerName | None,
+        typer.Option("--tracker", help="Fly it through the bytes of another kind of tracker."),
     ] = None,
     panel: Annotated[bool, typer.Option("--panel/--no-panel", help="Start the panel too.")] = True,
-    force: ForceOption = False,
+    duplicate_ids: DuplicateIdsOption = False,
 ) -> None:
     """Fly the simulated tracker repeatedly until interrupted.
 
@@ -93,7 +92,7 @@ def demo(
     def read() -> GatewaySettings:
         return with_endpoints(read_settings(file), endpoint)
 
-    settings = _without_conflicts(read(), one=flight is not None, force=force)
+    settings = _without_conflicts(read(), one=flight is not None, allowed=duplicate_ids)
     # First, as it takes seconds to load; the simulator is therefore imported later.
     page = launched_panel(wanted=panel)
     load_entry_points()
@@ -106,11 +105,11 @@ def demo(
 
     try:
         if flight is not None:
-            line, aircraft = recorded_line(settings, flight, columns, report)
+            line, aircraft = recorded_line(settings, flight, report)
         else:
             one = settings.simulator
-            boards = firmware_line(one, unix_time_us(), radio.value) if firmware else None
-            line = made_ahead(boards or simulated_line(one, source))
+            boards = firmware and firmware_line(one, unix_time_us(), firmware.value)
+            line = made_ahead(boards or simulated_line(one, tracker))
             aircraft = calibrated_aircraft(settings)
     except (BenchError, ValueError) as error:
         refuse(str(error))
@@ -123,20 +122,21 @@ def demo(
 
         def daemon() -> Daemon:
             log.info("recording.mode is not used here: %s", "recording" if record else NOT_RECORDED)
-            daemons.append(Daemon(own(settings), aircraft, lambda: own(read()), line, source or ""))
-            return daemons[0]
+            made = Daemon(own(settings), aircraft, lambda: own(read()), line, tracker or "")
+            daemons.append(made)
+            return made
 
         run_event_loop(serve(daemon, plain=plain, panel=page), settings.hub.event_loop)
 
 
-def _without_conflicts(settings: GatewaySettings, *, one: bool, force: bool) -> GatewaySettings:
+def _without_conflicts(settings: GatewaySettings, *, one: bool, allowed: bool) -> GatewaySettings:
     """Return the settings; refuse if another gateway sends the ids of the simulated aircraft."""
     first, count = settings.simulator.vehicle_id, 1 if one else settings.simulator.vehicles
-    refuse_conflicts(range(first, first + count), settings, force=force)
+    refuse_conflicts(range(first, first + count), settings, allowed=allowed)
     return settings
 
 
-def simulated_line(settings: SimulatorSettings, source: SourceName | None) -> Iterator[TimedFrame]:
+def simulated_line(settings: SimulatorSettings, source: TrackerName | None) -> Iterator[TimedFrame]:
     """Simulate the aircraft, as frames of the receiver or bytes of another source."""
     from gateway.simulator.receiver import simulate
     from gateway.simulator.source_bytes import SOURCE_BYTES
@@ -149,7 +149,6 @@ def simulated_line(settings: SimulatorSettings, source: SourceName | None) -> It
 def recorded_line(
     settings: GatewaySettings,
     name: Path,
-    columns: Path | None = None,
     report: Callable[[str], None] = log.info,
 ) -> tuple[Iterator[TimedFrame], dict[int, AircraftSettings]]:
     """Send a recording as its nodes would have sent it, with unchanged calibrated values."""
@@ -159,7 +158,7 @@ def recorded_line(
 
     files = files_of([name], folder_of(settings), "tables")
     with progress_of(files) as advance:
-        options = read_options(settings, columns, progress=advance)
+        options = read_options(settings, progress=advance)
         flight = open_flown(files, options)
     aircraft = with_reference(settings.default_aircraft, gps_latency_s=flight.gps_latency_s)
 

@@ -204,7 +204,7 @@ def _check_nodes(
         if share > LOSSY_PERCENT and link.lost > FEW_LOST:
             hints.append(
                 f"Node {node}: {share:.0f} % of the payloads are lost: upright antennas, 10 uF "
-                "across the radio's supply, or `--rate 250` on all boards for range"
+                "across the radio's supply, or `--air-rate 250` on all boards for range"
             )
     console.print(table)
     for hint in hints:

@@ -30,7 +30,7 @@ OPTIONS: Final = {
     "node_id": "--node",
     "radio_pipe": "--pipe",
     "radio_channel": "--channel",
-    "radio_kbps": "--rate",
+    "radio_kbps": "--air-rate",
     "radio_power_dbm": "--power",
     "radio_address": "--address",
     "imu_send_hz": "--send-rate",
@@ -65,13 +65,22 @@ def _allowed(field: Field) -> str:
     return f"{literals or field.range} {field.unit}".strip()
 
 
+def _panel(name: str) -> str:
+    if name in ("vehicle_id", "node_id", "radio_pipe"):
+        return "Aircraft"
+    if name.startswith("lora_"):
+        return "LoRa"
+    return "nRF24L01+" if name.startswith("radio_") else "Sensors"
+
+
 def _option(name: str) -> Any:
     field, flags = FIELDS[name], [OPTIONS[name]]
     if name == "imu_raw":
         flags = ["--raw/--filtered"]
     unbounded = ("imu_raw", "radio_address", "lora_foreign")
     allowed = "" if name in unbounded else f" {_allowed(field)}."
-    return typer.Option(*flags, help=f"{field.meaning}{allowed}", show_default=False)
+    text = f"{field.meaning}{allowed}"
+    return typer.Option(*flags, help=text, show_default=False, rich_help_panel=_panel(name))
 
 
 @app.command()
@@ -95,28 +104,32 @@ def flash(
         output_file("Write the image to this file, not to a board.", (".hex",)),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
-    vehicle: Annotated[int | None, _option("vehicle_id")] = None,
-    node: Annotated[int | None, _option("node_id")] = None,
-    pipe: Annotated[int | None, _option("radio_pipe")] = None,
-    channel: Annotated[int | None, _option("radio_channel")] = None,
-    rate: Annotated[int | None, _option("radio_kbps")] = None,
+    radio: Annotated[
+        RadioName, typer.Option("--radio", help="The radio of all boards: nRF24L01+ or LoRa.")
+    ] = RadioName.NRF24,
     power: Annotated[
         int | None,
         typer.Option("--power", help="Transmit power: -18, -12, -6, 0 dBm; with LoRa 2 to 20."),
     ] = None,
-    address: Annotated[str | None, _option("radio_address")] = None,
+    vehicle: Annotated[int | None, _option("vehicle_id")] = None,
+    node: Annotated[int | None, _option("node_id")] = None,
+    pipe: Annotated[int | None, _option("radio_pipe")] = None,
     send_rate: Annotated[int | None, _option("imu_send_hz")] = None,
     raw: Annotated[bool | None, _option("imu_raw")] = None,
     accel_range: Annotated[int | None, _option("accel_range_g")] = None,
     gyro_range: Annotated[int | None, _option("gyro_range_dps")] = None,
     gps_rate: Annotated[int | None, _option("gps_rate_hz")] = None,
     gps_model: Annotated[int | None, _option("gps_dynamic_model")] = None,
-    radio: Annotated[
-        RadioName, typer.Option("--radio", help="The radio of all boards: nRF24L01+ or LoRa.")
-    ] = RadioName.NRF24,
+    channel: Annotated[int | None, _option("radio_channel")] = None,
+    air_rate: Annotated[int | None, _option("radio_kbps")] = None,
+    address: Annotated[str | None, _option("radio_address")] = None,
     frequency: Annotated[
         float | None,
-        typer.Option("--frequency", help="LoRa: centre of the channel, MHz; as on all boards."),
+        typer.Option(
+            "--frequency",
+            help="Centre of the channel, MHz; the same on all boards.",
+            rich_help_panel="LoRa",
+        ),
     ] = None,
     bandwidth: Annotated[int | None, _option("lora_bandwidth_khz")] = None,
     spreading: Annotated[int | None, _option("lora_spreading")] = None,
@@ -126,7 +139,9 @@ def flash(
     duty: Annotated[
         float | None,
         typer.Option(
-            "--duty", help="LoRa: maximum time on air, percent; by default 45, with a warning."
+            "--duty",
+            help="Maximum time on air, percent; by default 45, with a warning.",
+            rich_help_panel="LoRa",
         ),
     ] = None,
 ) -> None:
@@ -137,7 +152,7 @@ def flash(
     khz = None if frequency is None else round(1000 * frequency)
     nrf24_power, lora_power = (power, None) if radio is RadioName.NRF24 else (None, power)
     given: tuple[object, ...] = (
-        *(vehicle, node, pipe, channel, rate, nrf24_power, _address(address)),
+        *(vehicle, node, pipe, channel, air_rate, nrf24_power, _address(address)),
         *(send_rate, raw, accel_range, gyro_range, gps_rate, gps_model),
         *(khz, bandwidth, spreading, coding, sync_word, foreign, lora_power),
     )

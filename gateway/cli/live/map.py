@@ -18,15 +18,14 @@ app = typer.Typer()
 @app.command("map", context_settings=NEGATIVE_NUMBERS)
 def get_map(
     around: Annotated[str, typer.Argument(help="A recording, or LATITUDE,LONGITUDE in degrees.")],
-    *,
     source: Annotated[
         str,
-        typer.Option(
-            "--source",
+        typer.Argument(
             help="A PMTiles file of raster tiles: an https:// address whose owner permits "
             "extracts, or a path.",
         ),
     ],
+    *,
     radius: Annotated[str, typer.Option("--radius", help="Margin: 5km, 800m, 3mi.")] = "5km",
     zoom: Annotated[int, typer.Option("--zoom", min=1, max=22, help="Greatest zoom.")] = 16,
     name: Annotated[

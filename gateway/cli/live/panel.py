@@ -48,7 +48,9 @@ def panel(
             help="A vehicle's MAVLink, such as tcp:HOST:5760 or udp-listen:0.0.0.0:14550.",
         ),
     ] = None,
-    port: Annotated[int | None, typer.Option("--port", "-p", min=0, max=65535)] = None,
+    tcp_port: Annotated[
+        int | None, typer.Option("--tcp-port", help="Instead of the settings'.", min=0, max=65535)
+    ] = None,
     hash_password: Annotated[
         bool, typer.Option("--hash-password", help="Prompt for a password and print its hash.")
     ] = False,
@@ -83,7 +85,7 @@ def panel(
             return
         SOCKET.set(Path(os.fsdecode(line.removesuffix(b"\n"))))
     settings = read_settings()
-    wanted = settings.panel if port is None else replace(settings.panel, port=port)
+    wanted = settings.panel if tcp_port is None else replace(settings.panel, port=tcp_port)
     folder = folder_of(settings)
 
     def show_link(link: str) -> None:

@@ -55,11 +55,10 @@ def status(*, json: JsonOption = False) -> None:
 
 @group.command()
 def rename(
-    name: Annotated[str, typer.Argument(help="Letters, digits, spaces, dots, hyphens.")],
-    *,
+    name: Annotated[str, typer.Argument(help="New name: letters, digits, spaces, dots, hyphens.")],
     recording: Annotated[
         str | None,
-        typer.Option("--recording", help="Recording; by default the current or last one."),
+        typer.Argument(help="Recording; by default the current or last one.", show_default=False),
     ] = None,
 ) -> None:
     """Rename a recording; nothing is ever overwritten."""

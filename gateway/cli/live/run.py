@@ -38,9 +38,11 @@ LOG_INTERVAL_S: Final = 10.0
 SWITCH_S: Final = 0.0001
 
 PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines instead of the live view.")]
-ForceOption = Annotated[
+DuplicateIdsOption = Annotated[
     bool,
-    typer.Option("--force", help="Send even if another gateway sends the same vehicle id there."),
+    typer.Option(
+        "--duplicate-ids", help="Send even if another gateway sends the same vehicle id there."
+    ),
 ]
 EndpointOption = Annotated[
     list[str] | None,
@@ -68,7 +70,16 @@ def run_gateway(
         bool, typer.Option("--panel", help="Start the panel too, whatever the settings.")
     ] = False,
 ) -> None:
-    """Run the gateway: for receiver, trackers or a router, until interrupted."""
+    """Run the gateway: for receiver, trackers or a router, until interrupted.
+
+    Our boards: `mavgate run` reads the receiver that is on USB.
+
+    Another tracker: `mavgate run --source crsf:/dev/ttyACM0` makes a vehicle of a radio, a
+    phone or a microcontroller.
+
+    A router: `mavgate run -e serial:/dev/ttyACM0:57600 -e udp:192.168.1.20:14550` passes MAVLink of
+    an autopilot to ground stations.
+    """
     # Read here: a reload runs in another thread, without the context.
     file = CONFIG.get()
 
@@ -113,11 +124,11 @@ def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> Ga
     return msgspec.structs.replace(settings, hub=hub)
 
 
-def refuse_conflicts(systems: Collection[int], settings: GatewaySettings, *, force: bool) -> None:
+def refuse_conflicts(systems: Collection[int], settings: GatewaySettings, *, allowed: bool) -> None:
     """End the command if another gateway sends one of its vehicle ids to the same endpoint."""
     for text in conflicts(systems, settings.hub.endpoints):
-        if not force:
-            refuse(f"{text}; choose another id or endpoint, or --force")
+        if not allowed:
+            refuse(f"{text}; choose another id or endpoint, or --duplicate-ids")
         log.warning("%s", text)
 
 

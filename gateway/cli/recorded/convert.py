@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -98,9 +98,7 @@ def convert(
         list[str] | None,
         _option("--without", "Leave out messages of this name, id or pattern; may be repeated."),
     ] = None,
-    while_state: Annotated[
-        Literal["armed"] | None, _option("--while", "Keep the time while a vehicle is armed.")
-    ] = None,
+    armed: Annotated[bool, _option("--armed", "Keep the time while a vehicle is armed.")] = False,
     modes: Annotated[
         list[str] | None,
         _option("--from-mode", "Keep the time while a vehicle is in this mode; may be repeated."),
@@ -109,7 +107,7 @@ def convert(
         float,
         _option(
             "--margin",
-            "Margin before and after --while and --from-mode, s.",
+            "Margin before and after --armed and --from-mode, s.",
             min=0.0,
             max=MAX_MARGIN_S,
         ),
@@ -160,7 +158,7 @@ def convert(
     anonymiser = None if anonymity is None else Anonymiser(anonymity)
     renumbering = Renumbering(_read_renames(rename), merge=merge_systems) if rename else None
     edits = TlogEdits(
-        choice, _read_state(while_state, modes or [], margin_s), merge,
+        choice, _read_state(modes or [], margin_s, armed=armed), merge,
         tuple(edit for edit in (anonymiser, renumbering) if edit is not None),
     )  # fmt: skip
     _check_edits(edits, output, message or [], system or [])
@@ -201,11 +199,11 @@ def _write(
     return flight
 
 
-def _read_state(state: str | None, modes: Sequence[str], margin_s: float) -> StateChoice | None:
-    if state is None and not modes:
+def _read_state(modes: Sequence[str], margin_s: float, *, armed: bool) -> StateChoice | None:
+    if not (armed or modes):
         return None
     names = frozenset(mode.upper() for mode in modes)
-    return StateChoice(armed=state is not None, modes=names, margin_s=margin_s)
+    return StateChoice(armed=armed, modes=names, margin_s=margin_s)
 
 
 def _read_anonymity(

@@ -12,7 +12,12 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-from gateway.cli.live.run import EndpointOption, ForceOption, refuse_conflicts, with_endpoints
+from gateway.cli.live.run import (
+    DuplicateIdsOption,
+    EndpointOption,
+    refuse_conflicts,
+    with_endpoints,
+)
 from gateway.cli.support.control import ask
 from gateway.cli.support.options import read_options, read_settings
 from gateway.cli.support.recording_options import (
@@ -21,7 +26,6 @@ from gateway.cli.support.recording_options import (
     Files,
     FromOption,
     FuseWithOption,
-    PositionOption,
     ToOption,
     print_remarks,
     progress_of,
@@ -58,7 +62,7 @@ group = typer.Typer(help="Control the running player.", no_args_is_help=True)
 def play(
     files: Files,
     *,
-    speed: Annotated[str, typer.Option("--speed", "-s", help="0.1 to 100, or max.")] = "1",
+    speed: Annotated[str, typer.Option("--speed", help="0.1 to 100, or max.")] = "1",
     begin: FromOption = None,
     end: ToOption = None,
     loop: Annotated[bool, typer.Option("--loop", help="Restart at the end.")] = False,
@@ -69,7 +73,7 @@ def play(
     system: Annotated[
         list[int] | None,
         typer.Option(
-            "--as",
+            "--id",
             min=1,
             max=249,
             help="System id for each recording's first vehicle; its others get the next ids.",
@@ -81,7 +85,6 @@ def play(
     ] = False,
     both: BesideOption = False,
     fuse_with: FuseWithOption = "recorded",
-    position: PositionOption = "causal",
     columns: ColumnsOption = None,
     with_commands: Annotated[
         bool,
@@ -95,7 +98,7 @@ def play(
     ] = False,
     attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
     endpoint: EndpointOption = None,
-    force: ForceOption = False,
+    duplicate_ids: DuplicateIdsOption = False,
 ) -> None:
     """Play one or several recordings to the ground stations.
 
@@ -114,7 +117,7 @@ def play(
             with_commands, commands_anywhere=with_commands,
         )  # fmt: skip
         files = recorded_files(files, "tlogs")
-        options = read_options(gateway, columns, choice=fuse_with, position=position)
+        options = read_options(gateway, columns, choice=fuse_with)
         with progress_of(files) as advance:
             recorded = open_flights(
                 files, replace(options, progress=advance), opened, fuse=fuse, both=both
@@ -122,7 +125,7 @@ def play(
             flights = lay_out(recorded, system or [], with_commands=with_commands)
             prepare(flights, plan)
         played = [system for flight in flights for system in flight.system_ids.values()]
-        refuse_conflicts(played, gateway, force=force)
+        refuse_conflicts(played, gateway, allowed=duplicate_ids)
         if not attached:
             log_other_gateways()
         print_remarks(remark for flight in recorded for remark in flight.remarks)

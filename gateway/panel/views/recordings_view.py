@@ -37,7 +37,7 @@ REFRESH_S: Final = 1.0
 IDLE: Final = "idle"
 MUCH_LOST: Final = 0.05
 """Share of lost samples above which the loss is highlighted."""
-ARMED_OPTIONS: Final = ("--while=armed", "--margin=10")
+ARMED_OPTIONS: Final = ("--armed", "--margin=10")
 FACTS: Final = ("Duration", "Distance", "Height", "Loss")
 
 

@@ -186,7 +186,7 @@ async def test_piped_tables_and_texts_are_never_wrapped(
 
 
 async def test_mark_accepts_negative_coordinates(asked: list[object]) -> None:
-    assert (await run("clients", "mark", "-7.76", "-110.4", "--alt", "-3")) == "marked\n"
+    assert (await run("clients", "mark", "-7.76", "-110.4", "-3")) == "marked\n"
     assert asked == [(-7.76, -110.4, -3.0, None)]
     await run("clients", "mark", "--hight", "3", code=2)
 

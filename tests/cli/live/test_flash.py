@@ -68,7 +68,7 @@ def test_lora_image_holds_its_settings_and_names_its_airtime(images: Path, tmp_p
     ("words", "message"),
     [
         ("imu --vehicle 32", "--vehicle 32: must be 1 to 31"),
-        ("imu --rate 500", "--rate 500: must be 250, 1000, 2000 kbit/s"),
+        ("imu --air-rate 500", "--air-rate 500: must be 250, 1000, 2000 kbit/s"),
         ("imu --power 3", "--power 3: must be -18, -12, -6, 0 dBm"),
         ("imu --gps-rate 5", "--gps-rate: the program imu has no such setting"),
         ("imu --address xyz", "--address xyz"),

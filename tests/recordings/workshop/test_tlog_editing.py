@@ -117,7 +117,7 @@ def test_options_that_fit_nothing_are_refused(
 
 def test_options_of_tlogs_are_refused_for_other_formats(tmp_path: Path) -> None:
     path = write_tlog(tmp_path / "a.tlog", MIXED)
-    for options in (("--without", "HEARTBEAT"), ("--as", "1:2"), ("--while", "armed")):
+    for options in (("--without", "HEARTBEAT"), ("--as", "1:2"), ("--armed",)):
         text = run("convert", path, "-o", tmp_path / "x.kml", *options, code=2)
         assert "ends in .tlog" in text
 
@@ -224,7 +224,7 @@ def test_armed_state_of_a_gimbal_or_a_station_does_not_count() -> None:
 
 
 def test_armed_parts_are_cut_on_the_command_line(tmp_path: Path) -> None:
-    kept, _ = convert(tmp_path, armed_flight((20, 30)), "--while", "armed", "--margin", 2.5)
+    kept, _ = convert(tmp_path, armed_flight((20, 30)), "--armed", "--margin", 2.5)
     assert kept[0].time_us == START_US + 17_500_000
     assert kept[-1].time_us == START_US + 32 * SECOND_US
 
@@ -234,7 +234,7 @@ def test_armed_parts_are_cut_on_the_command_line(tmp_path: Path) -> None:
     [
         (("--from-mode", "auto"), [10, 11, 30, 31]),
         (("--from-mode", "AUTO", "--from-mode", "6"), [10, 11, 20, 21, 30, 31]),
-        (("--from-mode", "AUTO", "--while", "armed"), [30, 31]),
+        (("--from-mode", "AUTO", "--armed"), [30, 31]),
     ],
 )
 def test_time_in_chosen_modes_is_kept(
