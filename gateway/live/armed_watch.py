@@ -3,14 +3,11 @@
 from collections.abc import Set
 from typing import Final
 
-from gateway.units import US_PER_S
-from gateway.vehicle_state.newest import NewestState, NewestVehicles
+from gateway.vehicle_state.newest import HEARTBEAT_TIMEOUT_US, NewestState, NewestVehicles
 from gateway.vehicle_state.positions import RANKS
 from gateway.wire.mavlink_messages import HEARTBEAT_ID
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 
-LOST_US: Final = 300 * US_PER_S
-"""A vehicle without a heartbeat for longer counts as disarmed."""
 SHOWN: Final = 4
 """Maximum vehicles in the name of a recording."""
 WATCHED: Final = frozenset({HEARTBEAT_ID, *RANKS})
@@ -44,7 +41,7 @@ class ArmedWatch:
         return {
             system_id: state
             for system_id, state in self._newest.states.items()
-            if state.is_armed() and state.age_us(now_us, "HEARTBEAT") < LOST_US
+            if state.is_armed() and state.age_us(now_us, "HEARTBEAT") <= HEARTBEAT_TIMEOUT_US
         }
 
 

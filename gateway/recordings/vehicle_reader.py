@@ -2,7 +2,7 @@
 
 It yields, for each vehicle, the positions of its best source, the attitude of its best message, its
 joined texts, and any other requested message. Frames of ground stations and of the other components
-of a system are left out, except for their texts. See `Senders`.
+of a system are left out, except for their texts and the images of cameras. See `Senders`.
 """
 
 import math
@@ -18,12 +18,14 @@ from gateway.records import Quat
 from gateway.vehicle_state.positions import ORIGIN_ID, Position, named_position, position_of
 from gateway.vehicle_state.senders import RecordedSender, Senders, is_station
 from gateway.vehicle_state.status_texts import STATUSTEXT_ID, JoinedText, TextJoiner
-from gateway.wire.mavlink_messages import DEFINITIONS
+from gateway.wire.mavlink_messages import DEFINITIONS, ids_of
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 from gateway.wire.recorded_frames import Batch, RecordedFrame, fields_of
 
 BOOT_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "timestamp": 1000}
 """Fields with the time since boot, and their unit in µs; a civil time in one is ignored."""
+IMAGE_IDS: Final = ids_of("CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED")
+"""Messages about images, which the autopilot or any camera of the system sends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +113,8 @@ class VehicleReader:
             return
         yield from map(_of_text, self._joiner.poll(time_us))
         vehicle = self.vehicle(system_id)
-        if origin != vehicle.origin or is_station(origin, self._senders.stations):
+        is_of_vehicle = origin == vehicle.origin or message_id in IMAGE_IDS
+        if not is_of_vehicle or is_station(origin, self._senders.stations):
             return
         if message_id == ORIGIN_ID and (found := named_position(fields_of(frame))) is not None:
             self._frame_origins[system_id] = found

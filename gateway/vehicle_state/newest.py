@@ -33,6 +33,8 @@ Fields = Mapping[str, Any]
 
 HEARD_US: Final = 60 * US_PER_S
 """Time after its last message at which a vehicle is removed."""
+HEARTBEAT_TIMEOUT_US: Final = 5 * US_PER_S
+"""Time after the last heartbeat, sent once a second, from which a vehicle counts as lost."""
 POSITION_FRESH_US: Final = 3 * US_PER_S
 """Time after a position of a better source for which inferior sources are ignored."""
 POSITION_OLD_US: Final = 5 * US_PER_S

@@ -98,7 +98,9 @@ def convert(
         list[str] | None,
         _option("--without", "Leave out messages of this name, id or pattern; may be repeated."),
     ] = None,
-    armed: Annotated[bool, _option("--armed", "Keep the time while a vehicle is armed.")] = False,
+    armed: Annotated[
+        bool, _option("--armed", "Keep the time while a vehicle is armed, or one of --system.")
+    ] = False,
     modes: Annotated[
         list[str] | None,
         _option("--from-mode", "Keep the time while a vehicle is in this mode; may be repeated."),
@@ -201,6 +203,8 @@ def _write(
 
 def _read_state(modes: Sequence[str], margin_s: float, *, armed: bool) -> StateChoice | None:
     if not (armed or modes):
+        if margin_s:
+            refuse("--margin belongs to --armed and --from-mode")
         return None
     names = frozenset(mode.upper() for mode in modes)
     return StateChoice(armed=armed, modes=names, margin_s=margin_s)

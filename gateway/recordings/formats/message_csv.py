@@ -18,6 +18,8 @@ from gateway.wire.recorded_frames import Batch, columns_of
 
 HEAD: Final = ("time", "system_id", "component_id")
 """Columns before the fields; the time is civil, in UTC, to the microsecond."""
+FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")
+"""Beginnings of a cell that a spreadsheet evaluates."""
 
 
 def write(batches: Iterable[Batch], message_id: int) -> Iterator[bytes]:
@@ -56,11 +58,16 @@ def _columns(batch: Batch, message_id: int) -> Iterator[list[str]]:
     for name in DEFINITIONS[message_id].fieldnames:
         column = values[name]
         if column.dtype.kind == "S":
-            yield [text_of(data) for data in column.tolist()]
+            yield [data_cell(text_of(data)) for data in column.tolist()]
         elif column.ndim > 1:
             yield from column.T.astype(str).tolist()
         else:
             yield column.astype(str).tolist()
+
+
+def data_cell(text: str) -> str:
+    """Return a text of others so that a spreadsheet takes it for data, not for a formula."""
+    return f"'{text}" if text.startswith(FORMULA) else text
 
 
 def csv_lines(rows: Iterable[Iterable[object]]) -> str:

@@ -1,5 +1,6 @@
 """Compare two recordings or parameter files: parameters, missions, figures, texts."""
 
+import codecs
 import html
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from gateway.answers.log_answers import AUTOPILOT_VERSION_ID
+from gateway.printable import printable
 from gateway.recordings.files import FlightError
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.recordings.vehicle_recording import VehicleRecording
@@ -30,6 +32,10 @@ ERROR: Final = 3
 VIBRATION: Final = ("vibration_x", "vibration_y", "vibration_z")
 _IDS: Final = {name: MESSAGE_IDS[name] for name in ("BATTERY_STATUS", "VIBRATION", "GPS_RAW_INT")}
 UNKNOWN_U8: Final = 0xFF
+FIXED_DECIMALS: Final = 6
+"""Decimals of all values in MAVProxy's parameter files."""
+FLOAT_STEP: Final = 2.0**-23
+"""Relative difference of two consecutive single-precision floats."""
 QGC_CELLS: Final = ("vehicle", "component", "name", "value", "type")
 SECTIONS: Final = {"parameters": "parameter", "plans": "item", "figures": "figure", "texts": "text"}
 """Sections of a comparison, and the heading of their first column."""
@@ -46,6 +52,8 @@ class Contents:
     figures: dict[str, str] = field(default_factory=dict)
     texts: set[str] = field(default_factory=set)
     is_flight: bool = False
+    rounded: dict[str, int] = field(default_factory=dict)
+    """Number of decimals to which the value of a parameter may be rounded."""
     defaults: dict[str, str] = field(default_factory=dict)
     """Default values of parameters, where they are known."""
     meanings: dict[str, str] = field(default_factory=dict)
@@ -87,7 +95,12 @@ def compare(first: Contents, second: Contents) -> Comparison:
     only = (first.texts - second.texts, second.texts - first.texts)
     texts = {text: (text, "") for text in sorted(only[0])}
     texts |= {text: ("", text) for text in sorted(only[1])}
-    parameters = _differences(first.parameters, second.parameters)
+    rounded = first.rounded | second.rounded
+    parameters = {
+        name: pair
+        for name, pair in _differences(first.parameters, second.parameters).items()
+        if not (all(pair) and name in rounded and _is_rounded(*pair, rounded[name]))
+    }
     defaults, meanings = first.defaults | second.defaults, first.meanings | second.meanings
     known = {name: (defaults.get(name, ""), meanings.get(name, "")) for name in parameters}
     return Comparison(
@@ -108,13 +121,23 @@ def _differences(first: Mapping[str, str], second: Mapping[str, str]) -> dict[st
     }
 
 
+def _is_rounded(first: str, second: str, decimals: int) -> bool:
+    """Return whether two values are equal as floats that were rounded to some decimals."""
+    one, other = float(first), float(second)
+    return abs(one - other) <= 0.5 * 10.0**-decimals + FLOAT_STEP * abs(one)
+
+
 def read_param_file(path: Path) -> Contents:
     """Read a parameter file of Mission Planner, MAVProxy or QGroundControl.
 
     Raises FlightError if it has no parameters, OSError if it cannot be read.
     """
     with path.open("rb") as file:
-        lines = file.read(MAX_PARAM_FILE).decode("utf-8", "replace").splitlines()
+        data = file.read(MAX_PARAM_FILE)
+    encoding = (
+        "utf-16" if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    )
+    lines = data.decode(encoding, "replace").splitlines()
     found = Contents(str(path))
     for line in lines:
         cells = line.split("#")[0].replace(",", " ").split()
@@ -124,6 +147,8 @@ def read_param_file(path: Path) -> Contents:
         except ValueError:
             continue
         found.parameters[name] = parameter_text(value)
+        if len(decimals := text.partition(".")[2]) >= FIXED_DECIMALS and decimals.isdigit():
+            found.rounded[name] = len(decimals)
     if not found.parameters:
         raise FlightError(f"{path}: contains no parameters")
     return found
@@ -256,7 +281,7 @@ def rows_of(found: Comparison, section: str) -> tuple[tuple[str, ...], list[tupl
 
 def as_html(found: Comparison) -> Iterator[str]:
     """Write a comparison as one self-contained page."""
-    title = html.escape(" and ".join(found.names))
+    title = _escaped(" and ".join(found.names))
     yield f'<!doctype html><meta charset="utf-8"><title>{title}</title>'
     yield "<style>body{font-family:sans-serif}td,th{text-align:left;padding:2px 12px}</style>"
     for section in SECTIONS:
@@ -265,7 +290,17 @@ def as_html(found: Comparison) -> Iterator[str]:
 
 
 def _html_table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
-    yield "<table><tr>" + "".join(f"<th>{html.escape(head)}</th>" for head in heads) + "</tr>\n"
+    yield (
+        "<table><tr>"
+        + "".join(f"<th>{html.escape(printable(head))}</th>" for head in heads)
+        + "</tr>\n"
+    )
     for row in rows:
-        yield "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>\n"
+        yield (
+            "<tr>" + "".join(f"<td>{html.escape(printable(cell))}</td>" for cell in row) + "</tr>\n"
+        )
     yield "</table>\n"
+
+
+def _escaped(text: str) -> str:
+    return html.escape(printable(text))

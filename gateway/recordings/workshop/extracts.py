@@ -10,6 +10,7 @@
 
 import json
 import math
+import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +31,9 @@ from gateway.vehicle_state.senders import RecordedSender
 from gateway.wire.recorded_frames import fields_of
 
 END_US: Final = 1 << 62
+UNKNOWN_INT: Final = (1 << 31) - 1
+"""An unknown coordinate of MISSION_ITEM_INT."""
+_NOT_IN_NAMES: Final = re.compile(r"[^\x21-\x7e]|[,#]|^[=+@-]")
 _INTEGERS: Final = {1: "<Bxxx", 2: "<bxxx", 3: "<Hxx", 4: "<hxx", 5: "<I", 6: "<i"}
 """Encoding of an integer in the four bytes of a value, by MAV_PARAM_TYPE."""
 POLYGONS: Final = {
@@ -110,10 +114,15 @@ class RecordedPlan:
         return bool(self.heartbeat[1] == mavlink.MAV_AUTOPILOT_PX4)
 
 
+def _file_name(name: str) -> str:
+    """Return a parameter's name with the characters escaped that a file of them cannot hold."""
+    return _NOT_IN_NAMES.sub(lambda found: f"\\x{ord(found[0]):02x}", name)
+
+
 def param_file(parameters: Iterable[RecordedParameter]) -> Iterator[str]:
     """Write parameters in the format of Mission Planner and MAVProxy."""
     for parameter in parameters:
-        yield f"{parameter.name},{parameter.text}\n"
+        yield f"{_file_name(parameter.name)},{parameter.text}\n"
 
 
 def qgc_params(parameters: Iterable[RecordedParameter], plan: RecordedPlan) -> Iterator[str]:
@@ -121,15 +130,15 @@ def qgc_params(parameters: Iterable[RecordedParameter], plan: RecordedPlan) -> I
     yield f"# Onboard parameters for Vehicle {plan.system_id}\n#\n"
     yield "# Vehicle-Id Component-Id Name Value Type\n"
     for each in parameters:
-        cells = (plan.system_id, plan.component_id, each.name, each.text, each.kind)
+        cells = (plan.system_id, plan.component_id, _file_name(each.name), each.text, each.kind)
         yield "\t".join(map(str, cells)) + "\n"
 
 
 def waypoints(items: Sequence[Item]) -> Iterator[str]:
-    """Write items as a list of waypoints."""
+    """Write items as a list of waypoints, with 0 for an unknown number."""
     yield "QGC WPL 110\n"
     for number, item in enumerate(items):
-        numbers = (f"{value:.8f}" for value in item.numbers)
+        numbers = (f"{value or 0.0:.8f}" for value in _numbers(item))
         head = (number, int(number == 0), item.frame, item.command)
         yield "\t".join([*map(str, head), *numbers, str(item.autocontinue)]) + "\n"
 
@@ -137,21 +146,24 @@ def waypoints(items: Sequence[Item]) -> Iterator[str]:
 def qgc_plan(plan: RecordedPlan) -> str:
     """Write mission, fence and rally points as a QGroundControl plan."""
     items, at = plan.items(MISSION), plan.home()
-    home: tuple[float, ...] = (0, 0, 0) if at is None else (at.lat_deg, at.lon_deg, at.alt_amsl_m)
+    home: list[float | None] = [None, None, None]
+    if at is not None:
+        home = [_known(value) for value in (at.lat_deg, at.lon_deg, at.alt_amsl_m)]
     is_ardupilot = plan.heartbeat[1] == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
     if is_ardupilot and items:
-        # ArduPilot's first item is home.
-        home, items = items[0].numbers[4:], items[1:]
+        # ArduPilot's first item is home; without one it is 0, 0.
+        home = _numbers(items[0])[4:] if any(items[0].numbers[4:6]) else home
+        items = items[1:]
     mission = {
         "version": 2,
         "firmwareType": plan.heartbeat[1],
         "vehicleType": plan.heartbeat[0],
         "cruiseSpeed": CRUISE_MPS,
         "hoverSpeed": HOVER_MPS,
-        "plannedHomePosition": list(home),
+        "plannedHomePosition": home,
         "items": [_simple_item(item, number) for number, item in enumerate(items, 1)],
     }
-    rally = [list(item.numbers[4:]) for item in plan.items(RALLY)]
+    rally = [_numbers(item)[4:] for item in plan.items(RALLY)]
     content = {
         "fileType": "Plan", "version": 1, "groundStation": "mavgate", "mission": mission,
         "geoFence": {"version": 2, **_fence(plan.items(FENCE))},
@@ -160,11 +172,21 @@ def qgc_plan(plan: RecordedPlan) -> str:
     return json.dumps(content, indent=4, allow_nan=False) + "\n"
 
 
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _numbers(item: Item) -> list[float | None]:
+    """Return the seven parameters of an item; None for those that are unknown."""
+    *params, x, y, z = map(_known, item.numbers)
+    at = (None if raw == UNKNOWN_INT else value for raw, value in ((item.x, x), (item.y, y)))
+    return [*params, *at, z]
+
+
 def _simple_item(item: Item, number: int) -> Mapping[str, Any]:
-    params = [value if math.isfinite(value) else None for value in item.numbers]
     return {
         "type": "SimpleItem", "doJumpId": number, "command": item.command, "frame": item.frame,
-        "autoContinue": bool(item.autocontinue), "params": params,
+        "autoContinue": bool(item.autocontinue), "params": _numbers(item),
     }  # fmt: skip
 
 
@@ -174,16 +196,17 @@ def _fence(items: Sequence[Item]) -> dict[str, Any]:
     found: dict[str, Any] = {"polygons": polygons, "circles": circles}
     left = 0
     for item in items:
-        at = list(item.numbers[4:6])
+        params = _numbers(item)
+        first, at = params[0], params[4:6]
         if item.command in POLYGONS:
             if not left:
-                left, inclusion = int(item.params[0]), POLYGONS[item.command]
+                left, inclusion = int(first or 0), POLYGONS[item.command]
                 polygons.append({"version": 1, "inclusion": inclusion, "polygon": []})
             polygons[-1]["polygon"].append(at)
             left = max(left - 1, 0)
         elif item.command in CIRCLES:
-            circle = {"center": at, "radius": item.params[0]}
+            circle = {"center": at, "radius": first}
             circles.append({"version": 1, "inclusion": CIRCLES[item.command], "circle": circle})
         elif item.command == mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT:
-            found["breachReturn"] = list(item.numbers[4:])
+            found["breachReturn"] = params[4:]
     return found

@@ -6,12 +6,16 @@ its two times is the offset of the clocks plus the difference of the delays. Mos
 the same difference, so the densest second of all differences is found, and its median is the
 offset. A sample of the frames suffices: those whose last two bytes, part of a checksum or a
 signature, are divisible by a power of two that grows with the file.
+
+Two flights may contain equal frames as well: the texts of a start, for example. So files are of one
+flight only if there are copies during a fair share of the time that both cover, and if the clocks
+agree, except where the user states that it is one flight: a clock may be set to another time zone.
 """
 
 import heapq
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from operator import itemgetter
 from typing import Final
@@ -19,9 +23,9 @@ from typing import Final
 import numpy as np
 
 from gateway.recordings.tlog import TlogScanner, encode_record
-from gateway.units import US_PER_S
+from gateway.units import US_PER_S, counted
 from gateway.wire.frame_scan import TIME_SIZE
-from gateway.wire.recorded_frames import Batch, RecordedFrame
+from gateway.wire.recorded_frames import Batch, IntArray, RecordedFrame
 
 MAX_SAMPLE: Final = 50_000
 """Maximum number of frames in the sample of a file, about 10 MB."""
@@ -29,6 +33,12 @@ WINDOW_US: Final = US_PER_S
 """Maximum time between copies of a frame, once the clocks are aligned."""
 LEAST_COPIES: Final = 10
 """Fewer equal frames may be a coincidence: parameters are the same in every flight."""
+FAIR_SHARE: Final = 0.25
+"""Least share of the common time with copies in files of one flight; a link may lose most."""
+MAX_OFFSET_US: Final = 1800 * US_PER_S
+"""Greatest offset of clocks that are set to the same time, if not well."""
+FRAMES_PER_BIN: Final = 4
+"""Frames of the sample in each interval of the common time, in which a copy is expected."""
 MAX_PENDING: Final = 100_000
 """Maximum number of frames held to find copies; a file may give all its frames the same time."""
 PIECE: Final = 4096
@@ -76,32 +86,61 @@ class ClockOffset:
     """Offset to add to the times of the file, µs."""
     copies: int
     """Number of frames of the sample that are in both files."""
+    share: float = 1.0
+    """Share of the time that both files cover in which there are copies."""
+
+    @property
+    def fault(self) -> str:
+        """Why the files are not of one flight, independent of the clocks; empty if they may be."""
+        if self.share >= FAIR_SHARE:
+            return ""
+        return f"its {counted(self.copies, 'equal frame')} are in {self.share:.0%} of the time only"
 
 
 def clock_offset(sample: FrameSample, reference: FrameSample) -> ClockOffset | None:
     """Estimate the offset of a file's clock; None if too few frames are copies."""
-    differences = np.sort(
-        [
-            there_us - here_us
-            for frame, here_us in sample.frames.items()
-            if here_us is not None and (there_us := reference.frames.get(frame)) is not None
-        ]
-    )
-    if len(differences) < LEAST_COPIES:
+    both = [
+        (there_us, there_us - here_us)
+        for frame, here_us in sample.frames.items()
+        if here_us is not None and (there_us := reference.frames.get(frame)) is not None
+    ]
+    if len(both) < LEAST_COPIES:
         return None
+    times, differences = np.array(both)[np.argsort([each[1] for each in both])].T
     counts = np.searchsorted(differences, differences + WINDOW_US, "right")
     counts -= np.arange(len(differences))
     best = int(np.argmax(counts))
     count = int(counts[best])
     if count < LEAST_COPIES:
         return None
-    return ClockOffset(int(np.median(differences[best : best + count])), count)
+    offset_us = int(np.median(differences[best : best + count]))
+    share = _share(times[best : best + count], offset_us, sample, reference)
+    return ClockOffset(offset_us, count, share)
+
+
+def _share(
+    copied_us: IntArray, offset_us: int, sample: FrameSample, reference: FrameSample
+) -> float:
+    """Return the share of the common time with copies; both times are on the reference's clock."""
+    begin_us = max((sample.first_us or 0) + offset_us, reference.first_us or 0)
+    end_us = min((sample.last_us or 0) + offset_us, reference.last_us or 0)
+    frames = min(
+        sum(begin_us <= (time_us or 0) + shift_us <= end_us for time_us in one.frames.values())
+        for one, shift_us in ((sample, offset_us), (reference, 0))
+    )
+    bins = max(min((end_us - begin_us) // US_PER_S, frames // FRAMES_PER_BIN), 1)
+    found, _ = np.histogram(copied_us, bins, (begin_us, max(end_us, begin_us + 1)))
+    return float(np.count_nonzero(found)) / bins
 
 
 @dataclass(slots=True)
 class Alignment:
     """The relation of the clocks of one flight's files."""
 
+    is_one_flight: bool = False
+    """Whether the user states that it is one flight, whatever the clocks."""
+    faults: dict[int, str] = field(default_factory=dict)
+    """Why a file with equal frames is not taken as a part of the same flight, by its number."""
     samples: list[FrameSample] = field(default_factory=list)
     offsets: list[ClockOffset | None] = field(default_factory=list)
     """Offset of each file to the first one; None if no frame is copied in another file."""
@@ -113,11 +152,22 @@ class Alignment:
             sample.add(batch)
         found: list[ClockOffset] = []
         for earlier, known in zip(self.samples, self.offsets, strict=True):
-            if (offset := clock_offset(sample, earlier)) is not None:
-                base_us = known.offset_us if known else 0
-                found.append(ClockOffset(offset.offset_us + base_us, offset.copies))
+            if (offset := clock_offset(sample, earlier)) is None:
+                continue
+            if fault := self._fault_of(offset):
+                self.faults[len(self.samples)] = fault
+                continue
+            base_us = known.offset_us if known else 0
+            found.append(replace(offset, offset_us=offset.offset_us + base_us))
         self.samples.append(sample)
         self.offsets.append(max(found, key=lambda each: each.copies, default=None))
+
+    def _fault_of(self, offset: ClockOffset) -> str:
+        if not (fault := offset.fault) and not self.is_one_flight:
+            shift_s = offset.offset_us / US_PER_S
+            if abs(offset.offset_us) > MAX_OFFSET_US:
+                fault = f"the clocks differ by {shift_s:+.0f} s; if it is one flight, give --merge"
+        return fault
 
     @property
     def shifts_us(self) -> list[int]:

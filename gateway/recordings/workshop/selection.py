@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, time_us_of
+from gateway.vehicle_state.newest import HEARTBEAT_TIMEOUT_US
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS
@@ -101,19 +102,35 @@ class StateChoice:
 
     def includes(self, beat: Any) -> bool:
         """Return whether the time after this heartbeat is selected."""
-        number = int(beat["custom_mode"])
-        mode = mode_name(int(beat["autopilot"]), int(beat["type"]), number)
-        return (
-            not self.armed or bool(beat["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        ) and (not self.modes or not self.modes.isdisjoint((mode, str(number))))
+        is_armed = bool(beat["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        is_in_mode = not self.modes or not self.modes.isdisjoint(mode_of(beat))
+        return (is_armed or not self.armed) and is_in_mode
 
 
 class ChosenState:
-    """Whether any vehicle is in the selected state, from the heartbeats of the autopilots."""
+    """Whether any vehicle is in the selected state, from the heartbeats of the autopilots.
 
-    def __init__(self, senders: Senders, choice: StateChoice) -> None:
-        self._senders, self._choice = senders, choice
-        self._chosen: set[int] = set()
+    A state ends `HEARTBEAT_TIMEOUT_US` after the last heartbeat. `systems` restricts it to these
+    vehicles; if it is empty, to none.
+    """
+
+    def __init__(
+        self, senders: Senders, choice: StateChoice, systems: frozenset[int] = frozenset()
+    ) -> None:
+        self.choice = choice
+        self.modes: set[str] = set()
+        """Modes that occurred, by name, or as a number without one."""
+        self._senders, self._systems = senders, systems
+        self._until_us: dict[int, int] = {}
+        """End of the selected state, by sender."""
+
+    @property
+    def unknown(self) -> str:
+        """Text about selected modes that did not occur; empty if there are none."""
+        names = {part for mode in self.modes for part in mode.split()}
+        missing = ", ".join(sorted(self.choice.modes - names))
+        listed = ", ".join(sorted(self.modes))
+        return missing and f"no vehicle was in mode {missing}; the modes are {listed or 'unknown'}"
 
     def during(self, batch: Batch) -> BoolArray:
         """Return for each record whether a vehicle is in the state at that time."""
@@ -122,29 +139,41 @@ class ChosenState:
         at = 0
         for row, beat in zip(rows.tolist(), columns_of(batch, rows, HEARTBEAT_ID), strict=True):
             origin = int(batch.origins[row])
-            if origin != self._senders.vehicle(origin >> 8).origin:
+            is_chosen = not self._systems or origin >> 8 in self._systems
+            if not is_chosen or origin != self._senders.vehicle(origin >> 8).origin:
                 continue
-            found[at:row] = bool(self._chosen)
+            found[at:row] = batch.time_us[at:row] <= self._end_us
             at = row
-            if self._choice.includes(beat):
-                self._chosen.add(origin)
+            name, number = mode_of(beat)
+            self.modes.add(f"{name} {number}".strip())
+            if self.choice.includes(beat):
+                self._until_us[origin] = int(batch.time_us[row]) + HEARTBEAT_TIMEOUT_US
             else:
-                self._chosen.discard(origin)
-        found[at:] = bool(self._chosen)
+                self._until_us.pop(origin, None)
+        found[at:] = batch.time_us[at:] <= self._end_us
         return found
 
+    @property
+    def _end_us(self) -> int:
+        return max(self._until_us.values(), default=_LONG_AGO_US)
 
-def while_in_state(
-    batches: Iterable[Batch], senders: Senders, choice: StateChoice
-) -> Iterator[Batch]:
+
+def mode_of(beat: Any) -> tuple[str, str]:
+    """Return the mode in a heartbeat by name, empty if it has none, and as a number."""
+    number = int(beat["custom_mode"])
+    return mode_name(int(beat["autopilot"]), int(beat["type"]), number), str(number)
+
+
+def while_in_state(batches: Iterable[Batch], state: ChosenState) -> Iterator[Batch]:
     """Yield the records while a vehicle is in a state, with a margin before and after.
 
     Batches are held until their records are older than the margin; raises ValueError if the margin
     is too long.
     """
-    if not 0.0 <= choice.margin_s <= MAX_MARGIN_S:
-        raise ValueError(f"a margin of {choice.margin_s:g} s; 0 to {MAX_MARGIN_S:g}")
-    state, margin_us = ChosenState(senders, choice), math.ceil(choice.margin_s * 1e6)
+    margin_s = state.choice.margin_s
+    if not 0.0 <= margin_s <= MAX_MARGIN_S:
+        raise ValueError(f"a margin of {margin_s:g} s; 0 to {MAX_MARGIN_S:g}")
+    margin_us = math.ceil(margin_s * 1e6)
     held: deque[tuple[Batch, BoolArray]] = deque()
     newest_us = _LONG_AGO_US
     for batch in batches:

@@ -3,20 +3,23 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.printable import UNKNOWN, figure
-from gateway.recordings.formats.message_csv import csv_lines
+from gateway.printable import UNKNOWN, figure, printable
+from gateway.recordings.formats.message_csv import csv_lines, data_cell
 from gateway.recordings.moment import iso_time
+from gateway.recordings.tlog import DAY_US
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.records import NAN
 from gateway.units import DEGE7_PER_DEG, US_PER_S
 from gateway.vehicle_state.newest import NewestState
-from gateway.vehicle_state.positions import GroundDistance, Position
+from gateway.vehicle_state.positions import GroundDistance, Position, is_located
+from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS, MESSAGE_NAMES
+from gateway.wire.mavlink_splitter import origin_of
 
 REACHED_ID: Final = MESSAGE_IDS["MISSION_ITEM_REACHED"]
 LANDED_ID: Final = MESSAGE_IDS["EXTENDED_SYS_STATE"]
@@ -50,7 +53,7 @@ def texts(messages: Iterable[VehicleMessage]) -> str:
     """Write the texts as CSV, with their time, sender and severity."""
     found = [
         (iso_time(m.time_us), m.text.origin >> 8, m.text.origin & 0xFF, m.text.severity,
-         m.text.text)
+         data_cell(printable(m.text.text)))
         for m in messages
         if m.text is not None
     ]  # fmt: skip
@@ -82,24 +85,34 @@ def _event_values(message: VehicleMessage) -> list[tuple[str, str]]:
 
 
 def images(messages: Iterable[VehicleMessage]) -> str:
-    """Write the location of each image as CSV: CAMERA_FEEDBACK has angles, the other one names."""
-    found: list[tuple[object, ...]] = []
+    """Write the location of each image as CSV: CAMERA_FEEDBACK has angles, the other one names.
+
+    An image that was sent several times is one image, at the camera's time for it.
+    """
+    found: dict[tuple[object, ...], tuple[object, ...]] = {}
     for message in messages:
-        fields, at = message.fields, iso_time(message.time_us)
+        fields = message.fields
         if message.message_id == CAMERA_FEEDBACK_ID:
-            lat_deg, lon_deg = fields["lat"] / DEGE7_PER_DEG, fields["lng"] / DEGE7_PER_DEG
-            angles = fields["roll"], fields["pitch"], fields["yaw"]
-            located = fields["img_idx"], "", lat_deg, lon_deg, fields["alt_msl"], fields["alt_rel"]
-            found.append((at, message.system_id, *located, *angles))
+            time_us, name = fields["time_usec"], ""
+            number, lon_dege7 = fields["img_idx"], fields["lng"]
+            heights, angles = (fields["alt_msl"], fields["alt_rel"]), ["roll", "pitch", "yaw"]
         elif message.message_id == CAPTURED_ID and fields["capture_result"] == 1:
-            name = fields["file_url"].decode("utf-8", "replace")
-            lat_deg, lon_deg = fields["lat"] / DEGE7_PER_DEG, fields["lon"] / DEGE7_PER_DEG
-            heights = fields["alt"] / 1e3, fields["relative_alt"] / 1e3
-            located = fields["image_index"], name, lat_deg, lon_deg, *heights
-            found.append((at, message.system_id, *located, "", "", ""))
+            time_us, name = fields["time_utc"], data_cell(printable(text_of(fields["file_url"])))
+            number, lon_dege7 = fields["image_index"], fields["lon"]
+            heights, angles = (fields["alt"] / 1e3, fields["relative_alt"] / 1e3), []
+        else:
+            continue
+        place: tuple[object, ...] = ("", "", "", "")
+        if is_located(fields["lat"], lon_dege7):
+            place = (fields["lat"] / DEGE7_PER_DEG, lon_dege7 / DEGE7_PER_DEG, *heights)
+        at_us = time_us if abs(time_us - message.time_us) < DAY_US else message.time_us
+        row = (message.system_id, number, name, *place, *(fields[each] for each in angles))
+        same = (origin_of(message.frame), time_us, *row)
+        found.setdefault(same, (at_us, *row, *[""] * (3 - len(angles))))
     columns = ("time", "system", "image", "file", "lat_deg", "lon_deg", "alt_amsl_m",
                "alt_home_m", "roll_deg", "pitch_deg", "yaw_deg")  # fmt: skip
-    return csv_lines([columns, *found])
+    rows = sorted(found.values(), key=lambda row: cast(int, row[0]))
+    return csv_lines([columns, *((iso_time(cast(int, at)), *row) for at, *row in rows)])
 
 
 class _Shown:

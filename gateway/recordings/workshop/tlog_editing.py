@@ -14,7 +14,13 @@ from gateway.recordings.files import FlightError, Progress, TlogSource
 from gateway.recordings.tlog import encode_record
 from gateway.recordings.workshop.editing import FrameEdit
 from gateway.recordings.workshop.merging import WINDOW_US, Alignment, Copies, batched, by_time
-from gateway.recordings.workshop.selection import FrameChoice, StateChoice, while_in_state, within
+from gateway.recordings.workshop.selection import (
+    ChosenState,
+    FrameChoice,
+    StateChoice,
+    while_in_state,
+    within,
+)
 from gateway.recordings.workshop.trimming import NOTHING_WITHIN, Limits
 from gateway.units import US_PER_S, counted
 from gateway.vehicle_state.senders import Senders
@@ -54,13 +60,18 @@ class TlogEditor:
         if len(sources) == 1:
             yield from self._intact(sources[0], progress)
             return
-        alignment = Alignment()
+        merge = self._edits.merge
+        alignment = Alignment(is_one_flight=bool(merge))
         for source in sources:
             alignment.add(source.batches())
-        merge = self._edits.merge
         if merge is None:
-            overlap_us = alignment.overlap_us(alignment.shifts_us)
-            merge = overlap_us > WINDOW_US
+            is_joined = alignment.faults and not any(alignment.offsets)
+            merge = not is_joined and alignment.overlap_us(alignment.shifts_us) > WINDOW_US
+        if self._edits.merge is not False:
+            for number, fault in alignment.faults.items():
+                if alignment.offsets[number] is None:
+                    text = f"is taken for another flight, as {fault}; its times are kept"
+                    self._remark(f"{sources[number].path}: {text}")
         shifts_us = _after_1970(alignment) if merge else [0] * len(sources)
         ordered = [sources[number] for number in alignment.order(shifts_us)]
         if alignment.overlap_us(shifts_us) <= 0:
@@ -93,14 +104,21 @@ class TlogEditor:
                 yield batch
 
         cut: Iterable[Batch] = within(all_records(), self._limits)
+        state = None
         if edits.state is not None:
-            cut = while_in_state(cut, senders, edits.state)
+            state = ChosenState(senders, edits.state, edits.choice.systems)
+            cut = while_in_state(cut, state)
         for batch in map(edits.choice.apply, cut):
             kept += len(batch)
             yield batch
+        unknown = "" if state is None else state.unknown
         if not kept:
+            if unknown:
+                raise FlightError(unknown)
             is_cut = self._limits != (None, None) and edits.are_none
             raise FlightError(NOTHING_WITHIN if is_cut else NOTHING_LEFT)
+        if unknown:
+            self._remark(unknown)
         if not edits.are_none:
             kept -= self._left_out()
             self._remark(f"kept {kept} of {counted(total, 'record')}")
@@ -147,7 +165,10 @@ class TlogEditor:
     def _remark_merge(
         self, sources: Sequence[TlogSource], alignment: Alignment, copies: Copies
     ) -> None:
-        for source, offset in list(zip(sources, alignment.offsets, strict=True))[1:]:
+        for number, offset in enumerate(alignment.offsets[1:], 1):
+            source = sources[number]
+            if offset is None and number in alignment.faults:
+                continue
             if offset is None:
                 self._remark(f"{source.path}: has too few copies to compare clocks; times are kept")
             else:

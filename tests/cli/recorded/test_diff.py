@@ -73,14 +73,19 @@ def test_equal_recordings_have_no_differences(flights: tuple[Path, Path], tmp_pa
     assert "no differences" in run("diff", flights[0], copy)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 @pytest.mark.parametrize(
-    "content", ["A,0.1\nB,5\n", "A 0.1\nB 5\n", "# x\n1\t1\tA\t0.1\t9\n1\t1\tB\t5\t9\n"]
+    "content",
+    [
+        *("A,0.1\nB,5\n", "A 0.1\nB 5\n", "# x\n1\t1\tA\t0.1\t9\n1\t1\tB\t5\t9\n"),
+        *("A 0.100000\nB 5.000000\n", "A,0.1000004 # text\n#NOTE: x\nB,5\n"),
+    ],
 )
 def test_recording_is_compared_with_a_parameter_file(
-    flights: tuple[Path, Path], tmp_path: Path, content: str
+    flights: tuple[Path, Path], tmp_path: Path, content: str, encoding: str
 ) -> None:
     path = tmp_path / "x.param"
-    path.write_text(content)
+    path.write_text(content.replace("0.1000004", "0.10000000149"), encoding)
     found = json.loads(run("diff", flights[0], path, "--json"))
     assert found["parameters"] == {"B": ["2", "5"]}
     assert found["figures"] == found["texts"] == {}

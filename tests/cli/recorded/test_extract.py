@@ -163,6 +163,56 @@ def test_texts_events_and_images_are_rows_of_csv(tlog: Path, tmp_path: Path) -> 
     assert float(images[1]["alt_home_m"]) == 50.0
 
 
+def captured(number: int, utc_us: int, lat: int = E7[0], name: bytes = b"") -> Any:
+    at = (lat, E7[1] if lat else 0)
+    return mavlink.MAVLink_camera_image_captured_message(
+        1, utc_us, 1, *at, 550_000, 50_000, [1, 0, 0, 0], number, 1, name)  # fmt: skip
+
+
+def test_each_image_of_any_camera_is_one_row_at_its_own_time(tmp_path: Path) -> None:
+    second, camera = 1_000_000, Sender(component=100)
+    sent = [
+        *(captured(k, START_US + k * second) for k in (0, 2, 1, 0)), captured(0, 0, E7[0] + 1),
+        captured(0, 0, E7[0] + 1), captured(3, START_US + 3 * second, 0, b"=1+1\x1b"),
+    ]  # fmt: skip
+    beat = Sender().pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
+    records = records_of([beat, *map(camera.pack, sent)], 10 * second)
+    path, out = write_tlog(tmp_path / "a.tlog", records), tmp_path / "images.csv"
+    run("extract", path, "--images", out)
+    rows = list(csv.DictReader(out.read_text().splitlines()))
+    assert [(int(row["image"]), row["time"][-7:]) for row in rows] == [
+        *((k, f"2{k}.000Z") for k in (0, 1, 2, 3)), (0, "10.000Z"),
+    ]  # fmt: skip
+    assert (rows[3]["lat_deg"], rows[3]["alt_amsl_m"], rows[3]["file"]) == ("", "", "'=1+1\\x1b")
+
+
+def test_unknown_numbers_and_hostile_names_stay_data(tmp_path: Path) -> None:
+    nan, unknown = float("nan"), (1 << 31) - 1
+    messages = [
+        mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3),
+        mavlink.MAVLink_param_value_message(b"A\nB,1\x1b", 1.0, 9, 2, 0),
+        mavlink.MAVLink_param_value_message(b"=C", 2.0, 9, 2, 1),
+        mavlink.MAVLink_statustext_message(6, b"=cmd()"),
+        mavlink.MAVLink_mission_count_message(255, 190, 1, 0),
+        item(0, 0, 16, (unknown, unknown), nan),
+        mavlink.MAVLink_mission_count_message(255, 190, 1, 2),
+        item(0, 2, 5100, E7, nan),
+    ]
+    path = written(tmp_path, messages)
+    outs = [tmp_path / name for name in ("a.param", "a.waypoints", "a.plan", "a.csv")]
+    run("extract", path, "--params", outs[0], "--mission", outs[1], "--texts", outs[3])
+    run("extract", path, "--mission", outs[2])
+    params, waypoints, plan, texts = (out.read_text() for out in outs)
+    assert params.splitlines() == ["\\x3dC,2", "A\\x0aB\\x2c1\\x1b,1"]
+    assert "nan" not in waypoints
+    assert waypoints.split("\t")[8:11] == ["0.00000000"] * 3
+    found = json.loads(plan, parse_constant=lambda name: pytest.fail(name))
+    assert found["mission"]["plannedHomePosition"] == [None, None, None]
+    assert found["mission"]["items"][0]["params"][4:] == [None, None, None]
+    assert found["rallyPoints"]["points"][0][2] is None
+    assert texts.splitlines()[1].endswith(",'=cmd()")
+
+
 def parsed_srt(text: str) -> list[tuple[float, float, str]]:
     """Read SubRip by its rules: a number, a line with two times, text, and an empty line."""
     found = []

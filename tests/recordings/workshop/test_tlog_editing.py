@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 from os import SEEK_END
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
@@ -16,6 +17,7 @@ from gateway.recordings.workshop.editing import Renumbering
 from gateway.recordings.workshop.merging import MAX_SAMPLE, Alignment, FrameSample, batched
 from gateway.recordings.workshop.selection import (
     MAX_MARGIN_S,
+    ChosenState,
     FrameChoice,
     StateChoice,
     message_ids_of,
@@ -105,6 +107,8 @@ def test_chosen_frames_are_kept_byte_for_byte(
         (("--as", "1:2"), "systems 1 and 2 of the recording would both be system 2"),
         (("--as", "1:9", "--as", "2:9"), "--merge-systems"),
         (("--margin", MAX_MARGIN_S + 1), "--margin"),
+        (("--margin", 5), "--margin belongs to --armed"),
+        (("--from-mode", "ATUO"), "no vehicle was in mode ATUO; the modes are "),
     ],
 )
 def test_options_that_fit_nothing_are_refused(
@@ -209,7 +213,8 @@ def test_cut_to_armed_time_keeps_the_margin_on_both_sides(
     data, scanner = make_tlog(records), TlogScanner()
     batches = [scanner.feed(data[at : at + piece]) for at in range(0, len(data), piece)]
     batches.append(scanner.feed(b"", final=True))
-    cut = while_in_state(batches, senders_of(data), StateChoice(armed=True, margin_s=margin_s))
+    state = ChosenState(senders_of(data), StateChoice(armed=True, margin_s=margin_s))
+    cut = while_in_state(batches, state)
     found = [(r.time_us - START_US) / SECOND_US for batch in cut for r in batch.records()]
     assert found == [half / 2 for begin, end in kept_s for half in range(2 * begin, 2 * end)]
 
@@ -219,7 +224,8 @@ def test_armed_state_of_a_gimbal_or_a_station_does_not_count() -> None:
     gimbal = mavlink.MAVLink_heartbeat_message(26, 8, 128, 0, 4, 3)
     records = records_sent([((1, 1), disarmed), *[((1, 154), gimbal)] * 20])
     senders = senders_of(make_tlog(records))
-    cut = while_in_state([batch_of(records)], senders, StateChoice(armed=True))
+    state = ChosenState(senders, StateChoice(armed=True))
+    cut = while_in_state([batch_of(records)], state)
     assert sum(map(len, cut)) == 0
 
 
@@ -235,6 +241,7 @@ def test_armed_parts_are_cut_on_the_command_line(tmp_path: Path) -> None:
         (("--from-mode", "auto"), [10, 11, 30, 31]),
         (("--from-mode", "AUTO", "--from-mode", "6"), [10, 11, 20, 21, 30, 31]),
         (("--from-mode", "AUTO", "--armed"), [30, 31]),
+        (("--from-mode", "AUTO", "--from-mode", "LAND", "--system", "1"), [10, 11, 30, 31]),
     ],
 )
 def test_time_in_chosen_modes_is_kept(
@@ -247,6 +254,31 @@ def test_time_in_chosen_modes_is_kept(
     records = records_sent([((1, 1), message) for message in beats], SECOND_US)
     kept, _ = convert(tmp_path, records, *options)
     assert [(one.time_us - START_US) // SECOND_US for one in kept] == kept_s
+
+
+LOST = [(0, 1, 0), (0, 2, 128), (10, 1, 128), (20, 1, 0), (25, 2, None)]
+"""Second, vehicle and flags from then on: vehicle 2 is armed when it is lost."""
+
+
+@pytest.mark.parametrize(
+    ("options", "last_s"), [((), 30), (("--system", "1"), 20), (("--system", "2"), 24)]
+)
+def test_armed_ends_some_seconds_after_the_last_heartbeat(
+    tmp_path: Path, options: tuple[str, ...], last_s: int
+) -> None:
+    sent: list[tuple[tuple[int, int], Any]] = []
+    for second in range(60):
+        flags = {vehicle: flag for since_s, vehicle, flag in LOST if since_s <= second}
+        beats = [
+            ((vehicle, 1), mavlink.MAVLink_heartbeat_message(2, 3, flag, 0, 4, 3))
+            for vehicle, flag in flags.items()
+            if flag is not None
+        ]
+        sent += [*beats, *[((1, 1), mavlink.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))] * (
+            10 - len(beats))]  # fmt: skip
+    records = records_sent(sent, SECOND_US // 10)
+    kept, _ = convert(tmp_path, records, "--armed", *options)
+    assert (kept[-1].time_us - START_US) / SECOND_US == pytest.approx(last_s, abs=1.0)
 
 
 def two_receivers(offset_us: int, *, loss: int = 7) -> tuple[list[RecordedFrame], ...]:
@@ -262,10 +294,18 @@ def two_receivers(offset_us: int, *, loss: int = 7) -> tuple[list[RecordedFrame]
     return first, second, whole
 
 
-@pytest.mark.parametrize("offset_us", [0, 300_000, -7_200_000_000, 86_400_000_000 * 30])
-def test_files_of_two_receivers_are_merged_without_copies(tmp_path: Path, offset_us: int) -> None:
+@pytest.mark.parametrize(
+    ("offset_us", "option"),
+    [
+        *((0, "--force"), (300_000, "--force"), (-1_200_000_000, "--force")),
+        *((-7_200_000_000, "--merge"), (86_400_000_000 * 30, "--merge")),
+    ],
+)
+def test_files_of_two_receivers_are_merged_without_copies(
+    tmp_path: Path, offset_us: int, option: str
+) -> None:
     first, second, whole = two_receivers(offset_us)
-    kept, text = convert(tmp_path, first, second)
+    kept, text = convert(tmp_path, first, second, option)
     missing = {r.frame for k, r in enumerate(whole) if k % 35 == 0}
     assert [r.frame for r in kept] == [r.frame for r in whole if r.frame not in missing]
     assert all(abs(k.time_us - w.time_us) < 1000 for k, w in zip(
@@ -274,6 +314,36 @@ def test_files_of_two_receivers_are_merged_without_copies(tmp_path: Path, offset
     assert printed is not None
     assert float(printed[1]) == pytest.approx(-offset_us / 1e6, abs=1e-3)
     assert f"left out {len(first) + len(second) - len(kept)} copied frames" in text
+
+
+def test_clocks_that_differ_by_hours_are_not_aligned_unasked(tmp_path: Path) -> None:
+    first, second, _ = two_receivers(-7_200_000_000)
+    kept, text = convert(tmp_path, first, second)
+    assert len(kept) == len(first) + len(second)
+    assert "the clocks differ by +7200 s; if it is one flight, give --merge" in text
+
+
+def two_boots(offset_us: int) -> tuple[list[RecordedFrame], ...]:
+    """Return two flights of which the first second is equal, as after a start in simulation."""
+    flights = []
+    for number, begin_us in enumerate((0, offset_us)):
+        sender = Sender()
+        boot = [sender.pack(mavlink.MAVLink_statustext_message(6, b"%d" % k)) for k in range(14)]
+        rest = [sender.attitude(k + 1000 * number) for k in range(300)]
+        flown = records_of([*boot, *rest], 50_000)
+        flights.append([RecordedFrame(r.time_us + begin_us, r.frame) for r in flown])
+    return tuple(flights)
+
+
+@pytest.mark.parametrize("option", ["--force", "--merge"])
+@pytest.mark.parametrize("offset_us", [3_600_000_000, 60_000_000, 5_000_000])
+def test_flights_with_equal_starts_follow_each_other(
+    tmp_path: Path, offset_us: int, option: str
+) -> None:
+    first, second = two_boots(offset_us)
+    kept, text = convert(tmp_path, first, second, option)
+    assert kept == sorted([*first, *second], key=lambda record: record.time_us)
+    assert "is taken for another flight, as its 14 equal frames are in" in text
 
 
 def test_join_keeps_copies_and_times(tmp_path: Path) -> None:
@@ -416,7 +486,7 @@ def test_edits_that_change_nothing_are_recognised() -> None:
 
 def test_margin_out_of_range_is_refused() -> None:
     with pytest.raises(ValueError, match="margin"):
-        list(while_in_state([], Senders(), StateChoice(margin_s=MAX_MARGIN_S + 1)))
+        list(while_in_state([], ChosenState(Senders(), StateChoice(margin_s=MAX_MARGIN_S + 1))))
 
 
 def test_empty_tlog_is_refused(tmp_path: Path) -> None:
