@@ -3,8 +3,12 @@
 The first station loads parameters, missions and metadata over the link; the answers that pass are
 kept, and further stations are answered from them. For a vehicle that signs, this requires that the
 gateway has its key: requests must be signed with it, and the answers are signed with it too.
+
+Answers are kept for each link separately, since two links may lead to two vehicles with one id.
+Those of a link that has gone are used again when the vehicle returns to the same endpoint.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -31,11 +35,10 @@ CHECK_US: Final = 10 * US_PER_S
 class _Entry:
     """The kept answers of one vehicle."""
 
+    endpoint: str
     live: LiveAnswers
     vehicle: CachedVehicle
     heard_us: int = 0
-    sequence: int = 0
-    """Sequence number of the next answer."""
     key: bytes | None = b""
     """Key with which it signs: empty if it does not sign, None if the gateway lacks the key."""
     checked: tuple[int, int, MavFrame] | None = None
@@ -43,26 +46,32 @@ class _Entry:
 
 
 class AnswerCache:
-    """The kept answers of all vehicles by system id."""
+    """The kept answers of all vehicles by link and system id.
+
+    A link is the client that leads to the vehicle, or the endpoint of one that has gone.
+    """
 
     def __init__(self, signer: FrameSigner) -> None:
         self._signer = signer
-        self._entries: dict[int, _Entry] = {}
+        self._entries: dict[tuple[int | str, int], _Entry] = {}
 
     @staticmethod
     def reads(message_id: int) -> bool:
         """Return whether this cache evaluates a message without a target."""
         return message_id in NOTED_IDS
 
-    def add(self, frame: MavFrame, now_us: int) -> MavFrame | None:
-        """Process a frame of a vehicle; return a request that must still be sent to it."""
+    def add(self, link: int, endpoint: str, frame: MavFrame, now_us: int) -> MavFrame | None:
+        """Process a frame of a vehicle; return a request that must still be sent to it.
+
+        `endpoint` is the location of its link's endpoint.
+        """
         system, component = frame.origin
         if component != AUTOPILOT:
-            entry = self._entries.get(system)
-            if entry is not None and frame.message_id == mavlink.MAVLINK_MSG_ID_PARAM_VALUE:
-                entry.vehicle.other_lists = True
+            known = self._entries.get((link, system))
+            if known is not None and frame.message_id == mavlink.MAVLINK_MSG_ID_PARAM_VALUE:
+                known.vehicle.other_lists = True
             return None
-        entry = self._entry(system)
+        entry = self._entry(link, endpoint, system)
         key = self._signer.key_of(frame) if frame.signed else b""
         if key != entry.key:
             # The kept answers were not signed with this key, so anybody could have sent them.
@@ -78,30 +87,48 @@ class AnswerCache:
         return None
 
     def handle(
-        self, client_id: int, frame: MavFrame, now_us: int, *, may_answer: bool
+        self,
+        client_id: int,
+        frame: MavFrame,
+        now_us: int,
+        links: Sequence[int],
+        *,
+        may_answer: bool,
     ) -> tuple[list[Outgoing], MavFrame | None]:
         """Answer a station's request, or note the values that it writes.
 
-        Returns the answers, and the frame to be sent to the vehicle, if any.
+        `links` lead to the vehicle; the first that can answer does. Returns the answers, and the
+        frame to be sent to the vehicle, if any.
         """
-        entry = self._entries.get(frame.target[0])
-        if entry is None:
-            return [], frame
-        request = entry.vehicle.read(Incoming(client_id, frame.data, trusted=True), now_us)
-        if request is None:
-            return [], frame
-        if may_answer and self._fits(entry, frame) and entry.live.is_fresh(now_us):
+        known = (self._entries.get((link, frame.target[0])) for link in links)
+        entries = [entry for entry in known if entry is not None]
+        incoming = Incoming(client_id, frame.data, trusted=True)
+        requests = [entry.vehicle.read(incoming, now_us) for entry in entries]
+        for entry, request in zip(entries, requests, strict=True):
+            is_usable = may_answer and self._fits(entry, frame) and entry.live.is_fresh(now_us)
+            if request is None or not is_usable:
+                continue
             answers = entry.vehicle.answer(request, now_us)
             if answers is not None:
                 passed = self._check(entry, request, frame, now_us)
-                return [self._numbered(entry, each, now_us) for each in answers], passed
-        entry.live.add_request(request.message, frame, now_us)
+                return [self._sealed(entry, each, now_us) for each in answers], passed
+        for entry, request in zip(entries, requests, strict=True):
+            if request is not None:
+                entry.live.add_request(client_id, request.message, frame, now_us)
         return [], frame
+
+    def asker(self, link: int, frame: MavFrame) -> int | None:
+        """Return the client whose request for a file a frame answers; None if that is not certain.
+
+        Stations that share an id are sent each other's answers otherwise.
+        """
+        entry = self._entries.get((link, frame.origin[0]))
+        return entry.live.asker(frame) if entry is not None else None
 
     def poll(self, now_us: int) -> list[Outgoing]:
         """Return the next answer of every list and file transfer in progress."""
         return [
-            self._numbered(entry, each, now_us)
+            self._sealed(entry, each, now_us)
             for entry in self._entries.values()
             for each in entry.vehicle.poll(now_us)
             if isinstance(each, Outgoing)
@@ -112,18 +139,22 @@ class AnswerCache:
         due = (entry.vehicle.next_due_us() for entry in self._entries.values())
         return min((time_us for time_us in due if time_us is not None), default=None)
 
-    def remove(self, system: int) -> None:
-        """Drop the kept answers of a vehicle, for example when its link gets other options."""
-        self._entries.pop(system, None)
+    def drop(self, link: int) -> None:
+        """Drop all answers of a link, as after a change of its options."""
+        self._entries = {key: entry for key, entry in self._entries.items() if key[0] != link}
 
     def remove_client(self, client_id: int) -> None:
-        """Drop the downloads of a disconnected station."""
-        for entry in self._entries.values():
+        """Drop the downloads of a client that has gone; keep the answers that it brought."""
+        for (link, system), entry in [*self._entries.items()]:
             entry.vehicle.remove_client(client_id)
+            entry.live.remove_client(client_id)
+            if link == client_id:
+                del self._entries[link, system]
+                self._entries[entry.endpoint, system] = entry
 
-    def describe(self, system: int, now_us: int) -> str:
+    def describe(self, link: int, system: int, now_us: int) -> str:
         """List the kept answers of a vehicle with the age of each part; empty if there are none."""
-        entry = self._entries.get(system)
+        entry = self._entries.get((link, system))
         if entry is None or not entry.live.since_us:
             return ""
         live = entry.live
@@ -136,13 +167,16 @@ class AnswerCache:
         )
         return f"system {system}: {', '.join(parts)}"
 
-    def _entry(self, system: int) -> _Entry:
-        entry = self._entries.get(system)
+    def _entry(self, link: int, endpoint: str, system: int) -> _Entry:
+        entry = self._entries.get((link, system))
         if entry is None:
+            entry = self._entries.pop((endpoint, system), None)
             if len(self._entries) >= MAX_VEHICLES:
                 del self._entries[min(self._entries, key=lambda each: self._entries[each].heard_us)]
-            live = LiveAnswers(system)
-            entry = self._entries[system] = _Entry(live, CachedVehicle(system, live))
+            if entry is None:
+                live = LiveAnswers(system)
+                entry = _Entry(endpoint, live, CachedVehicle(system, live))
+            self._entries[link, system] = entry
         return entry
 
     def _fits(self, entry: _Entry, request: MavFrame) -> bool:
@@ -166,9 +200,9 @@ class AnswerCache:
         sender.seq = frame.sequence
         return frame_of(bytes(message.pack(sender)))
 
-    def _numbered(self, entry: _Entry, answer: Outgoing, now_us: int) -> Outgoing:
-        frame = edit_frame(frame_of(answer.frame), sequence=entry.sequence, drop_signature=True)
-        entry.sequence = (entry.sequence + 1) & 0xFF
+    def _sealed(self, entry: _Entry, answer: Outgoing, now_us: int) -> Outgoing:
+        """Sign an answer if the vehicle signs."""
+        frame = edit_frame(frame_of(answer.frame), drop_signature=True)
         assert frame is not None
         if entry.key:
             frame = self._signer.signed(frame, entry.key, now_us)

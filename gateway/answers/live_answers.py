@@ -16,6 +16,7 @@ confirmation does no harm.
 """
 
 import struct
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -24,7 +25,15 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.answers.log_answers import ALL_KINDS, PARAM_VALUE, Items, LogAnswers, content_of
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import KINDS
-from gateway.vehicle.services.ftp import ACK, WRITING, FtpError, Opcode, decode_packet, full_path
+from gateway.vehicle.services.ftp import (
+    ACK,
+    WRITING,
+    FtpError,
+    Opcode,
+    Packet,
+    decode_packet,
+    full_path,
+)
 from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_messages import BOOT_TIME_OFFSETS, boot_time_us, ids_of
@@ -54,7 +63,8 @@ STORE: Final = (mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1.0)
 NO_INDEX: Final = 0xFFFF
 """Index in the PARAM_VALUE by which ArduPilot confirms a setting, and in that of the checksum."""
 RESTART_US: Final = 5 * US_PER_S
-"""Increase of the boot time that indicates a restart; congestion delays frames by less."""
+"""Change of the boot time that indicates a restart, or another vehicle; congestion delays frames by
+less."""
 FRESH_US: Final = 10 * US_PER_S
 """Maximum time without a boot time; after it, the vehicle may have restarted unnoticed."""
 PACKED: Final = "/param.pck"
@@ -63,13 +73,39 @@ METADATA_FILES: Final = (".json", ".json.xz", ".json.gz", PACKED)
 MAX_BYTES: Final = 1_000_000
 """Limit for one vehicle: 1000 parameters take 40 kB, the metadata of PX4 about 300 kB."""
 MAX_READS: Final = 8
-"""Maximum number of file reads in progress."""
+"""Maximum number of file reads in progress, and of stations whose requests for files are known."""
+MAX_ASKED: Final = 64
+"""Maximum requests of one station for files that are known; it repeats older ones."""
+BURST_ANSWERS: Final = 4096
+"""Maximum answers to one request of a burst: a file of a megabyte."""
 READING: Final = (Opcode.READ_FILE, Opcode.BURST_READ_FILE)
 PARAMETERS: Final = "parameters"
 
 _PLAN_IDS: Final = struct.Struct("<2xH2xIII")
 """Fields of MISSION_CURRENT: number of items, and the ids of mission, fence and rally points."""
 _HOME_BYTES: Final = 12
+FTP_PAYLOAD: Final = slice(3, 254)
+"""Bytes of the payload in FILE_TRANSFER_PROTOCOL."""
+SEQUENCE_MASK: Final = 0xFFFF
+"""Sequence numbers of MAVLink FTP have 16 bits."""
+
+
+Reader = tuple[int, tuple[int, int]]
+"""A station that reads files: its client, and its system and component."""
+
+
+def _answers_to(request: Packet, answer: Packet) -> bool:
+    """Return whether a packet is an answer to a request, by opcode, number, session and offset."""
+    after = (answer.sequence - request.sequence) & SEQUENCE_MASK
+    if answer.request_opcode != request.opcode:
+        return False
+    if request.opcode == Opcode.OPEN_FILE_RO or answer.opcode != ACK:
+        return after == 1
+    if request.opcode == Opcode.BURST_READ_FILE:
+        is_part = 1 <= after <= BURST_ANSWERS and answer.offset >= request.offset
+    else:
+        is_part = after == 1 and answer.offset == request.offset
+    return is_part and answer.session == request.session
 
 
 @dataclass(slots=True)
@@ -115,7 +151,9 @@ class LiveAnswers:
         self._shown: dict[int, bytes] = {}
         self._home = b""
         self._plan_ids: dict[int, int] = {}
-        self._readings: dict[tuple[int, int], _Reading] = {}
+        self._readings: dict[Reader, _Reading] = {}
+        self._asked: dict[Reader, deque[Packet]] = {}
+        """The newest requests for files, by their sender."""
         self._uploader = (0, 0)
         """System and component of the station that most recently began to upload a mission."""
         self._drop_parameters()
@@ -161,7 +199,7 @@ class LiveAnswers:
         """Process a frame of the vehicle."""
         booted_us = boot_time_us(frame, now_us)
         if booted_us is not None:
-            if self._booted_us is not None and booted_us - self._booted_us > RESTART_US:
+            if self._booted_us is not None and abs(booted_us - self._booted_us) > RESTART_US:
                 self.clear()
             self._booted_us, self._timed_us = booted_us, now_us
         match frame.message_id:
@@ -181,7 +219,7 @@ class LiveAnswers:
             case part if part in MISSION_IDS:
                 self._add_mission(frame, now_us, is_upload=False)
 
-    def add_request(self, message: Any, frame: MavFrame, now_us: int) -> None:
+    def add_request(self, client_id: int, message: Any, frame: MavFrame, now_us: int) -> None:
         """Process a request from a station to the vehicle."""
         match message.get_type():
             case "PARAM_SET" if message.param_id != HASH_NAME:
@@ -192,7 +230,7 @@ class LiveAnswers:
                     self._drop_parameters()
                     self._drop_missions(ALL_KINDS)
             case "FILE_TRANSFER_PROTOCOL":
-                self._add_file_request(bytes(message.payload), frame.origin)
+                self._add_file_request(bytes(message.payload), (client_id, frame.origin))
             case "MISSION_COUNT" | "MISSION_CLEAR_ALL" | "MISSION_WRITE_PARTIAL_LIST":
                 self._drop_missions(message.mission_type)
                 self._uploader = frame.origin
@@ -287,24 +325,54 @@ class LiveAnswers:
                 self._plan_ids.pop(kind, None)
                 self.since_us[name] = now_us
 
-    def _add_file_request(self, payload: bytes, station: tuple[int, int]) -> None:
+    def remove_client(self, client_id: int) -> None:
+        """Discard what a client was reading that has gone."""
+        self._readings = {key: one for key, one in self._readings.items() if key[0] != client_id}
+        self._asked = {key: asked for key, asked in self._asked.items() if key[0] != client_id}
+
+    def asker(self, frame: MavFrame) -> int | None:
+        """Return the client that requested the content of a frame; None if several may have."""
+        reader = self._reader(frame.target, _packet_of(frame))
+        return None if reader is None else reader[0]
+
+    def _reader(self, station: tuple[int, int], packet: Packet) -> Reader | None:
+        """Return the reader that a packet answers, if no other of the same id may have asked."""
+        found = [
+            reader
+            for reader, asked in self._asked.items()
+            if reader[1] == station and any(_answers_to(each, packet) for each in asked)
+        ]
+        if len(found) > 1:
+            # Each of them may get the content of the other's file.
+            for reader in found:
+                self._readings.pop(reader, None)
+        return found[0] if len(found) == 1 else None
+
+    def _add_file_request(self, payload: bytes, reader: Reader) -> None:
         packet = decode_packet(payload)
         if packet.opcode in WRITING:
             self.clear()
-        elif packet.opcode == Opcode.OPEN_FILE_RO:
+            return
+        if reader not in self._asked and len(self._asked) >= MAX_READS:
+            self._readings.pop(next(iter(self._asked)), None)
+            self._asked.pop(next(iter(self._asked)))
+        self._asked.setdefault(reader, deque(maxlen=MAX_ASKED)).append(packet)
+        if packet.opcode == Opcode.OPEN_FILE_RO:
             path = full_path(packet)
-            self._readings.pop(station, None)
+            self._readings.pop(reader, None)
             if path.partition("?")[0].endswith(METADATA_FILES) and len(self._readings) < MAX_READS:
-                self._readings[station] = _Reading(path)
+                self._readings[reader] = _Reading(path)
 
     def _add_file(self, frame: MavFrame, now_us: int) -> None:
-        reading = self._readings.get(frame.target)
-        packet = decode_packet(payload_of(frame.data, 254)[3:])
-        if reading is None:
+        packet = _packet_of(frame)
+        reader = self._reader(frame.target, packet)
+        reading = self._readings.get(reader) if reader is not None else None
+        if reader is None or reading is None:
             return
         if packet.request_opcode == Opcode.OPEN_FILE_RO and packet.opcode == ACK:
             reading.session = packet.session
             reading.size = int.from_bytes(packet.data[:4], "little")
+            self._drop_others(reader, packet.session)
         elif packet.session != reading.session or packet.request_opcode not in READING:
             return
         elif packet.opcode == ACK and packet.data and self.size < MAX_BYTES:
@@ -316,4 +384,17 @@ class LiveAnswers:
         if content:
             self.files[reading.path] = content
             self.since_us["files"] = now_us
-            del self._readings[frame.target]
+            del self._readings[reader]
+
+    def _drop_others(self, reader: Reader, session: int) -> None:
+        """Drop what other stations with the id of a reader have read in its session.
+
+        The vehicle has opened another file there, so their next chunks would be of that file.
+        """
+        for other, reading in [*self._readings.items()]:
+            if other != reader and other[1] == reader[1] and reading.session == session:
+                del self._readings[other]
+
+
+def _packet_of(frame: MavFrame) -> Packet:
+    return decode_packet(payload_of(frame.data, FTP_PAYLOAD.stop)[FTP_PAYLOAD])

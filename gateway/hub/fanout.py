@@ -11,7 +11,8 @@ A frame that a client does not get (filtered, limited, or an answer to another c
 gap in its sequence numbers, which ground stations show as radio loss. So our own frames are
 renumbered: each client has a count of the frames that it was not sent, and all clients with the
 same count share one copy, which is signed too if its vehicle signs. Frames of other vehicles are
-never changed; a filter on those does show as loss.
+not changed, and a filter on those does show as loss; with one exception: frames of vehicles whose
+answers are kept are numbered for each client, because the gateway sends some in their name.
 
 The frames to a client of known bandwidth are counted, and thinned once a second so that they fit:
 see `send_queue.py`. A client whose endpoint has `monitor=yes` gets every frame. A client of
@@ -34,9 +35,10 @@ from gateway.hub.send_queue import (
     SEQUENCE_MASK,
     Bandwidth,
 )
-from gateway.hub.transports.base import Client, OnForeign, Route, Targets
+from gateway.hub.transports.base import Client, OnForeign, Route, Target, Targets
 from gateway.records import ClientInterval
 from gateway.units import US_PER_S
+from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_messages import base_size
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame
@@ -71,6 +73,9 @@ class _Subscription:
     """Requested intervals by system and message."""
     gaps: dict[Origin, _Gap] = field(default_factory=dict)
     limits: dict[bytes, RateLimit] = field(default_factory=dict)
+    inserted: dict[Origin, int] = field(default_factory=dict)
+    """Kept answers that the gateway has sent in the name of other systems, by these. Frames of a
+    system with an entry are numbered for this client."""
 
     def carries(self, frame: MavFrame) -> bool:
         """Return whether the client gets this system, and its MAVLink version has the message."""
@@ -175,8 +180,8 @@ class Fanout:
         self.forwarding = forwarding or Forwarding()
         self.forwarding.work[IS_RECORDED] = on_foreign is not None
         self._on_foreign = on_foreign
-        self._targets: dict[tuple[tuple[int, int], ...], Targets] = {}
-        """Targets by client and limit of each: routes share them."""
+        self._targets: dict[tuple[tuple[int, int, Origin | None], ...], Targets] = {}
+        """Targets by client, limit and renumbered system of each: routes share them."""
         self._targets_at: dict[int, Targets] = {}
         """The same targets by the address of their memory."""
         self.others: dict[tuple[int, bytes], Route] = {}
@@ -304,17 +309,55 @@ class Fanout:
             else:
                 gap.skip()
 
+    def insert(self, frame: MavFrame, client_ids: Collection[int], newest: int) -> None:
+        """Send a kept answer of another system to some clients, past their filters.
+
+        Its number follows that of the system's newest frame; all following frames of the system to
+        these clients are renumbered, so that no number is missing or occurs twice.
+        """
+        for client_id, subscription in tuple(self._subscriptions.items()):
+            client = subscription.client
+            is_addressed = client_id in client_ids or client.endpoint.monitor
+            if is_addressed and subscription.lets_out(frame):
+                if frame.origin not in subscription.inserted:
+                    self.clear()
+                before = subscription.inserted.get(frame.origin, 0)
+                subscription.inserted[frame.origin] = before + 1
+                subscription.answered += len(frame.data)
+                client.send(self._renumbered(frame, newest + before + 1))
+
+    def numbers(self, client_id: int, origin: Origin) -> bool:
+        """Return whether frames of another system are numbered for a client."""
+        subscription = self._subscriptions.get(client_id)
+        return subscription is not None and origin in subscription.inserted
+
+    def _renumbered(self, frame: MavFrame, number: int) -> MavFrame:
+        """Return another system's frame with a number; unchanged if it cannot be signed again."""
+        sign = self._signer.renewal(frame) if frame.signed else None
+        return edit_frame(frame, sequence=number & SEQUENCE_MASK, sign=sign) or frame
+
+    def _sender(self, subscription: _Subscription, origin: Origin) -> Callable[[MavFrame], None]:
+        """Return the function that sends frames of another system to a client."""
+        send, inserted = subscription.client.send, subscription.inserted
+        if origin not in inserted:
+            return send
+        return lambda frame: send(self._renumbered(frame, frame.sequence + inserted[origin]))
+
     def deliver(self, frame: MavFrame, client_ids: Collection[int], source_id: int) -> None:
         """Forward a frame to some clients, past their filters, unchanged."""
+        source = self._subscriptions.get(source_id)
         for client_id in client_ids:
             subscription = self._subscriptions.get(client_id)
             if subscription and subscription.lets_out(frame):
+                if source is not None and source.client.endpoint.cache:
+                    subscription.inserted.setdefault(frame.origin, 0)
                 subscription.answered += len(frame.data)
-                subscription.client.send(frame)
+                self._sender(subscription, frame.origin)(frame)
         for monitor in self._monitors:
-            passes = self._subscriptions[monitor.client_id].lets_out(frame)
-            if passes and monitor.client_id not in client_ids and monitor.client_id != source_id:
-                monitor.send(frame)
+            subscription = self._subscriptions[monitor.client_id]
+            is_other = monitor.client_id not in client_ids and monitor.client_id != source_id
+            if is_other and subscription.lets_out(frame):
+                self._sender(subscription, frame.origin)(frame)
 
     def make_route(
         self,
@@ -330,18 +373,23 @@ class Fanout:
         """
         if max(len(source.routes), len(self.others)) >= MAX_ROUTES:
             self.clear()
-        targets: list[tuple[Client, RateLimit | None]] = []
+        targets: list[Target] = []
+        key: list[tuple[int, int, Origin | None]] = []
         for subscription in self._subscriptions.values():
             interval_us = self._interval_us(subscription, frame, is_ours=False)
             if subscription.client is source or not reaches(subscription.client.client_id):
                 continue
             if interval_us != NO_MESSAGES:
-                limit = subscription.limit_of(frame.key, interval_us)
-                targets.append((subscription.client, limit))
-        key = tuple((client.client_id, id(limit)) for client, limit in targets)
-        shared = self._targets.get(key)
+                limit, client = subscription.limit_of(frame.key, interval_us), subscription.client
+                if source.endpoint.cache:
+                    subscription.inserted.setdefault(frame.origin, 0)
+                is_edited = frame.origin in subscription.inserted
+                send = self._sender(subscription, frame.origin) if is_edited else None
+                targets.append((client, limit, send))
+                key.append((client.client_id, id(limit), frame.origin if is_edited else None))
+        shared = self._targets.get(tuple(key))
         if shared is None:
-            shared = self._targets[key] = Targets(targets)
+            shared = self._targets[tuple(key)] = Targets(targets)
             self._targets_at[shared.address] = shared
         return Route(frame.message_id, shared, source, path, rejects, self._on_foreign)
 
@@ -369,7 +417,7 @@ class Fanout:
         origins = {origin for link in links for origin in link.gaps}
         requested = {k: v for link in reversed(links) for k, v in link.requested.items()}
         for link in links:
-            link.requested = dict(requested)
+            link.requested, link.inserted = dict(requested), dict(links[0].inserted)
             for origin in origins:
                 link.gap_of(origin).skipped = links[0].gap_of(origin).skipped
         self.clear()

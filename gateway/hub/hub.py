@@ -121,8 +121,8 @@ class Hub:
         self._share_reads()
         self._fanout = Fanout(signer, self.forwarding, on_foreign, is_recording=keeps_order)
         self.finish_run, self.update_buffer = self._fanout.finish_run, self._fanout.update_buffer
-        self._round_trip = RoundTrip()
-        self._vehicles = OwnVehicles()
+        self.reroute, self.numbers = self._fanout.reconfigure, self._fanout.numbers
+        self._round_trip, self._vehicles = RoundTrip(), OwnVehicles()
         self.greet = self._vehicles.await_greeting
         self._router = Router(
             self,

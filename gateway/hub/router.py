@@ -38,6 +38,7 @@ from gateway.wire.system_ids import LAST_ID
 
 UNADDRESSED_REQUESTS: Final = frozenset({HEARTBEAT_ID, dialect.MAVLINK_MSG_ID_TIMESYNC})
 """Messages without a target that our vehicles handle, from any sender."""
+FILE_ID: Final = dialect.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL
 MAX_UNTRUSTED_SYSTEMS: Final = 8
 """Maximum systems that are shown for an untrusted client."""
 
@@ -95,7 +96,8 @@ class Router:
             return ()
         systems = sorted({system for system, _ in self.origins(client.client_id)})
         now_us = self._context.now_us()
-        return tuple(text for each in systems if (text := self._cache.describe(each, now_us)))
+        texts = (self._cache.describe(client.client_id, each, now_us) for each in systems)
+        return tuple(filter(None, texts))
 
     def routed_vehicles(self) -> set[int]:
         """Return the systems of trusted clients that are not ground stations."""
@@ -115,8 +117,7 @@ class Router:
 
     def reconfigure(self, client: Client) -> None:
         """Apply a client's changed options; one no longer trusted leaves the routing table."""
-        for system, _ in self.origins(client.client_id):
-            self._cache.remove(system)
+        self._cache.drop(client.client_id)
         if client.trusted:
             self._untrusted.remove(client.client_id)
         else:
@@ -284,7 +285,8 @@ class Router:
     def _keep(self, client: Client, frame: MavFrame, now_us: int) -> None:
         """Keep the answers of a client's vehicles, if its endpoint has the option `cache`."""
         if client.endpoint.cache and client.trusted:
-            request = self._cache.add(frame, now_us)
+            client_id, location = client.client_id, client.endpoint.location
+            request = self._cache.add(client_id, location, frame, now_us)
             if request is not None:
                 self._fanout.deliver(request, (client.client_id,), NOBODY)
 
@@ -297,6 +299,7 @@ class Router:
             client.client_id,
             frame,
             now_us,
+            clients,
             may_answer=kept and client.endpoint.cache is not False,
         )
         self._send_cached(answers)
@@ -305,8 +308,8 @@ class Router:
     def _send_cached(self, answers: list[Outgoing]) -> None:
         for each in answers:
             if each.client_id is not None:
-                links = self.links.group(each.client_id)
-                self._fanout.deliver(each.header or frame_of(each.frame), links, NOBODY)
+                frame, links = each.header or frame_of(each.frame), self.links.group(each.client_id)
+                self._fanout.insert(frame, links, self._table.newest_sequence(frame.origin))
         due_us = self._cache.next_due_us()
         if due_us is not None and self._cache_timer is None:
             wait_s = max(due_us - self._context.now_us(), 0) / US_PER_S
@@ -325,6 +328,10 @@ class Router:
         if to_stations:
             asked = client.endpoint.systems.has
             clients = [key for key in clients if table.awaits_answer(key, frame.target, asked)]
+        if client.endpoint.cache and frame.message_id == FILE_ID and len(clients) > 1:
+            asker = self._cache.asker(client.client_id, frame)
+            links = self.links.group(asker) if asker in clients else clients
+            clients = [key for key in clients if key in links]
         if ours or clients:
             client.prove()
         if ours:

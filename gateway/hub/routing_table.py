@@ -99,6 +99,19 @@ class FrameStream:
         if sent_us >= self.newest_us:
             self.newest_us, self.leader = sent_us, client_id
 
+    def newest_sequence(self) -> int:
+        """Return the number of the newest frame; of several at one time, the last of their run."""
+        newest_us = max(self.sent_us)
+        return (
+            next(
+                number
+                for number in range(256)
+                if self.sent_us[number] == newest_us != self.sent_us[number + 1 & 0xFF]
+            )
+            if newest_us != min(self.sent_us)
+            else 0
+        )
+
     def is_behind(self, sequence: int, limit_us: int) -> bool:
         """Return whether the frames after a number were accepted more than a limit ago.
 
@@ -270,6 +283,11 @@ class RoutingTable:
         if path is not None and (is_other or len(self._to[origin]) > 1):
             self._changed()
         return path
+
+    def newest_sequence(self, origin: Origin) -> int:
+        """Return the sequence number of the newest frame of a system; 0 if there is none."""
+        paths = self._to.get(origin)
+        return next(iter(paths.values())).stream.newest_sequence() if paths else 0
 
     def is_shared(self, origin: Origin, now_us: int) -> bool:
         """Return whether a system has been received recently on more than one path."""

@@ -34,6 +34,7 @@ from pymavlink.dialects.v20 import all as dialect
 
 from gateway.hub.routing_table import MAX_ORIGINS, Origin
 from gateway.units import BITS_PER_BYTE, US_PER_S
+from gateway.wire.frame_editing import renumbered
 from gateway.wire.mavlink_messages import ids_of
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame
@@ -245,7 +246,8 @@ class SendQueue:
 
     The newest frame is always accepted. Our own frames are numbered and signed as they leave; one
     that was overtaken is signed again, since its timestamp is too early. `system_here` returns the
-    id at the gateway of a sender that has another one on the link.
+    id at the gateway of a sender that has another one on the link. Frames of others for which
+    `is_numbered` returns True are numbered too, and never signed.
     """
 
     def __init__(
@@ -254,11 +256,13 @@ class SendQueue:
         is_own: Callable[[Origin], bool],
         signer: FrameSigner,
         system_here: Callable[[int], int] | None = None,
+        is_numbered: Callable[[Origin], bool] = lambda _: False,
     ) -> None:
         self.max_bytes = max_bytes
+        self._is_own = is_own
         self._system_here = system_here
         self.max_bulk_bytes = max(max_bytes, BULK_BYTES)
-        self._numbering = Numbering(is_own)
+        self._numbering = Numbering(lambda origin: is_own(origin) or is_numbered(origin))
         self._signer = signer
         self._sizes = [0, 0]
         """Waiting bytes of all but bulk, and of bulk."""
@@ -344,6 +348,8 @@ class SendQueue:
         if step is None:
             return frame.data
         sequence = self._numbering.leave(frame, step)
+        if not self._is_own(frame.origin):
+            return renumbered(frame, sequence).data
         system = self._system_here(frame.origin[0]) if self._system_here else None
         return self._signer.sequence_and_sign(frame, sequence, now_us, system).data
 

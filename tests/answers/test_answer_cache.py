@@ -2,7 +2,6 @@
 
 import struct
 from collections.abc import Callable, Iterable
-from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -12,7 +11,7 @@ from gateway.answers import answer_cache, live_answers
 from gateway.answers.answer_cache import AnswerCache
 from gateway.answers.live_answers import LiveAnswers
 from gateway.records import Incoming, Outgoing
-from gateway.vehicle.services.ftp import Opcode
+from gateway.vehicle.services.ftp import ACK, Opcode, Packet
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
@@ -31,7 +30,6 @@ from tests.kit.ground_station import (
     item,
     kinds,
     load_parameters,
-    of_kind,
     request_item,
     upload,
 )
@@ -79,7 +77,11 @@ class CachedLink:
 
     def handle(self, incoming: Incoming, now_us: int) -> list[Outgoing]:
         answers, passed = self.cache.handle(
-            incoming.client_id, frame_of(incoming.frame), now_us, may_answer=self.may_answer
+            incoming.client_id,
+            frame_of(incoming.frame),
+            now_us,
+            [RADIO],
+            may_answer=self.may_answer,
         )
         if passed is not None:
             self.up.append(self.mav.decode(bytearray(passed.data)))
@@ -92,12 +94,12 @@ class CachedLink:
     def ask(self, message: Any, *, signed: bool = False) -> tuple[list[Outgoing], bool]:
         """Ask the cache as a station; return its answers, and whether it passes the request on."""
         frame = frame_of(packed(message, 255, 190, signing=SIGNING if signed else None))
-        answers, passed = self.cache.handle(7, frame, self.clock.now_us, may_answer=True)
+        answers, passed = self.cache.handle(7, frame, self.clock.now_us, [RADIO], may_answer=True)
         assert passed in (None, frame)
         return answers, passed is not None
 
     def kept(self) -> str:
-        return self.cache.describe(1, self.clock.now_us)
+        return self.cache.describe(RADIO, 1, self.clock.now_us)
 
     def passed(self) -> list[str]:
         """Return the kinds of messages that went over the link since the last call."""
@@ -121,7 +123,7 @@ class CachedLink:
             message = self.mav.decode(bytearray(each.frame))
             if self.loses(message):
                 continue
-            again = self.cache.add(frame, self.clock.now_us)
+            again = self.cache.add(RADIO, "radio", frame, self.clock.now_us)
             found.append(Outgoing(each.frame, each.message_id))
             if again is not None:
                 self.up.append(self.mav.decode(bytearray(again.data)))
@@ -160,13 +162,11 @@ def test_second_station_gets_parameters_and_missions_without_the_link(link: Cach
     link.first.request(VERSION)
     link.up.clear()
     assert load_parameters(link.second) == values
-    numbers = [message.get_seq() for message in of_kind(link.second.inbox, "PARAM_VALUE")]
-    assert {(after - before) % 256 for before, after in pairwise(numbers)} == {1}
     for kind, sent in items.items():
         assert [content(each) for each in download(link.second, kind)] == [*map(content, sent)]
     assert kinds(link.second.request(VERSION)) == ["COMMAND_ACK", "AUTOPILOT_VERSION"]
     assert link.up == []
-    text = link.cache.describe(1, link.clock.now_us + 4_000_000)
+    text = link.cache.describe(RADIO, 1, link.clock.now_us + 4_000_000)
     assert f"parameters ({len(values)}) 4 s" in text
     assert "mission (5)" in text
 
@@ -174,7 +174,7 @@ def test_second_station_gets_parameters_and_missions_without_the_link(link: Cach
 def test_downloaded_mission_is_kept_and_its_end_is_passed_on(link: CachedLink) -> None:
     link.may_answer = False
     upload(link.first, ITEMS)
-    link.cache.remove(1)
+    link.cache.drop(RADIO)
     link.report(31_000)
     link.may_answer = True
     download(link.first)
@@ -277,7 +277,7 @@ def test_mission_whose_id_changes_is_dropped(
     upload(link.first, [item(i, FENCE, param1=3.0, z=0.0) for i in range(3)], FENCE)
     for total, *ids in (before, after):
         current = frame_with(42, struct.pack("<HHBBIII", 0, total, 0, 0, *ids))
-        assert link.cache.add(frame_of(current), link.clock.now_us) is None
+        assert link.cache.add(RADIO, "radio", frame_of(current), link.clock.now_us) is None
     names = {MISSION: "mission", FENCE: "fence"}
     assert {kind for kind, name in names.items() if name in link.kept()} == kept
 
@@ -324,6 +324,85 @@ def test_file_of_metadata_is_read_once_over_the_link(link: CachedLink, path: byt
     is_packed = path.startswith(b"@PARAM")
     link.first.set_parameter("TUN_ORDER", 3)
     assert (FtpClient(link.second).open(path).session, len(link.up)) == (0, 1 + is_packed)
+
+
+ONE_ID = (255, 190)
+
+
+@pytest.mark.parametrize("sessions", [(0, 1), (0, 0)], ids=str)
+@pytest.mark.parametrize("first_sequence", [40, 1])
+def test_files_that_stations_of_one_id_read_at_once_are_not_mixed(
+    link: CachedLink, sessions: tuple[int, int], first_sequence: int
+) -> None:
+    """Frames of the vehicle reach both; only numbers and sessions distinguish their requests.
+
+    A vehicle with one session opens the second file in place of the first one.
+    """
+    paths = (b"/a.json", b"/b.json")
+    numbers = [first_sequence, 1]
+    askers = []
+
+    def ask(reader: int, opcode: int, session: int = 0, data: bytes = b"") -> None:
+        packet = Packet(numbers[reader], session, opcode, len(data), 0, 0, 0, data)
+        numbers[reader] += 1
+        sent = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, packet.encode())
+        frame = frame_of(packed(sent, *ONE_ID))
+        link.cache.handle(20 + reader, frame, 0, [RADIO], may_answer=False)
+        pending.append((reader, packet))
+
+    def answer(data: bytes, session: int) -> None:
+        _, packet = pending.pop(0)
+        reply = packet.answer(ACK, session, data)
+        sent = mavlink.MAVLink_file_transfer_protocol_message(0, *ONE_ID, reply.encode())
+        frame = frame_of(packed(sent))
+        askers.append(link.cache.asker(RADIO, frame))
+        link.cache.add(RADIO, "radio", frame, 0)
+
+    pending: list[tuple[int, Packet]] = []
+    for reader in (0, 1):
+        ask(reader, Opcode.OPEN_FILE_RO, data=paths[reader])
+    for reader in (0, 1):
+        answer(struct.pack("<I", 1), sessions[reader])
+    for reader in (0, 1):
+        ask(reader, Opcode.READ_FILE, sessions[reader])
+    for reader in (0, 1):
+        answer(b"ab"[reader : reader + 1], sessions[reader])
+    kept = link.cache._entries[RADIO, 1].live.files
+    files = {path: kept.get(path.decode()) for path in paths}
+    if first_sequence == 1:
+        assert files == {paths[0]: None, paths[1]: None}
+    elif sessions == (0, 0):
+        assert files == {paths[0]: None, paths[1]: b"b"}
+    else:
+        assert files == {paths[0]: b"a", paths[1]: b"b"}
+    opened = [20, 21] if first_sequence == 40 else [None, None]
+    read = [20, 21] if first_sequence == 40 or sessions == (0, 1) else [None, None]
+    assert askers == opened + read
+
+
+def test_vehicles_of_one_id_on_two_links_are_distinguished(link: CachedLink) -> None:
+    link.down(value(b"ONE", 1.0))
+    link.cache.add(50, "other", frame_of(packed(value(b"TWO", 2.0))), link.clock.now_us)
+    request = frame_of(packed(request_list(), *ONE_ID))
+    boot = mavlink.MAVLink_attitude_message(90_000, 0, 0, 0, 0, 0, 0)
+    link.cache.add(50, "other", frame_of(packed(boot)), link.clock.now_us)
+    for client_id, links, name in (7, [RADIO], "ONE"), (8, [50], "TWO"), (9, [50, RADIO], "TWO"):
+        now_us = link.clock.now_us
+        answers, _ = link.cache.handle(client_id, request, now_us, links, may_answer=True)
+        answers += link.cache.poll(now_us + 1_000_000)
+        assert [read_back(each.frame).param_id for each in answers] == [name]
+    link.cache.remove_client(50)
+    assert link.cache.describe(50, 1, 0) == ""
+    # The vehicle returns from another port, and another vehicle after it.
+    link.cache.add(51, "other", frame_of(packed(boot)), link.clock.now_us)
+    assert "parameters (1)" in link.cache.describe(51, 1, 0)
+    link.cache.remove_client(51)
+    boot.time_boot_ms = 95_000
+    link.cache.add(52, "other", frame_of(packed(boot)), link.clock.now_us)
+    link.clock.advance(1.0)
+    boot.time_boot_ms = 200_000
+    link.cache.add(52, "other", frame_of(packed(boot)), link.clock.now_us)
+    assert link.cache.describe(52, 1, 0) == ""
 
 
 def test_file_whose_end_is_known_but_not_its_middle_is_left_to_the_vehicle(
@@ -384,9 +463,10 @@ def test_kept_bytes_and_vehicles_are_bounded(
         link.down(value(b"P%d" % index, 1.0, 100, index))
     assert sum(not link.ask(request_value(f"P{index}"))[1] for index in range(100)) == 11
     for system in range(2, 9):
-        link.cache.add(numbered(system, 0, value(b"P", 1.0)), link.clock.now_us + system)
+        frame = numbered(system, 0, value(b"P", 1.0))
+        link.cache.add(RADIO, "radio", frame, link.clock.now_us + system)
     now_us = link.clock.now_us
-    assert [i for i in range(9) if link.cache.describe(i, now_us)] == [6, 7, 8]
+    assert [i for i in range(9) if link.cache.describe(RADIO, i, now_us)] == [6, 7, 8]
 
 
 def test_damaged_or_foreign_requests_are_passed_on(link: CachedLink) -> None:

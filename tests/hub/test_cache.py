@@ -1,5 +1,6 @@
 """Requests to a vehicle behind an endpoint with `cache=yes` are answered by kept answers."""
 
+import itertools
 from typing import Any
 
 import msgspec
@@ -7,8 +8,10 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.hub import Hub
+from gateway.wire.mavlink_signing import is_genuine
 from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.hub import Rig, Station
+from tests.kit.mavlink import KEY, signer
 from tests.kit.messages import beat
 from tests.ports import free_ports
 
@@ -59,12 +62,18 @@ def parameter(index: int, value: float) -> Any:
 ATTITUDE = mavlink.MAVLink_attitude_message(20_000, 0, 0, 0, 0, 0, 0)
 
 
-async def scene(rig: Rig, options: str, station_options: str = "") -> Scene:
+async def scene(
+    rig: Rig, options: str, station_options: str = "", *, signed: bool = False
+) -> Scene:
     chosen = zip(free_ports(3), (options, "", station_options), strict=True)
     urls = (f"udp-listen:127.0.0.1:{port}?trusted=yes{text}" for port, text in chosen)
-    hub = await rig.open(*urls)
+    hub = await rig.open(*urls, signer=signer() if signed else None)
     vehicle = rig.station(hub.listening_ports()[0], origin=(1, 1))
     one = Scene(rig, hub, vehicle, [await rig.call(hub, number) for number in (1, 2)])
+    for each in (vehicle, *one.stations) if signed else ():
+        each.sender = rig.sender(
+            each.sender.link.srcSystem, each.sender.link.srcComponent, signed=True
+        )
     one.report(beat(), ATTITUDE, *(parameter(index, float(index)) for index in range(COUNT)))
     await one.values(0, COUNT)
     vehicle.received()
@@ -123,6 +132,49 @@ async def test_station_whose_filter_excludes_the_vehicle_is_sent_nothing(rig: Ri
     one.ask(1, listing())
     await rig.quiet()
     assert one.stations[1].is_empty()
+    assert await one.asked() == []
+
+
+def counted_losses(numbers: list[int]) -> int:
+    return sum((after - before - 1) % 256 for before, after in itertools.pairwise(numbers))
+
+
+@pytest.mark.parametrize("signed", [False, True])
+async def test_kept_answers_leave_no_gap_in_the_numbers_of_the_vehicle(
+    rig: Rig, signed: bool
+) -> None:
+    one = await scene(rig, "&cache=yes", signed=signed)
+    for station in (0, 1, 1):
+        one.stations[station].received()
+    numbers: list[list[int]] = [[], []]
+    turns = iter(range(1000))
+
+    def are_all_sent() -> bool:
+        turn = next(turns)
+        one.report(ATTITUDE, beat())
+        if turn in (5, 300):
+            one.ask(1, listing())
+        rig.clock.now_us += 1000
+        for station, known in enumerate(numbers):
+            for data in one.stations[station].received():
+                frame = frame_of(data)
+                known += [frame.sequence] if frame.origin == (1, 1) else []
+                assert not signed or is_genuine(KEY, data)
+        return turn > 320 and len(numbers[1]) == len(numbers[0]) + 2 * COUNT
+
+    await rig.until(are_all_sent)
+    assert [counted_losses(each) for each in numbers] == [0, 0]
+
+
+async def test_answers_stay_when_the_client_of_the_vehicle_proves_that_it_receives(
+    rig: Rig,
+) -> None:
+    one = await scene(rig, "&cache=yes")
+    [client] = [client for client in one.hub._clients.values() if client.endpoint.cache]
+    client.is_proven = False
+    client.prove()
+    one.ask(1, listing())
+    await one.values(1, 2 * COUNT)
     assert await one.asked() == []
 
 

@@ -111,6 +111,12 @@ class HubContext(Protocol):
     def reconfigure(self, client: "Client") -> None:
         """Apply a client's changed options."""
 
+    def numbers(self, client_id: int, origin: Origin) -> bool:
+        """Return whether frames of another system are numbered for a client."""
+
+    def reroute(self, client: "Client") -> None:
+        """Route the frames to a client again, since it sends them in another way."""
+
     def flush_soon(self, wait_s: float, flush: Callable[[], None]) -> None:
         """Call back after the present events are handled, or after a wait."""
 
@@ -124,14 +130,14 @@ class HubContext(Protocol):
 class Targets:
     """The clients of some routes: those that the compiled step sends to, and others with limits."""
 
-    def __init__(self, targets: "Iterable[tuple[Client, RateLimit | None]]") -> None:
+    def __init__(self, targets: "Iterable[Target]") -> None:
         self.direct: list[Client] = []
         self.others: list[tuple[Callable[[MavFrame], None], RateLimit | None]] = []
-        for client, limit in targets:
-            if limit is None and client.is_direct:
+        for client, limit, send in targets:
+            if limit is None and send is None and client.is_direct:
                 self.direct.append(client)
             else:
-                self.others.append((client.send, limit))
+                self.others.append((send or client.send, limit))
         words = [address_of(client.words) for client in self.direct]
         self._memory = np.array([len(words), bool(self.others), *words])
         self.address = address_of(self._memory)
@@ -518,6 +524,8 @@ class Client:
         )
 
 
+Target = tuple[Client, RateLimit | None, Callable[[MavFrame], None] | None]
+"""A client of a route, its limit, and the function that sends to it; None for its own."""
 Peer = TypeVar("Peer", bound=Client)
 
 

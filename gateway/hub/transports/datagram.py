@@ -347,7 +347,8 @@ class DatagramPeer(DatagramClient):
         self._use(self.write if is_held else self._direct)
         if self.state == UNPROVEN:
             self.become("open")
-        self.reconfigure(self.endpoint)
+        self._packer = self._packer_of(self.endpoint)
+        self.context.reroute(self)
 
     def _send_limited(self, data: bytes) -> object:
         """Send a datagram if the allowance of an unproven client suffices; else drop it."""

@@ -99,7 +99,9 @@ class QueuedClient(Client):
         """Start with an empty queue."""
         super().__post_init__()
         signer = self.context.signer
-        self._queue = SendQueue(self.queue_bytes, self._is_own, signer, self._system_here)
+        self._queue = SendQueue(
+            self.queue_bytes, self._is_own, signer, self._system_here, self._is_numbered
+        )
         self._splitter = MavlinkSplitter()
         self._step = self.context.forwarding.step(self.words, reads=False)
 
@@ -108,6 +110,9 @@ class QueuedClient(Client):
 
     def _is_own(self, origin: Origin) -> bool:
         return self.context.is_own((self._system_here(origin[0]), origin[1]))
+
+    def _is_numbered(self, origin: Origin) -> bool:
+        return self.context.numbers(self.client_id, (self._system_here(origin[0]), origin[1]))
 
     def feed(self, data: bytes, now_us: int) -> None:
         """Process a chunk of the stream; the compiled step forwards frames with known routes."""
