@@ -14,7 +14,6 @@ from gateway.analysis.flight import (
     Fixes,
     Flight,
     FlightTrack,
-    LocalFrame,
     fixes_of,
     fuse_track,
     local_frame,
@@ -27,7 +26,7 @@ from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
 from gateway.recordings.fuse import FusionSettings, with_estimator
 from gateway.settings import Settings, fields_of
 from gateway.units import US_PER_S
-from gateway.vehicle_state.positions import ground_distance_m
+from gateway.vehicle_state.positions import LocalFrame, ground_distance_m
 
 ESTIMATORS: Final[tuple[str, ...]] = tuple(
     name for name in OWN_ESTIMATORS if name in EstimationSettings.__struct_fields__

@@ -18,8 +18,6 @@ from gateway.aircraft import AircraftSettings
 from gateway.estimation.columns import NAV_ALT, NAV_FLAGS, NAV_LAT, NAV_LON, NAV_QUAT, NAV_VEL
 from gateway.estimation.reference import is_usable
 from gateway.estimation.select import Estimator, make_estimator
-from gateway.geometry.angle import wrap_180
-from gateway.geometry.geodesy import radii_m
 from gateway.recordings.columns import NAV, NODE_TIME, RAW, has_group
 from gateway.recordings.fuse import (
     SMOOTHED_ESTIMATOR,
@@ -39,6 +37,7 @@ from gateway.records import BaroSample, GpsFix, NavFlags
 from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut
 from gateway.sensing.chain import ImuLog
 from gateway.units import DEG_PER_DEGE7, US_PER_S
+from gateway.vehicle_state.positions import LocalFrame
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -185,29 +184,6 @@ def fixes_of(flight: Flight) -> Fixes:
         alt_amsl_m=np.array([fix.alt_amsl_m for fix in used], np.float64),
         vel_n_mps=np.array([fix.vel_n_mps for fix in used], np.float64).reshape(-1, 3),
     )
-
-
-@dataclass(frozen=True, slots=True)
-class LocalFrame:
-    """Local plane: metres north and east of one position."""
-
-    lat_deg: float
-    lon_deg: float
-    alt_m: float
-
-    def north_m(self, lat_deg: FloatArray) -> FloatArray:
-        """Convert latitudes to metres north."""
-        meridian, _ = radii_m(self.lat_deg, self.alt_m)
-        return np.asarray(np.radians(lat_deg - self.lat_deg) * meridian)
-
-    def east_m(self, lon_deg: FloatArray) -> FloatArray:
-        """Convert longitudes to metres east, in the shorter direction."""
-        _, parallel = radii_m(self.lat_deg, self.alt_m)
-        return np.asarray(np.radians(wrap_180(lon_deg - self.lon_deg)) * parallel)
-
-    def local_m(self, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArray:
-        """Convert positions to metres, shape (N, 2): north and east."""
-        return np.column_stack([self.north_m(lat_deg), self.east_m(lon_deg)])
 
 
 def local_frame(flight: Flight) -> LocalFrame | None:

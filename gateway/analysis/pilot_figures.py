@@ -5,10 +5,11 @@ from typing import Final
 
 import numpy as np
 
-from gateway.analysis.flight import Flight, FlightTrack, FloatArray, LocalFrame
+from gateway.analysis.flight import Flight, FlightTrack, FloatArray
 from gateway.analysis.metrics import greatest
 from gateway.recordings.figures import gps_outages_us
 from gateway.units import US_PER_S
+from gateway.vehicle_state.positions import LocalFrame
 
 AIRBORNE_MPS: Final = 3.0
 """Minimum ground speed in flight, more than that of a person who carries the aircraft."""

@@ -11,6 +11,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import file_digest
+from operator import itemgetter
 from pathlib import Path, PurePath
 from typing import Any, Final, get_type_hints
 from urllib.parse import quote
@@ -18,32 +19,27 @@ from urllib.parse import quote
 import msgspec
 
 from gateway.batch.executors import Executor, WorkFailed
-from gateway.batch.facts import FlightFacts, Flown, Segments, TableTally, TlogTally
+from gateway.batch.facts import CataloguedFlight, Flown, Segments, flights_of
 from gateway.printable import UserError
 from gateway.recordings.files import (
     GZIP,
     NO_RECORDING,
     OTHER_FORMATS,
-    TABLE,
-    TLOG,
     FlightError,
     first_bytes,
     format_of,
     open_recording,
-    open_tlog,
-    read_blocks,
 )
 from gateway.recordings.formats.maps import track_feature
 from gateway.recordings.index import as_text, recording_name
-from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.table import TableBlock, TableReader
+from gateway.recordings.summary import read_summary
 from gateway.records import NAN
 from gateway.units import DEG_PER_DEGE7, M_PER_CM
 from gateway.vehicle_state.positions import TrackPoint
 
 CATALOGUE_NAME: Final = "catalogue.sqlite"
-SCHEMA: Final = 2
+SCHEMA: Final = 3
 """Version of the schema; a catalogue of another version is recreated."""
 BUSY_S: Final = 10.0
 """Time that a writer waits for another one to finish, s."""
@@ -53,7 +49,7 @@ _FILE_COLUMNS: Final = {
     "modified": "INTEGER NOT NULL", "digest": "TEXT NOT NULL", "error": "TEXT",
 }  # fmt: skip
 _SQL: Final = {int | None: "INTEGER", float | None: "REAL", str | None: "TEXT"}
-_FACT_COLUMNS: Final = {name: _SQL[kind] for name, kind in get_type_hints(FlightFacts).items()}
+_FACT_COLUMNS: Final = {name: _SQL[kind] for name, kind in get_type_hints(CataloguedFlight).items()}
 COLUMNS: Final = (*_FILE_COLUMNS, *_FACT_COLUMNS)
 """Columns that a query can use."""
 _POSITION: Final = struct.Struct("<iii")
@@ -171,7 +167,7 @@ class Catalogue:
     def _insert(self, file: CataloguedFile) -> None:
         of_file = (file.path, file.name, file.kind, file.size, file.modified_ns, file.digest)
         marks = ", ".join("?" * len(COLUMNS))
-        for facts, track in file.flights or ((FlightFacts(), []),):
+        for facts, track in file.flights or ((CataloguedFlight(), []),):
             cursor = self._db.execute(
                 f"INSERT INTO flights ({', '.join(COLUMNS)}) VALUES ({marks})",
                 (*of_file, file.error, *msgspec.structs.astuple(facts)),
@@ -200,6 +196,8 @@ class FlightFigures(msgspec.Struct, frozen=True):
     duration: float
     distance: float | None = None
     highest: float | None = None
+    height_above: str | None = None
+    """Zero of the height: `home` or `first position`."""
     loss: float | None = None
 
 
@@ -210,8 +208,9 @@ Figures = dict[PurePath, dict[int | None, FlightFigures]]
 def figures_of(rows: Iterable[Row]) -> Figures:
     """Sum up the recordings of a catalogue; all lists of recordings use this function.
 
-    The tables and tlogs of a recording contain the same flight: the table's figures have priority.
-    The parts of a recording are added up; unreadable ones are left out.
+    The tables and tlogs of a recording contain the same flight: the tlog's positions have priority,
+    since it contains home, and the table's loss. The parts of a recording are added up; unreadable
+    ones are left out.
     """
     parts: dict[tuple[PurePath, int | None], list[Row]] = {}
     for row in rows:
@@ -220,23 +219,29 @@ def figures_of(rows: Iterable[Row]) -> Figures:
             parts.setdefault(key, []).append(row)
     found: Figures = {}
     for (path, vehicle), of_flight in parts.items():
-        kind = max((row["kind"] for row in of_flight), key=lambda one: (one == "table", str(one)))
-        of_kind = [row for row in of_flight if row["kind"] == kind]
-
-        def known(column: str, rows: list[Row] = of_kind) -> list[Any]:
-            return [row[column] for row in rows if row[column] is not None]
-
-        distances, losses = known("distance"), known("loss")
         lengths_s: defaultdict[str, float] = defaultdict(float)
         for row in of_flight:
             lengths_s[row["kind"]] += row["duration"] or 0.0
+        located = _rows_with(of_flight, "distance", "tlog")
+        distances = [row["distance"] for row in located]
+        highest = [row for row in located if row["highest"] is not None]
+        top = max(highest, key=itemgetter("highest"), default={})
+        losses = [row["loss"] for row in _rows_with(of_flight, "loss", "table")]
         found.setdefault(path, {})[vehicle] = FlightFigures(
             max(lengths_s.values()),
             sum(distances) if distances else None,
-            max(known("highest"), default=None),
+            top.get("highest"),
+            top.get("height_above"),
             sum(losses) / len(losses) if losses else None,
         )
     return found
+
+
+def _rows_with(rows: list[Row], column: str, preferred: str) -> list[Row]:
+    """Return the rows of one kind of file, if possible the preferred one, that have a value."""
+    known = [row for row in rows if row[column] is not None]
+    kind = max((row["kind"] for row in known), key=lambda kind: kind == preferred, default="")
+    return [row for row in known if row["kind"] == kind]
 
 
 def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
@@ -453,22 +458,4 @@ def _may_be_recording(path: Path) -> bool:
 
 
 def _flights_in(path: Path, options: ReadOptions) -> list[Flown]:
-    kind = format_of(path)
-    if kind == TLOG:
-        source = open_tlog(path)
-        tlog = TlogTally(source.senders)
-        for batch in source.batches():
-            tlog.add(batch)
-        return tlog.flown()
-    tally = TableTally()
-    if kind == TABLE:
-        reader = TableReader()
-        for block in read_blocks(path, reader, None):
-            tally.add(block)
-        return tally.flown(reader.header)
-    rows = open_rows(path, options)
-    for block in rows.blocks:
-        tally.add(TableBlock(block.cells))
-    # The header made for another program's log has the settings of mavgate, not of the log.
-    plain = {"mavgate_version": "", "settings": {}, "calibration": {}}
-    return tally.flown(msgspec.structs.replace(rows.header, **plain))
+    return [*flights_of(read_summary(path, None, lambda: options))]

@@ -6,7 +6,6 @@ panel, and its aircraft get system ids that no live one has.
 
 import asyncio
 import logging
-import math
 import os
 import tempfile
 from collections import defaultdict
@@ -16,23 +15,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from gateway.live.control_socket import ControlError
 from gateway.live.terminal import own_command
 from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import ControlClient, Uplink
-from gateway.recordings.columns import TableRow
-from gateway.recordings.files import TLOG, format_of, open_tlog, read_chunks
+from gateway.recordings.files import TABLE, FlightError
+from gateway.recordings.flight_facts import FlightTrackPoints
 from gateway.recordings.index import RecordingError, find_recording, parts_together
-from gateway.recordings.table import TableReader
-from gateway.recordings.vehicle_reader import VehicleReader
+from gateway.recordings.summary import read_summary
 from gateway.units import US_PER_S
-from gateway.vehicle_state.positions import TrackPoint
-from gateway.vehicle_state.senders import FIRST_GROUND_STATION, Senders
+from gateway.vehicle_state.senders import FIRST_GROUND_STATION
 
 log = logging.getLogger(__name__)
 
 PROFILE_POINTS: Final = 400
-HEIGHT_GAP_US: Final = US_PER_S // 5
 RECORDED: Final = "recorded"
 FUSED_AGAIN: Final = "fused again"
 READY_S: Final = 120.0
@@ -68,18 +66,12 @@ class RecordedAircraft:
     """Its height; empty if none was recorded."""
 
 
-def look_into(files: Sequence[Path]) -> list[list[RecordedAircraft]]:
+def recorded_aircraft(files: Sequence[Path]) -> list[list[RecordedAircraft]]:
     """Read the aircraft of the files: a list for each flight that a player makes of them.
 
-    Raises OSError if a file cannot be read.
+    Raises OSError or FlightError if a file cannot be read.
     """
-    flights = []
-    for parts in parts_together(files):
-        if format_of(parts[0]) == TLOG:
-            flights.append(_of_tlogs(parts))
-        else:
-            flights.append([_of_tables(parts)])
-    return flights
+    return [_aircraft_of(parts) for parts in parts_together(files)]
 
 
 def free_ids(count: int, taken: Collection[int]) -> range:
@@ -94,51 +86,27 @@ def free_ids(count: int, taken: Collection[int]) -> range:
     raise ValueError(f"{count} more aircraft do not fit next to those that are shown")
 
 
-def _of_tlogs(parts: Sequence[Path]) -> list[RecordedAircraft]:
-    sources, senders = [open_tlog(part) for part in parts], Senders()
-    for source in sources:
-        senders.merge(source.senders)
-    reader, begin_us = VehicleReader(senders), None
-    points: defaultdict[int, list[TrackPoint]] = defaultdict(list)
-    for batch in (batch for source in sources for batch in source.batches()):
-        begin_us = int(batch.time_us[0]) if begin_us is None and len(batch) else begin_us
-        for message in reader.feed_batch(batch):
-            if (at := message.position) is not None:
-                point = TrackPoint(message.time_us, at.lat_deg, at.lon_deg, at.alt_amsl_m)
-                _note_height(point, points[message.system_id])
+def _aircraft_of(parts: Sequence[Path]) -> list[RecordedAircraft]:
+    found = [read_summary(part) for part in parts]
+    begin_us = next((one.info.first_us for one in found if one.info.first_us is not None), 0)
+    origin = FUSED_AGAIN if found[0].info.kind == TABLE else RECORDED
+    points: defaultdict[int, list[FlightTrackPoints]] = defaultdict(list)
+    for one in found:
+        for system_id, tally in one.tallies.items():
+            points[system_id].append(tally.points())
     return [
-        RecordedAircraft(system_id, RECORDED, _profile(points[system_id], begin_us or 0))
-        for system_id in senders.systems()
+        RecordedAircraft(system_id, origin, _profile(some, begin_us))
+        for system_id, some in sorted(points.items())
     ]
 
 
-def _of_tables(parts: Sequence[Path]) -> RecordedAircraft:
-    vehicle_id, points, begin_us = 1, list[TrackPoint](), None
-    for part in parts:
-        reader = TableReader()
-        for chunk in read_chunks(part, None):
-            for event in reader.feed(chunk):
-                if isinstance(event, TableRow):
-                    begin_us = event.time_us if begin_us is None else begin_us
-                    if event.state is not None:
-                        at = (event.state.lat_deg, event.state.lon_deg, event.state.alt_amsl_m)
-                        _note_height(TrackPoint(event.time_us, *at), points)
-        vehicle_id = reader.vehicle_id
-    return RecordedAircraft(vehicle_id, FUSED_AGAIN, _profile(points, begin_us or 0))
-
-
-def _note_height(point: TrackPoint, points: list[TrackPoint]) -> None:
-    is_due = not points or point.time_us - points[-1].time_us >= HEIGHT_GAP_US
-    if is_due and math.isfinite(point.alt_amsl_m):
-        points.append(point)
-
-
-def _profile(points: Sequence[TrackPoint], begin_us: int) -> Profile:
-    kept = points[:: max(1, len(points) // PROFILE_POINTS)]
-    return Profile(
-        tuple((point.time_us - begin_us) / US_PER_S for point in kept),
-        tuple(point.alt_amsl_m for point in kept),
-    )
+def _profile(parts: Sequence[FlightTrackPoints], begin_us: int) -> Profile:
+    time_us = np.concatenate([part.time_us for part in parts])
+    alt_m = np.concatenate([part.alt_amsl_m for part in parts])
+    known = np.flatnonzero(np.isfinite(alt_m))
+    known = known[:: max(1, len(known) // PROFILE_POINTS)]
+    seconds = (time_us[known] - begin_us) / US_PER_S
+    return Profile(tuple(seconds.tolist()), tuple(alt_m[known].tolist()))
 
 
 class PlaybackError(Exception):
@@ -192,9 +160,9 @@ class Playback:
         tables = [file for file in files if file.suffix == ".csv"]
         played = [*tlogs, *(tables if fused_again or not tlogs else [])]
         try:
-            flights = await asyncio.to_thread(look_into, played)
+            flights = await asyncio.to_thread(recorded_aircraft, played)
             firsts = self._number(flights)
-        except (OSError, ValueError) as error:
+        except (FlightError, OSError, ValueError) as error:
             raise PlaybackError(f"{name}: {error}") from error
         self.name = name
         await self._start(played, firsts)

@@ -1,32 +1,18 @@
-"""Summary of any recording: time, vehicles, rates, gaps, distance, damage."""
+"""Summary of any recording: time, vehicles, rates, gaps, facts of the flights, damage."""
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import msgspec
 import numpy as np
 
-from gateway.recordings.columns import (
-    BARO,
-    FIX_LAT,
-    FIX_LON,
-    GPS,
-    MAG,
-    NAV,
-    NAV_LAT,
-    NAV_LON,
-    RAW,
-    SI,
-    FloatArray,
-    has_fix,
-    has_group,
-    has_position,
-)
+from gateway.recordings.columns import BARO, GPS, MAG, NAV, RAW, SI, FloatArray, has_group
 from gateway.recordings.files import (
     NO_RECORDING,
     TABLE,
@@ -37,33 +23,20 @@ from gateway.recordings.files import (
     open_tlog,
     read_blocks,
 )
+from gateway.recordings.flight_facts import FlightFacts, FlightTally, Gap, TimesSpan, checksum
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableNote, TableReader
-from gateway.recordings.tlog import DAY_US
+from gateway.recordings.tallies import MessageTally, RowTally
 from gateway.recordings.tlog_index import TlogIndex
-from gateway.recordings.vehicle_reader import VehicleReader
-from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
-from gateway.vehicle_state.positions import GroundDistance
+from gateway.units import US_PER_S, counted
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
-from gateway.wire.recorded_frames import Batch, IntArray
+from gateway.wire.recorded_frames import Batch
 
 if TYPE_CHECKING:
     from gateway.recordings.recorded_table import ReadOptions
 
 
-GAP_US: Final = 2 * US_PER_S
-"""Minimum pause that is a gap: every vehicle sends a heartbeat once a second."""
-MAX_GAPS: Final = 1000
 DAMAGED_TIME: Final = "{} with a damaged time, replaced by that of the record before"
-
-
-@dataclass(frozen=True, slots=True)
-class Gap:
-    """A gap in the data."""
-
-    time_us: int
-    """Start of the gap, in the recording's own time."""
-    duration_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +55,15 @@ class VehicleInfo:
     system_id: int
     mav_type: int | None
     autopilot: int | None
-    distance_m: float | None
-    """Distance over ground; None without a position."""
     positions: str | None
     """Source of the positions: a MAVLink message, or states or fixes of a table."""
     rates: tuple[Rate, ...]
+    facts: FlightFacts | None = None
+    """None for a ground station."""
+    version: str | None = None
+    """Version of mavgate, or of the autopilot's firmware."""
+    settings: str | None = None
+    """Checksum of settings and calibration, or of the parameters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +74,7 @@ class FileInfo:
     size: int
     records: int
     first_us: int | None
-    """µs since 1970 for a tlog, on the gateway clock for a table."""
+    """µs since 1970 for MAVLink and logs, on the gateway clock for a table."""
     last_us: int | None
     duration_s: float
     """Time from the first record to the last, without jumps of the clock by days."""
@@ -113,61 +90,21 @@ class FileInfo:
     """Remarks of the reader for the user."""
 
 
-@dataclass(slots=True)
-class TimesSpan:
-    """Sum up the duration of records; a clock jump of more than a day adds nothing."""
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Summary of a file, with the positions of its vehicles by system id."""
 
-    first_us: int | None = None
-    gaps: list[Gap] = field(default_factory=list)
-    """The first `MAX_GAPS` between records of `add_all`."""
-    last_us: int | None = None
-    """Greatest time."""
-    _begin_us: int = 0
-    """Start of the part since the last clock jump."""
-    _newest_us: int = 0
-    _last_us: int = 0
-    _before_us: int = 0
-    """Total length of the parts before it."""
-
-    @property
-    def length_us(self) -> int:
-        """Duration from the first record to the last, without clock jumps."""
-        return self._before_us + self._newest_us - self._begin_us
-
-    def add(self, time_us: int) -> None:
-        """Add the time of the next record."""
-        if self.first_us is None:
-            self.first_us = self._begin_us = self._newest_us = time_us
-        elif abs(time_us - self._last_us) > DAY_US:
-            self._before_us = self.length_us
-            self._begin_us = self._newest_us = time_us
-        elif time_us > self._newest_us:
-            self._newest_us = time_us
-        self._last_us = time_us
-
-    def add_all(self, times_us: IntArray) -> None:
-        """Add the times of the next records, at least one."""
-        before_us = times_us[0] if self.first_us is None else self._last_us
-        steps_us = np.diff(times_us, prepend=before_us)
-        for i in np.flatnonzero(steps_us > GAP_US)[: MAX_GAPS - len(self.gaps)].tolist():
-            step_us = int(steps_us[i])
-            self.gaps.append(Gap(int(times_us[i]) - step_us, step_us / US_PER_S))
-        for between in np.split(times_us, np.flatnonzero(np.abs(steps_us) > DAY_US)):
-            if len(between):
-                self.add(int(between[0]))
-                self._newest_us = max(self._newest_us, int(between.max()))
-                self.last_us = max(self.last_us or self._newest_us, self._newest_us)
-                self._last_us = int(between[-1])
+    info: FileInfo
+    tallies: Mapping[int, FlightTally] = field(default_factory=dict)
 
 
 class TlogSummary:
-    """Summarise a tlog, batch by batch."""
+    """Summarise MAVLink, batch by batch."""
 
     def __init__(self, senders: Senders) -> None:
         self._index, self._senders = TlogIndex(), senders
-        self._reader = VehicleReader(senders, with_attitude=False)
+        self._tally = MessageTally(senders)
         self._counts: Counter[tuple[int, int]] = Counter()
-        self._distances: defaultdict[int, GroundDistance] = defaultdict(GroundDistance)
         self._span = TimesSpan()
 
     def add(self, batch: Batch) -> None:
@@ -179,17 +116,14 @@ class TlogSummary:
         keys, counts = np.unique((batch.origins >> 8) << 24 | batch.message_ids, return_counts=True)
         for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
             self._counts[key >> 24, key & 0xFFFFFF] += count
-        for message in self._reader.feed_batch(batch):
-            if (at := message.position) is not None:
-                self._distances[message.system_id].update(
-                    message.time_us, at.lat_deg, at.lon_deg, message.boot_us
-                )
+        self._tally.add(batch)
 
-    def result(self, size: int) -> FileInfo:
+    def result(self, size: int) -> Summary:
         """Return the summary of a file of that size."""
         index = self._index
+        self._tally.flush()
         duration_s = self._span.length_us / US_PER_S
-        return FileInfo(
+        info = FileInfo(
             kind="tlog",
             size=size,
             records=index.count,
@@ -206,36 +140,37 @@ class TlogSummary:
             unfinished_bytes=index.unfinished,
             remarks=(DAMAGED_TIME.format(counted(index.mended, "record")),) if index.mended else (),
         )
+        return Summary(info, self._tally.vehicles)
 
     def _vehicle(self, system_id: int, duration_s: float) -> VehicleInfo:
-        vehicle = self._senders.vehicle(system_id)
-        mav_type, autopilot = vehicle.heartbeat or (None, None)
+        mav_type, autopilot = self._senders.vehicle(system_id).heartbeat or (None, None)
         counts = {key: n for (system, key), n in self._counts.items() if system == system_id}
-        distance_m = self._distances[system_id].distance_m
-        return VehicleInfo(
-            system_id=system_id,
-            mav_type=mav_type,
-            autopilot=autopilot,
-            distance_m=distance_m,
-            positions=None if distance_m is None else MESSAGE_NAMES[vehicle.position_id or 0],
-            rates=tuple(
-                _rate(MESSAGE_NAMES.get(key, f"message {key}"), counts[key], duration_s)
-                for key in sorted(counts)
-            ),
+        rates = tuple(
+            _rate(MESSAGE_NAMES.get(key, f"message {key}"), counts[key], duration_s)
+            for key in sorted(counts)
+        )
+        found = VehicleInfo(system_id, mav_type, autopilot, None, rates)
+        tally = self._tally.vehicles.get(system_id)
+        if tally is None:
+            return found
+        return replace(
+            found,
+            positions=tally.positions,
+            facts=tally.facts(),
+            version=tally.firmware,
+            settings=tally.settings_checksum,
         )
 
 
 class TableSummary:
-    """Summarise a table, event by event."""
+    """Summarise a table, or rows that were read from another format, block by block."""
 
     def __init__(self) -> None:
         self._header: TableHeader | None = None
         self._notes: list[TableNote] = []
         self._counts: Counter[str] = Counter()
         self._damaged_bytes = self._unfinished_bytes = 0
-        self._last_us: int | None = None
-        self._of_states, self._of_fixes = GroundDistance(), GroundDistance()
-        self._span = TimesSpan()
+        self._tally = RowTally()
 
     def add(self, block: TableBlock, header: TableHeader | None) -> None:
         """Add the next block of the file."""
@@ -249,43 +184,45 @@ class TableSummary:
                 self._counts["damage"] += 1
                 self._damaged_bytes += comment.size
         if len(block):
-            self._add_rows(block.cells)
+            self._count_rows(block.cells)
+        self._tally.add(block)
 
-    def result(self, size: int) -> FileInfo:
+    def result(self, size: int) -> Summary:
         """Return the summary of a file of that size."""
-        duration_s = self._span.length_us / US_PER_S
-        has_states = self._of_states.distance_m is not None
-        distance_m = (self._of_states if has_states else self._of_fixes).distance_m
-        positions = "states" if has_states else "GPS fixes"
+        span, header = self._tally.span, self._header
+        facts = self._tally.facts()
         vehicle = VehicleInfo(
-            system_id=self._header.vehicle_id if self._header else 1,
+            system_id=header.vehicle_id if header else 1,
             mav_type=None,
             autopilot=None,
-            distance_m=distance_m,
-            positions=None if distance_m is None else positions,
+            positions=self._tally.positions,
             rates=tuple(
-                _rate(name, self._counts[name], duration_s)
+                _rate(name, self._counts[name], facts.duration_s)
                 for name in ("imu", "mag", "baro", "gps", "state")
                 if self._counts[name]
             ),
+            facts=facts,
+            version=(header and header.mavgate_version) or None,
+            settings=_checksum(header),
         )
-        return FileInfo(
+        info = FileInfo(
             kind="table",
             size=size,
             records=self._counts["row"],
-            first_us=self._span.first_us,
-            last_us=self._last_us,
-            duration_s=duration_s,
+            first_us=span.first_us,
+            last_us=span.last_us,
+            duration_s=facts.duration_s,
             vehicles=(vehicle,),
-            gaps=tuple(self._span.gaps),
+            gaps=facts.gaps,
             damaged_bytes=self._damaged_bytes,
             damaged_runs=self._counts["damage"],
             unfinished_bytes=self._unfinished_bytes,
-            header=self._header,
+            header=header,
             notes=tuple(self._notes),
         )
+        return Summary(info, {vehicle.system_id: self._tally})
 
-    def _add_rows(self, cells: FloatArray) -> None:
+    def _count_rows(self, cells: FloatArray) -> None:
         counts = self._counts
         has_imu, has_mag = has_group(cells, SI), has_group(cells, MAG)
         counts["row"] += len(cells)
@@ -293,48 +230,82 @@ class TableSummary:
         counts["mag"] += int((has_imu & has_mag).sum())
         for name, group in (("baro", BARO), ("gps", GPS), ("state", NAV)):
             counts[name] += int(has_group(cells, group).sum())
-        times_us = cells[:, 0].astype(np.int64)
-        self._last_us = max(int(times_us.max()), self._last_us or 0)
-        self._span.add_all(times_us)
-        fixed = cells[has_fix(cells)]
-        for time_us, lat, lon in fixed[:, [GPS.start, FIX_LAT, FIX_LON]].tolist():
-            self._of_fixes.update(int(time_us), lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)
-        placed = cells[has_position(cells)]
-        for time_us, lat_deg, lon_deg in placed[:, [0, NAV_LAT, NAV_LON]].tolist():
-            self._of_states.update(int(time_us), lat_deg, lon_deg)
 
 
 def _rate(name: str, count: int, duration_s: float) -> Rate:
     return Rate(name, count, round(count / duration_s, 3) if duration_s > 0 else 0.0)
 
 
-def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOptions]) -> FileInfo:
-    """Summarise a tlog, a table, or another program's file; FlightError for any other file.
+def _checksum(header: TableHeader | None) -> str | None:
+    if header is None or not header.settings:
+        return None
+    # Sorted, so that the order of the sections has no effect.
+    return checksum(msgspec.json.encode([header.settings, header.calibration], order="sorted"))
 
-    `options` is called for other programs' files only.
+
+def read_summary(
+    file: Path,
+    progress: Progress | None = None,
+    options: Callable[[], ReadOptions] | None = None,
+) -> Summary:
+    """Summarise a recording of any format, in one pass; FlightError for any other file.
+
+    `options` is called for other programs' files only, which are refused without it.
     """
     kind, size = format_of(file), file.stat().st_size
     if kind == TLOG:
         source = open_tlog(file)
-        tlog = TlogSummary(source.senders)
-        for batch in source.batches(progress):
-            tlog.add(batch)
-        found = tlog.result(size)
-        found = replace(found, remarks=(*source.remarks, *found.remarks))
-        if not found.records:
+        found = _of_messages(source.senders, source.batches(progress), size)
+        if not found.info.records:
             raise FlightError(f"{file}: {NO_RECORDING}")
-        return found
+        return _with(found, kind, (*source.remarks, *found.info.remarks))
     if kind != TABLE:
-        return _describe_by_rows(file, kind, options())
+        if options is None:
+            raise FlightError(f"{file}: {NO_RECORDING}")
+        return _of_other_file(file, kind, options())
     table, reader = TableSummary(), TableReader()
     for block in read_blocks(file, reader, progress):
         table.add(block, reader.header)
     return table.result(size)
 
 
-def _describe_by_rows(file: Path, kind: str, options: ReadOptions) -> FileInfo:
+def _of_messages(senders: Senders, batches: Iterable[Batch], size: int) -> Summary:
+    summary = TlogSummary(senders)
+    for batch in batches:
+        summary.add(batch)
+    return summary.result(size)
+
+
+def _with(found: Summary, kind: str, remarks: Iterable[str]) -> Summary:
+    return replace(found, info=replace(found.info, kind=kind, remarks=tuple(remarks)))
+
+
+def _of_other_file(file: Path, kind: str, options: ReadOptions) -> Summary:
     # These import all stages, which the summary of our own recordings does not need.
-    from gateway.recordings.reading import has_record, is_table, open_record, open_rows
+    from gateway.recordings.reading import has_record
+
+    if not has_record(file):
+        return _of_rows(file, kind, options)
+    try:
+        rows = _of_rows(file, kind, options)
+    except FlightError as no_samples:
+        try:
+            return _of_log(file, kind, options)
+        except FlightError:
+            raise no_samples from None
+    with suppress(FlightError):
+        found = _of_log(file, kind, options)
+        (vehicle,) = found.info.vehicles
+        vehicle = replace(vehicle, rates=rows.info.vehicles[0].rates)
+        # The samples are those of the log.
+        info = replace(found.info, vehicles=(vehicle,), records=rows.info.records)
+        remarks = dict.fromkeys([*rows.info.remarks, *found.info.remarks])
+        return _with(replace(found, info=info), kind, remarks)
+    return rows
+
+
+def _of_rows(file: Path, kind: str, options: ReadOptions) -> Summary:
+    from gateway.recordings.reading import is_table, open_rows
     from gateway.recordings.workshop.joining import shifted
 
     recorded, table = open_rows(file, options), TableSummary()
@@ -342,13 +313,21 @@ def _describe_by_rows(file: Path, kind: str, options: ReadOptions) -> FileInfo:
     zero_us = 0 if own else recorded.header.unix_us_at_zero or 0
     for block in recorded.blocks:
         table.add(shifted(block, zero_us), recorded.header)
-    remarks = list(recorded.remarks)
-    if has_record(file):
-        with suppress(FlightError):
-            remarks += filter(None, [open_record(file, replace(options, progress=None)).lacks])
-    return replace(
-        table.result(file.stat().st_size),
-        kind=kind,
-        header=recorded.header if own else None,
-        remarks=tuple(remarks),
-    )
+    found = table.result(file.stat().st_size)
+    found = replace(found, info=replace(found.info, header=found.info.header if own else None))
+    return _with(found, kind, recorded.remarks)
+
+
+def _of_log(file: Path, kind: str, options: ReadOptions) -> Summary:
+    """Summarise an autopilot's log by the MAVLink that is made of it."""
+    from gateway.recordings.workshop.convert import FlightToWrite
+
+    flight = FlightToWrite([file], replace(options, progress=None))
+    batches = flight.chosen()
+    found = _of_messages(flight.senders, batches, file.stat().st_size)
+    (log,), info = flight.logs, found.info
+    counts = [(name, count) for name, count in sorted(log.counts.items()) if count]
+    rates = tuple(_rate(*one, info.duration_s) for one in counts)
+    info = replace(info, vehicles=tuple(replace(one, rates=rates) for one in info.vehicles))
+    remarks = [*flight.remarks, *filter(None, [log.lacks])]
+    return _with(replace(found, info=info), kind, remarks)

@@ -16,11 +16,12 @@ from gateway.geometry.quaternion import from_euler, normalise
 from gateway.recordings.tlog import FIRST_CIVIL_US
 from gateway.records import Quat
 from gateway.vehicle_state.positions import ORIGIN_ID, Position, named_position, position_of
-from gateway.vehicle_state.senders import RecordedSender, Senders, is_station
-from gateway.vehicle_state.status_texts import STATUSTEXT_ID, JoinedText, TextJoiner
-from gateway.wire.mavlink_messages import DEFINITIONS, ids_of
+from gateway.vehicle_state.senders import MODES_ID, RecordedSender, Senders, is_station
+from gateway.vehicle_state.status_texts import STATUSTEXT_ID, JoinedText, TextJoiner, text_of
+from gateway.wire.flight_modes import mode_name
+from gateway.wire.mavlink_messages import DEFINITIONS, HEARTBEAT_ID, ids_of
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
-from gateway.wire.recorded_frames import Batch, RecordedFrame, fields_of
+from gateway.wire.recorded_frames import Batch, RecordedFrame, fields_of, fields_of_rows
 
 BOOT_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "timestamp": 1000}
 """Fields with the time since boot, and their unit in µs; a civil time in one is ignored."""
@@ -45,6 +46,9 @@ class VehicleMessage:
     text: JoinedText | None = None
     frame: bytes = b""
     """The whole frame; empty for a text."""
+    mode: str = ""
+    """Name of the flight mode in a HEARTBEAT: the autopilot's, that of AVAILABLE_MODES, or its
+    number."""
 
     @property
     def boot_us(self) -> int | None:
@@ -94,14 +98,21 @@ class VehicleReader:
         """Process the next batch of the recording."""
         for origin in np.unique(batch.origins).tolist():
             self.vehicle(origin >> 8)
-        ids = {*self._wanted, STATUSTEXT_ID, ORIGIN_ID}
+        ids = {*self._wanted, ORIGIN_ID, MODES_ID}
         for one in self._vehicles.values():
             ids |= {key for key in (one.attitude_id, one.position_id) if key is not None}
-        for record in batch.records(np.flatnonzero(np.isin(batch.message_ids, [*ids]))):
-            yield from self.feed(record)
+        is_own = np.isin(batch.origins, [one.origin for one in self._vehicles.values()])
+        is_own |= np.isin(batch.message_ids, [*IMAGE_IDS])
+        is_wanted = is_own & np.isin(batch.message_ids, [*ids])
+        wanted = np.flatnonzero(is_wanted | (batch.message_ids == STATUSTEXT_ID))
+        fields = fields_of_rows(batch, wanted)
+        for record, values in zip(batch.records(wanted), fields, strict=True):
+            yield from self.feed(record, values)
 
-    def feed(self, record: RecordedFrame) -> Iterator[VehicleMessage]:
-        """Process the next record."""
+    def feed(
+        self, record: RecordedFrame, fields: Mapping[str, Any] | None = None
+    ) -> Iterator[VehicleMessage]:
+        """Process the next record, of which the fields may be known."""
         frame, time_us = record.frame, record.time_us
         system_id, component_id = origin_of(frame)
         origin, message_id = system_id << 8 | component_id, message_id_of(frame)
@@ -116,27 +127,42 @@ class VehicleReader:
         is_of_vehicle = origin == vehicle.origin or message_id in IMAGE_IDS
         if not is_of_vehicle or is_station(origin, self._senders.stations):
             return
-        if message_id == ORIGIN_ID and (found := named_position(fields_of(frame))) is not None:
-            self._frame_origins[system_id] = found
         is_best = message_id in (vehicle.position_id, vehicle.attitude_id)
-        if (is_best or message_id in self._wanted) and message_id in DEFINITIONS:
-            yield self._message(vehicle, message_id, record)
+        is_used = is_best or message_id in self._wanted or message_id in (ORIGIN_ID, MODES_ID)
+        if not is_used or message_id not in DEFINITIONS:
+            return
+        fields = fields or fields_of(frame)
+        if message_id == ORIGIN_ID and (found := named_position(fields)) is not None:
+            self._frame_origins[system_id] = found
+        elif message_id == MODES_ID:
+            vehicle.modes[fields["custom_mode"]] = text_of(fields["mode_name"])
+        if is_best or message_id in self._wanted:
+            yield self._message(vehicle, message_id, record, fields)
 
     def flush(self) -> Iterator[VehicleMessage]:
         """Yield the texts that will not be continued."""
         return map(_of_text, self._joiner.flush())
 
     def _message(
-        self, vehicle: RecordedSender, message_id: int, record: RecordedFrame
+        self,
+        vehicle: RecordedSender,
+        message_id: int,
+        record: RecordedFrame,
+        fields: Mapping[str, Any],
     ) -> VehicleMessage:
-        fields, system_id = fields_of(record.frame), vehicle.origin >> 8
-        position = q_nb = None
+        system_id, position, q_nb, mode = vehicle.origin >> 8, None, None, ""
         if message_id == vehicle.position_id:
             position = position_of(message_id, fields, self._frame_origins.get(system_id))
         elif message_id == vehicle.attitude_id:
             q_nb = attitude_of(fields)
+        elif message_id == HEARTBEAT_ID:
+            number = fields["custom_mode"]
+            mode = mode_name(fields["autopilot"], fields["type"], number)
+            mode = mode or vehicle.modes.get(number) or str(number)
         return VehicleMessage(
-            system_id, record.time_us, message_id, fields, position, q_nb, frame=record.frame
+            *(system_id, record.time_us, message_id, fields, position, q_nb),
+            frame=record.frame,
+            mode=mode,
         )
 
 

@@ -29,11 +29,9 @@ class VehicleRecording:
         self.first_us = 0
         """Time of the first record; 0 before it is read."""
         self._answers = LogAnswers()
-        # The flight's senders are either complete, or empty and not usable here.
-        self._senders = self.flight.senders if self.flight.is_mavlink else Senders()
         self._batches: Iterator[Batch] | None = self.flight.chosen()
-        self.system_id = options.system_id
-        if self.flight.is_mavlink and self.system_id is None:
+        self.system_id: int = options.system_id or 0
+        if not self.system_id or not self.flight.is_mavlink:
             self.system_id = _only_vehicle(files, self.flight.senders)
 
     def batches(self) -> Iterator[Batch]:
@@ -43,9 +41,7 @@ class VehicleRecording:
         self.first_us = 0
         for batch in batches:
             self.first_us = self.first_us or (int(batch.time_us[0]) if len(batch) else 0)
-            if not self.flight.is_mavlink:
-                self._senders.add(batch)
-            self._answers.add(batch, self._senders)
+            self._answers.add(batch, self.flight.senders)
             yield batch
 
     def messages(self, wanted: Iterable[int]) -> Iterator[VehicleMessage]:
@@ -66,8 +62,7 @@ class VehicleRecording:
 
     def plan(self) -> RecordedPlan:
         """Return its parameters and plans at the end of the records read so far."""
-        system_id = self.system_id or next(iter(self._senders.systems()), 1)
-        return RecordedPlan(self._answers, self._senders.vehicle(system_id))
+        return RecordedPlan(self._answers, self.flight.senders.vehicle(self.system_id))
 
 
 def _only_vehicle(files: Sequence[Path], senders: Senders) -> int:

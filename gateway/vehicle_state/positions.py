@@ -14,7 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.geometry.geodesy import displacement_m, offset_deg
+from gateway.geometry.angle import wrap_180
+from gateway.geometry.geodesy import displacement_m, offset_deg, radii_m
 from gateway.records import NAN, UNKNOWN_VEC3, Vec3
 from gateway.units import DEG_PER_DEGE7, M_PER_CM, M_PER_MM, US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
@@ -103,6 +104,29 @@ class TrackPoint:
     alt_amsl_m: float = NAN
     attitude_deg: tuple[float, float, float] | None = None
     """Roll, pitch and yaw, if they are known."""
+
+
+@dataclass(frozen=True, slots=True)
+class LocalFrame:
+    """Local plane: metres north and east of one position."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+
+    def north_m(self, lat_deg: FloatArray) -> FloatArray:
+        """Convert latitudes to metres north."""
+        meridian, _ = radii_m(self.lat_deg, self.alt_m)
+        return np.asarray(np.radians(lat_deg - self.lat_deg) * meridian)
+
+    def east_m(self, lon_deg: FloatArray) -> FloatArray:
+        """Convert longitudes to metres east, in the shorter direction."""
+        _, parallel = radii_m(self.lat_deg, self.alt_m)
+        return np.asarray(np.radians(wrap_180(lon_deg - self.lon_deg)) * parallel)
+
+    def local_m(self, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArray:
+        """Convert positions to metres, shape (N, 2): north and east."""
+        return np.column_stack([self.north_m(lat_deg), self.east_m(lon_deg)])
 
 
 def is_located(lat_dege7: Any, lon_dege7: Any) -> Any:

@@ -5,9 +5,9 @@ one that sends the most positions. So the attitude of a gimbal or the position o
 have the system id of their aircraft, are not taken for the aircraft's.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Set
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -23,6 +23,7 @@ from gateway.vehicle_state.positions import (
     holds_position,
     named_position,
 )
+from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS
 from gateway.wire.recorded_frames import Batch, columns_of, fields_of
 
@@ -30,6 +31,7 @@ FIRST_GROUND_STATION: Final = 250
 """System ids from here on are ground stations by convention, and keep their id."""
 AUTOPILOT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1."""
+MODES_ID: Final = MESSAGE_IDS["AVAILABLE_MODES"]
 HIGH_LATENCY2_ID: Final = MESSAGE_IDS["HIGH_LATENCY2"]
 ATTITUDE_ID: Final = MESSAGE_IDS["ATTITUDE"]
 ATTITUDE_QUATERNION_ID: Final = MESSAGE_IDS["ATTITUDE_QUATERNION"]
@@ -56,6 +58,8 @@ class RecordedSender:
     """MAV_TYPE and MAV_AUTOPILOT."""
     frame_origin: Position | None = None
     """Origin of LOCAL_POSITION_NED until the vehicle sends another one."""
+    modes: dict[int, str] = field(default_factory=dict, compare=False)
+    """Names of its custom modes from AVAILABLE_MODES, by number."""
 
     @property
     def component(self) -> int:
@@ -77,6 +81,8 @@ class Senders:
         """Number of seconds with a valid message, by sender and message id."""
         self.frame_origins: dict[int, Position] = {}
         """First origin of LOCAL_POSITION_NED by sender."""
+        self.modes: defaultdict[int, dict[int, str]] = defaultdict(dict)
+        """Names of the custom modes by number, by sender."""
 
     def add(self, batch: Batch) -> None:
         """Add the next batch of a file."""
@@ -87,6 +93,9 @@ class Senders:
         for i in np.flatnonzero(batch.message_ids == ORIGIN_ID).tolist():
             if (found := named_position(fields_of(batch.frame(i)))) is not None:
                 self.frame_origins.setdefault(int(batch.origins[i]), found)
+        for i in np.flatnonzero(batch.message_ids == MODES_ID).tolist():
+            mode = fields_of(batch.frame(i))
+            self.modes[int(batch.origins[i])][mode["custom_mode"]] = text_of(mode["mode_name"])
         for message_id in _COUNTED:
             rows = np.flatnonzero(batch.message_ids == message_id)
             if len(rows) and message_id in POSITION_SOURCES:
@@ -117,6 +126,7 @@ class Senders:
             _best(attitude) or ATTITUDE_QUATERNION_ID,
             self.heartbeats.get(origin),
             self.frame_origins.get(origin),
+            dict(self.modes.get(origin, {})),
         )
 
     def systems(self) -> list[int]:
@@ -131,6 +141,8 @@ class Senders:
         self.heartbeats = {**other.heartbeats, **self.heartbeats}
         self.seconds += other.seconds
         self.frame_origins = {**other.frame_origins, **self.frame_origins}
+        for origin, names in other.modes.items():
+            self.modes[origin] |= names
 
     def _add_heartbeats(self, batch: Batch) -> None:
         for message_id in (HEARTBEAT_ID, HIGH_LATENCY2_ID):

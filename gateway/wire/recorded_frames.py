@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.wire.frame_scan import TIME_SIZE
-from gateway.wire.mavlink_messages import layout_of
+from gateway.wire.mavlink_messages import DEFINITIONS, layout_of
 from gateway.wire.mavlink_splitter import PAYLOAD_V1, PAYLOAD_V2, START_V2, message_id_of
 
 IntArray = NDArray[np.int64]
@@ -110,6 +110,20 @@ def fields_of(frame: bytes) -> dict[str, Any]:
     layout = layout_of(message_id_of(frame))
     values = np.frombuffer(payload_of(frame, layout.itemsize), layout)[0].item()
     return dict(zip(layout.names or (), values, strict=True))
+
+
+def fields_of_rows(batch: "Batch", wanted: IntArray) -> list[dict[str, Any]]:
+    """Return the fields of some frames, as `fields_of`; empty for unknown messages."""
+    found: list[dict[str, Any]] = [{}] * len(wanted)
+    ids = batch.message_ids[wanted]
+    for message_id in np.unique(ids).tolist():
+        if message_id not in DEFINITIONS:
+            continue
+        rows, names = np.flatnonzero(ids == message_id), layout_of(message_id).names or ()
+        columns = columns_of(batch, wanted[rows], message_id).tolist()
+        for row, values in zip(rows.tolist(), columns, strict=True):
+            found[row] = dict(zip(names, values, strict=True))
+    return found
 
 
 def columns_of(batch: "Batch", wanted: IntArray, message_id: int) -> NDArray[np.void]:

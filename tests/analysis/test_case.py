@@ -13,13 +13,14 @@ from gateway.analysis.case import (
     summarise,
     withheld_error_m,
 )
-from gateway.analysis.flight import FlightTrack, LocalFrame, local_frame
+from gateway.analysis.flight import FlightTrack, local_frame
 from gateway.analysis.pilot_figures import pilot_figures
 from gateway.analysis.reporting.estimators import comparison
 from gateway.analysis.simulated import simulated_flight
 from gateway.analysis.sweep import with_values
 from gateway.recordings.fuse import with_estimator
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.vehicle_state.positions import LocalFrame
 from tests.analysis.flights import DURATION_S, short_case, short_flight, true_track, with_imu
 
 

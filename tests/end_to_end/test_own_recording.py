@@ -200,24 +200,29 @@ def test_summary_names_vehicles_and_gives_stations_no_distance(tlog: Path) -> No
     vehicles = {vehicle["system_id"]: vehicle for vehicle in found["vehicles"]}
     assert vehicles[1]["positions"] == vehicles[2]["positions"] == "GLOBAL_POSITION_INT"
     assert vehicles[1]["mav_type"] == mavlink.MAV_TYPE_FIXED_WING
-    assert vehicles[255]["distance_m"] is vehicles[255]["positions"] is None
+    assert vehicles[255]["facts"] is vehicles[255]["positions"] is None
     assert " km" not in invoke("info", tlog, code=0).output.split("system 255")[1]
 
 
 def test_catalogue_is_read_by_sqlite_and_agrees_with_the_summary(folder: Path, tlog: Path) -> None:
     invoke("info", folder, code=0)
     with sqlite3.connect(folder / "catalogue.sqlite") as db:
-        rows = db.execute("SELECT kind, vehicle, distance, error FROM flights").fetchall()
-    assert sorted((kind, vehicle) for kind, vehicle, _, _ in rows) == [
+        columns = "kind, vehicle, error, distance, airborne, highest, height_above, fastest"
+        rows = db.execute(f"SELECT {columns} FROM flights").fetchall()
+    assert sorted((kind, vehicle) for kind, vehicle, *_ in rows) == [
         ("table", 1), ("table", 2), ("tlog", 1), ("tlog", 2),
     ]  # fmt: skip
-    assert {error for *_, error in rows} == {None}
+    assert {error for _, _, error, *_ in rows} == {None}
     info = json.loads(invoke("info", "--json", tlog, code=0).output)
-    by_info = {one["system_id"]: one["distance_m"] for one in info["vehicles"]}
-    assert all(
-        distance == pytest.approx(by_info[vehicle])
-        for kind, vehicle, distance, _ in rows if kind == "tlog"
-    )  # fmt: skip
+    by_info = {one["system_id"]: one["facts"] for one in info["vehicles"]}
+    for kind, vehicle, _, *facts in rows:
+        if kind == "tlog":
+            assert facts == [
+                by_info[vehicle][name]
+                for name in (
+                    *("distance_m", "airborne_s", "highest_m", "height_above", "fastest_mps"),
+                )
+            ]
 
 
 def test_tables_are_fused_again_and_recovered(folder: Path, tlog: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.config import GatewaySettings
-from gateway.panel.playback import FUSED_AGAIN, RECORDED, free_ids, look_into
+from gateway.panel.playback import FUSED_AGAIN, RECORDED, free_ids, recorded_aircraft
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.table import encode_head
 from gateway.units import US_PER_S
@@ -24,7 +24,7 @@ def test_heights_of_each_aircraft_in_a_tlog_are_read(tmp_path: Path) -> None:
     for n in range(5):
         sent += [((1, 1), at(alt_m=100 + n)), ((7, 1), at(alt_m=300))]
     tlog = write_tlog(tmp_path / "two_01.tlog", records_sent(sent, US_PER_S // 2))
-    ((first, second),) = look_into([tlog])
+    ((first, second),) = recorded_aircraft([tlog])
     assert (first.recorded_id, second.recorded_id) == (1, 7)
     assert {first.origin, second.origin} == {RECORDED}
     assert first.profile.time_s == (0.5, 1.5, 2.5, 3.5, 4.5)
@@ -37,7 +37,7 @@ def test_heights_of_a_table_are_of_its_states(tmp_path: Path, rng: np.random.Gen
     header = replace(header, vehicle_id=7)
     table = tmp_path / "a_01_v1.csv"
     table.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
-    ((found,),) = look_into([table])
+    ((found,),) = recorded_aircraft([table])
     assert (found.recorded_id, found.origin) == (7, FUSED_AGAIN)
     assert found.profile.time_s[-1] == pytest.approx(10.0, abs=0.5)
     heights = [row.state.alt_amsl_m for row in rows if row.state is not None]

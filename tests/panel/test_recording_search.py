@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gateway.batch.catalogue import Catalogue, CataloguedFile, FlightFigures
-from gateway.batch.facts import FlightFacts
+from gateway.batch.facts import CataloguedFlight
 from gateway.panel.recording_search import RecordingFacts
 
 pytestmark = pytest.mark.io
@@ -15,7 +15,7 @@ def catalogue(folder: Path, **seconds: float) -> None:
     catalogue = Catalogue(folder)
     for name, duration in seconds.items():
         for kind in ("tlog", "table"):
-            facts = FlightFacts(duration=duration, loss=0.1 if kind == "table" else None)
+            facts = CataloguedFlight(duration=duration, loss=0.1 if kind == "table" else None)
             path = f"{name}.{kind}"
             catalogue.put([CataloguedFile(path, name, kind, 1, 1, path, flights=((facts, []),))])
     catalogue.close()

@@ -36,13 +36,13 @@ def sum_up(data: bytes, chunk: int = 777) -> FileInfo:
     for begin in range(0, len(data), chunk):
         summary.add(scanner.feed(data[begin : begin + chunk]))
     summary.add(scanner.feed(b"", final=True))
-    return summary.result(len(data))
+    return summary.result(len(data)).info
 
 
 def sum_up_table(data: bytes) -> FileInfo:
     summary, reader = TableSummary(), TableReader()
     summary.add(reader.feed_block(data, final=True), reader.header)
-    return summary.result(len(data))
+    return summary.result(len(data)).info
 
 
 def test_tlog_is_summarised() -> None:
@@ -52,7 +52,8 @@ def test_tlog_is_summarised() -> None:
     assert (info.first_us, info.duration_s) == (START_US, 100.0)
     (vehicle,) = info.vehicles
     assert (vehicle.system_id, vehicle.mav_type, vehicle.autopilot) == (7, 1, 3)
-    assert vehicle.distance_m == pytest.approx(1000, rel=0.01)
+    assert vehicle.facts is not None
+    assert vehicle.facts.distance_m == pytest.approx(1000, rel=0.01)
     assert vehicle.positions == "GLOBAL_POSITION_INT"
     assert vehicle.rates == (Rate("HEARTBEAT", 101, 1.01), Rate("GLOBAL_POSITION_INT", 101, 1.01))
     assert info.gaps == ()

@@ -11,13 +11,14 @@ from matplotlib.ticker import MaxNLocator
 
 from gateway.analysis.blending import interpolate
 from gateway.analysis.case import Case
-from gateway.analysis.flight import FlightTrack, FloatArray, IntArray, LocalFrame
+from gateway.analysis.flight import FlightTrack, FloatArray, IntArray
 from gateway.analysis.metrics import euler_rad, rms, worst
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.quaternion import integrate_rate
 from gateway.units import US_PER_S
+from gateway.vehicle_state.positions import LocalFrame
 
 PAPER: Final = "paper"
 GYRO: Final = "gyroscope alone"

@@ -42,7 +42,7 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.index import Recording, list_recordings
 from gateway.recordings.moment import civil_time
-from gateway.recordings.summary import DAMAGED_TIME, FileInfo, VehicleInfo, describe
+from gateway.recordings.summary import DAMAGED_TIME, FileInfo, VehicleInfo, read_summary
 from gateway.recordings.table import TableFault, TableHeader, TableReader, encode_block, encode_head
 from gateway.units import US_PER_S, counted
 
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-WHOLE: Final = ("vehicle", "duration", "highest", "gps_outages", "faults")
+WHOLE: Final = ("vehicle", "duration", "gps_outages", "faults")
 """Columns of the catalogue that are shown without decimals."""
 SHOWN: Final = 8
 """Gaps and damaged ranges that are listed individually."""
@@ -110,7 +110,7 @@ def info(
         def options() -> ReadOptions:
             return read_options(read_settings(), columns, progress=advance)
 
-        found = [(each, describe(each, advance, options)) for each in files]
+        found = [(each, read_summary(each, advance, options).info) for each in files]
     for number, (each, info_of_file) in enumerate(found):
         if json:
             print_json(info_of_file)
@@ -223,11 +223,12 @@ def _show(file: Path, found: FileInfo) -> None:
     console.print(f"{counted(found.records, 'record')} in {_clock(found.duration_s)}{_when(found)}")
     if found.header is not None:
         head = found.header
-        console.print(
-            f"recording {head.session or '?'}, part {head.part}, by mavgate {head.mavgate_version}",
-        )
+        session = f"recording {head.session}, " if head.session else ""
+        session += f"part {head.part}, " if head.session or head.part > 1 else ""
+        console.print(f"{session}by mavgate {head.mavgate_version or UNKNOWN}")
     for vehicle in found.vehicles:
-        console.print(f"\n{_heading(vehicle, found.kind)}", _rates(vehicle), sep="\n")
+        console.print(f"\n{_heading(vehicle, found.kind)}", *_figures_of(vehicle), sep="\n")
+        console.print(_rates(vehicle))
     begin_us = found.first_us or 0
     gaps = [(gap.duration_s, (gap.time_us - begin_us) / US_PER_S) for gap in found.gaps]
     _print_some([f"gap of {long_s:.1f} s at {_clock(at_s)}" for long_s, at_s in gaps], "more gap")
@@ -255,9 +256,24 @@ def _heading(vehicle: VehicleInfo, kind: str) -> str:
     if vehicle.mav_type is not None:
         title += f": {_enum_name('MAV_TYPE', vehicle.mav_type)}"
         title += f", {_enum_name('MAV_AUTOPILOT', vehicle.autopilot or 0)}"
-    if vehicle.distance_m is None:
-        return title
-    return f"{title}; {vehicle.distance_m / 1000:.3f} km by {vehicle.positions}"
+    return title
+
+
+def _figures_of(vehicle: VehicleInfo) -> list[str]:
+    """Return the facts of a flight as lines of text."""
+    facts = vehicle.facts
+    if facts is None:
+        return []
+    above, distance_m = f"m above {facts.height_above}", facts.distance_m
+    parts = (
+        distance_m is not None and f"{distance_m / 1000:.3f} km by {vehicle.positions}",
+        facts.airborne_s is not None and f"in the air {_clock(facts.airborne_s)}",
+        facts.armed_s is not None and f"armed {_clock(facts.armed_s)}",
+        facts.highest_m is not None and f"highest {facts.highest_m:.0f} {above}",
+        facts.fastest_mps is not None and f"fastest {facts.fastest_mps:.1f} m/s",
+    )
+    text = ", ".join(part for part in parts if part)
+    return [text] if text else []
 
 
 def _rates(vehicle: VehicleInfo) -> Table:
@@ -347,8 +363,8 @@ def _show_flights(rows: list[Row]) -> None:
     from gateway.batch.catalogue import figures_of
 
     grid = table_of(
-        "file", "kind", "began (UTC)", "aircraft", "duration, s", "distance, km", "highest, m",
-        "fastest, m/s", "GPS outages", "faults", "loss", left=3,
+        "file", "kind", "began (UTC)", "aircraft", "duration, s", "distance, km",
+        "highest, m above", "fastest, m/s", "GPS outages", "faults", "loss", left=3,
     )  # fmt: skip
     for row in rows:
         if row["error"] is not None:
@@ -358,8 +374,9 @@ def _show_flights(rows: list[Row]) -> None:
         whole = {key: figure(row[key], ".0f") for key in WHOLE}
         grid.add_row(
             row["path"], row["kind"], row["began"] or UNKNOWN, whole["vehicle"], whole["duration"],
-            figure(km, ".2f"), whole["highest"], figure(row["fastest"], ".1f"),
-            whole["gps_outages"], whole["faults"], figure(row["loss"], ".1%"),
+            figure(km, ".2f"), figure(row["highest"], ".0f", row["height_above"] or ""),
+            figure(row["fastest"], ".1f"), whole["gps_outages"], whole["faults"],
+            figure(row["loss"], ".1%"),
         )  # fmt: skip
     console_of().print(grid)
     lasted_s = [one.duration for flown in figures_of(rows).values() for one in flown.values()]
@@ -373,8 +390,8 @@ def _show_flights(rows: list[Row]) -> None:
 
 def _show_list(recordings: list[Recording], figures: dict[str, dict[int, FlightFigures]]) -> None:
     grid = table_of(
-        "recording", "length", "vehicles", "km", "height, m", "loss", "MB", "last written (UTC)",
-        "path",
+        "recording", "length", "vehicles", "km", "highest, m above", "loss", "MB",
+        "last written (UTC)", "path",
     )  # fmt: skip
     for recording in recordings:
         flown = figures.get(recording.name, {})
@@ -385,7 +402,7 @@ def _show_list(recordings: list[Recording], figures: dict[str, dict[int, FlightF
             UNKNOWN if length_s is None else duration_text(length_s),
             " ".join(map(str, sorted(flown))) or UNKNOWN,
             _each(each, lambda f: figure(f.distance and f.distance / 1000, ".2f")),
-            _each(each, lambda f: figure(f.highest, ".0f")),
+            _each(each, _height_text),
             _each(each, lambda f: figure(f.loss, ".1%")),
             f"{recording.size / 1e6:.2f}",
             UNKNOWN if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
@@ -397,6 +414,10 @@ def _show_list(recordings: list[Recording], figures: dict[str, dict[int, FlightF
 def _length_s(flown: dict[int, FlightFigures]) -> float | None:
     """Return the length of a recording from the figures of its vehicles; None if unknown."""
     return max((figures.duration for figures in flown.values()), default=None)
+
+
+def _height_text(figures: FlightFigures) -> str:
+    return figure(figures.highest, ".0f", figures.height_above or "")
 
 
 def _each(figures: list[FlightFigures], text: Callable[[FlightFigures], str]) -> str:

@@ -202,6 +202,6 @@ def _facts_cells(facts: FlightFigures | str | None) -> Cells:
     return (
         str(timedelta(seconds=round(facts.duration))),
         figure(distance and distance / 1000.0, ".2f", "km"),
-        figure(highest, ".0f", "m"),
+        figure(highest, ".0f", f"m above {facts.height_above}"),
         (figure(loss, ".1%"), "warn" if (loss or 0.0) > MUCH_LOST else ""),
     )

@@ -127,11 +127,8 @@ class RowReader:
             topic, _, name = where.partition(".")
             self._columns.setdefault(topic, set()).add(name)
         self._items: dict[int, LoggedItem] = {}
-
-    @property
-    def names(self) -> set[str]:
+        self.names = {*table().topics, "ORGN", *KINDS}
         """Names of the messages that are read."""
-        return {*table().topics, "ORGN", *KINDS}
 
     def feed(self, name: str, message: Message) -> list[Entry]:
         """Process the next message."""

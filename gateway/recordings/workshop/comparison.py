@@ -7,31 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from gateway.answers.log_answers import AUTOPILOT_VERSION_ID
 from gateway.printable import printable
 from gateway.recordings.files import FlightError
-from gateway.recordings.vehicle_reader import VehicleMessage
+from gateway.recordings.flight_facts import FlightFacts
+from gateway.recordings.tallies import FACT_IDS, VehicleTally
 from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.recordings.workshop.extracts import RecordedPlan, parameter_text
-from gateway.units import US_PER_S
 from gateway.vehicle.plan import KINDS, Item
-from gateway.vehicle_state.positions import GroundDistance
-from gateway.wire.frame_scan import TIME_SIZE
-from gateway.wire.mavlink_messages import MESSAGE_IDS
-from gateway.wire.mavlink_splitter import SEQUENCE_V1, SEQUENCE_V2, START_V2
-from gateway.wire.recorded_frames import Batch
 
 MAX_PARAM_FILE: Final = 4 << 20
 """Maximum size, bytes; a vehicle has about 1,500 parameters of 30 bytes each."""
-MAX_TEXTS: Final = 10_000
-"""Maximum number of different texts of a recording that are compared."""
-ERROR: Final = 3
-"""MAV_SEVERITY of an error; smaller values are more severe."""
-VIBRATION: Final = ("vibration_x", "vibration_y", "vibration_z")
-_IDS: Final = {name: MESSAGE_IDS[name] for name in ("BATTERY_STATUS", "VIBRATION", "GPS_RAW_INT")}
-UNKNOWN_U8: Final = 0xFF
 FIXED_DECIMALS: Final = 6
 """Decimals of all values in MAVProxy's parameter files."""
 FLOAT_STEP: Final = 2.0**-23
@@ -154,92 +140,45 @@ def read_param_file(path: Path) -> Contents:
     return found
 
 
-class FlownFigures:
-    """Collect the figures of a flight, message by message."""
-
-    def __init__(self) -> None:
-        self.texts: set[str] = set()
-        self.errors = 0
-        self.distance = GroundDistance()
-        self.used_mah: dict[int, tuple[int, int]] = {}
-        """Charge used by battery: the first and the last value."""
-        self.greatest_vibration_mps2 = 0.0
-        self.fewest_satellites: int | None = None
-        self.lost = self.received = 0
-        self._sequence: int | None = None
-
-    def add_batch(self, batch: Batch, origin: int) -> None:
-        """Count the vehicle's lost frames by gaps in their sequence numbers."""
-        data, rows = np.frombuffer(batch.data, np.uint8), batch.origins == origin
-        starts = batch.starts[rows] + TIME_SIZE
-        at = np.where(data[starts] == START_V2, SEQUENCE_V2, SEQUENCE_V1)
-        numbers = data[starts + at].astype(np.int64)
-        if not len(numbers):
-            return
-        before = int(numbers[0]) - 1 if self._sequence is None else self._sequence
-        gaps = (np.diff(numbers, prepend=before) - 1) & 0xFF
-        # A large step is a restart, or a frame that was received twice.
-        self.lost += int(gaps[gaps < 128].sum())
-        self.received += len(numbers)
-        self._sequence = int(numbers[-1])
-
-    def add(self, message: VehicleMessage) -> None:
-        """Process the next message of the vehicle."""
-        fields, at = message.fields, message.position
-        if message.text is not None:
-            self.errors += message.text.severity <= ERROR
-            if len(self.texts) < MAX_TEXTS:
-                self.texts.add(message.text.text)
-        if at is not None:
-            self.distance.update(message.time_us, at.lat_deg, at.lon_deg, message.boot_us)
-        if message.message_id == _IDS["BATTERY_STATUS"] and fields["current_consumed"] >= 0:
-            used = fields["current_consumed"]
-            first, _ = self.used_mah.get(fields["id"], (used, used))
-            self.used_mah[fields["id"]] = (first, used)
-        elif message.message_id == _IDS["VIBRATION"]:
-            worst = max(fields[axis] for axis in VIBRATION)
-            self.greatest_vibration_mps2 = max(self.greatest_vibration_mps2, worst)
-        elif message.message_id == _IDS["GPS_RAW_INT"]:
-            count = fields["satellites_visible"]
-            if count != UNKNOWN_U8:
-                known = self.fewest_satellites
-                self.fewest_satellites = count if known is None else min(known, count)
-
-    def figures(self, duration_s: float) -> dict[str, str]:
-        """Return the known figures as text."""
-        found = {"duration": f"{duration_s:.1f} s"}
-        if self.distance.distance_m is not None:
-            found["distance"] = f"{self.distance.distance_m:.0f} m"
-        for number, (first, last) in sorted(self.used_mah.items()):
-            found[f"charge used, battery {number}"] = f"{last - first} mAh"
-        if self.greatest_vibration_mps2:
-            found["greatest vibration"] = f"{self.greatest_vibration_mps2:.1f} m/s2"
-        if self.fewest_satellites is not None:
-            found["fewest satellites"] = str(self.fewest_satellites)
-        if self.received:
-            share = self.lost / (self.lost + self.received)
-            found["lost frames"] = f"{self.lost} ({share:.2%})"
-        found["errors"] = str(self.errors)
-        return found
-
-
 def read_recording(name: str, recording: VehicleRecording) -> Contents:
     """Read the compared content of a recording; raises FlightError if it has no vehicle."""
-    facts, reader = FlownFigures(), recording.reader(_IDS.values())
-    last_us = 0
+    reader = recording.reader(FACT_IDS)
+    tally = VehicleTally(reader.vehicle(recording.system_id))
     for batch in recording.batches():
-        last_us = int(batch.time_us[-1]) if len(batch) else last_us
-        if recording.flight.is_mavlink:
-            facts.add_batch(batch, reader.vehicle(recording.system_id or 0).origin)
+        tally.add_batch(batch)
         for message in reader.feed_batch(batch):
-            facts.add(message)
+            tally.update(message)
     for message in reader.flush():
-        facts.add(message)
+        tally.update(message)
     found = contents_of(name, recording.plan())
-    found.figures |= facts.figures((last_us - recording.first_us) / US_PER_S)
-    found.texts, found.is_flight = facts.texts, True
+    found.figures |= figures_of(tally.facts())
+    found.texts, found.is_flight = {text for _, _, text in tally.texts}, True
     defaults = recording.flight.defaults.items()
     found.defaults = {name: parameter_text(value) for name, value in defaults}
+    return found
+
+
+def figures_of(facts: FlightFacts) -> dict[str, str]:
+    """Return the known figures of a flight as text."""
+    found = {"duration": f"{facts.duration_s:.1f} s"}
+    above = f"highest above {facts.height_above}"
+    for name, value, form in (
+        ("in the air", facts.airborne_s, ".1f s"),
+        ("armed", facts.armed_s, ".1f s"),
+        ("distance", facts.distance_m, ".0f m"),
+        (above, facts.highest_m, ".1f m"),
+        ("fastest", facts.fastest_mps, ".1f m/s"),
+        *((f"charge used, battery {n}", mah, "d mAh") for n, mah in sorted(facts.used_mah.items())),
+        ("greatest vibration", facts.vibration_mps2, ".1f m/s2"),
+        ("fewest satellites", facts.satellites, "d"),
+    ):
+        number_form, _, unit = form.partition(" ")
+        if value is not None:
+            found[name] = f"{value:{number_form}} {unit}".rstrip()
+    if facts.frames_received:
+        share = facts.frames_lost / (facts.frames_lost + facts.frames_received)
+        found["lost frames"] = f"{facts.frames_lost} ({share:.2%})"
+    found["errors"] = str(facts.errors)
     return found
 
 

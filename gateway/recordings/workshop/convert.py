@@ -98,7 +98,8 @@ class FlightToWrite:
         self.fusions: list[RecordedFusion] = []
         """The fusions made to write the file."""
         self._tables: list[RecordedTable] = []
-        self._logs: list[AutopilotLog] = []
+        self.logs: list[AutopilotLog] = []
+        """The logs of autopilots among the files, once they are read."""
         self._remarks: list[str] = []
         self.senders = Senders()
         """Senders of the MAVLink; known once its frames are requested."""
@@ -118,10 +119,16 @@ class FlightToWrite:
         yield from editor.apply(self._batches(editor, sources), self.senders)
 
     def chosen(self) -> Iterator[Batch]:
-        """Yield the selected MAVLink, of all messages, not edited."""
+        """Yield the selected MAVLink, of all messages, not edited; its senders are known."""
         choice = replace(self._edits.choice, messages=frozenset())
         editor = TlogEditor(replace(self._edits, choice=choice), self._limits, self.remark)
-        return editor.chosen(self._batches(editor, self._sources), self.senders)
+        batches: Iterable[Batch] = self._batches(editor, self._sources)
+        if not self.is_mavlink:
+            # The senders of MAVLink that is made are known once all of it is.
+            batches = [*batches]
+            for batch in batches:
+                self.senders.add(batch)
+        return editor.chosen(batches, self.senders)
 
     def _batches(self, editor: TlogEditor, sources: list[TlogSource]) -> Iterator[Batch]:
         if self.is_mavlink:
@@ -191,19 +198,19 @@ class FlightToWrite:
     @property
     def remarks(self) -> list[str]:
         """Remarks for the user; complete once all is written."""
-        read: list[AutopilotLog | RecordedTable] = [*self._logs, *self._tables]
+        read: list[AutopilotLog | RecordedTable] = [*self.logs, *self._tables]
         found = [*read, *self.fusions]
         return [*self._remarks, *(remark for source in found for remark in source.remarks)]
 
     @property
     def defaults(self) -> dict[str, float]:
         """Default values of parameters, stated by the logs of autopilots, by name."""
-        return {name: value for log in self._logs for name, value in log.defaults.items()}
+        return {name: value for log in self.logs for name, value in log.defaults.items()}
 
     def lacks(self, ending: str) -> str:
         """Describe the content that a format cannot hold, once all is written; empty if none."""
-        if self._logs and ending == ".tlog":
-            return "; ".join(filter(None, (log.lacks for log in self._logs)))
+        if self.logs and ending == ".tlog":
+            return "; ".join(filter(None, (log.lacks for log in self.logs)))
         lacks = LACKS[ending]
         return lacks.of_tlogs if self.has_messages else lacks.of_tables
 
@@ -227,9 +234,9 @@ class FlightToWrite:
             for file in self.files:
                 log = open_record(file, self.options)
                 streams.append(RecordTranslator(log).frames())
-                self._logs.append(log)
+                self.logs.append(log)
         if self._estimates == "both":
-            second = beside_id(self._logs[0].vehicle_id)
+            second = beside_id(self.logs[0].vehicle_id)
             self.options = replace(self.options, system_id=second, progress=None)
         if self._estimates != "own":
             streams += [part.fused().frames() for part in self.by_aircraft()]

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, cast
+from typing import Final, cast
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -17,7 +17,6 @@ from gateway.units import DEGE7_PER_DEG, US_PER_S
 from gateway.vehicle_state.newest import NewestState
 from gateway.vehicle_state.positions import GroundDistance, Position, is_located
 from gateway.vehicle_state.status_texts import text_of
-from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS, MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import origin_of
 
@@ -41,12 +40,6 @@ MAX_GAP_US: Final = 5 * US_PER_S
 """Maximum age of a state that is shown."""
 _LANDED: Final = {1: "on the ground", 2: "in flight", 3: "taking off", 4: "landing"}
 """Texts by MAV_LANDED_STATE."""
-
-
-def _mode_of(fields: Any) -> str:
-    """Return the mode in a heartbeat under the autopilot's name for it, or as a number."""
-    number = fields["custom_mode"]
-    return mode_name(fields["autopilot"], fields["type"], number) or str(number)
 
 
 def texts(messages: Iterable[VehicleMessage]) -> str:
@@ -76,7 +69,7 @@ def _event_values(message: VehicleMessage) -> list[tuple[str, str]]:
     fields = message.fields
     if message.message_id == HEARTBEAT_ID:
         is_armed = fields["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-        return [("armed", "yes" if is_armed else "no"), ("mode", _mode_of(fields))]
+        return [("armed", "yes" if is_armed else "no"), ("mode", message.mode)]
     if message.message_id == LANDED_ID:
         return [("landed", _LANDED.get(fields["landed_state"], "unknown"))]
     if message.message_id == REACHED_ID:
@@ -122,22 +115,24 @@ class _Shown:
         self.newest_us = 0
         self._state, self._ground = NewestState(), GroundDistance()
         self._at: Position | None = None
+        self._mode = UNKNOWN
 
     def feed(self, message: VehicleMessage) -> None:
         """Process the next message of the vehicle."""
         self.newest_us = message.time_us
         self._state.update(MESSAGE_NAMES[message.message_id], message.fields, message.time_us)
+        self._mode = message.mode or self._mode
         if (at := message.position) is not None:
             self._at = at
             self._ground.update(message.time_us, at.lat_deg, at.lon_deg, message.boot_us)
 
     def text(self, names: Sequence[str]) -> str:
         """Return one line of the chosen fields that are known."""
-        beat, at = self._state.fields.get("HEARTBEAT"), self._at or Position(NAN, NAN)
+        at = self._at or Position(NAN, NAN)
         volts, percent = self._state.battery()
         is_above_home = math.isfinite(at.alt_home_m)
         known = {
-            "mode": [UNKNOWN if beat is None else _mode_of(beat)],
+            "mode": [self._mode],
             "height": [figure(at.alt_home_m if is_above_home else at.alt_amsl_m, ".1f", "m")],
             "speed": [figure(at.groundspeed_mps, ".1f", "m/s")],
             "distance": [figure(self._ground.distance_m, ".0f", "m flown")],

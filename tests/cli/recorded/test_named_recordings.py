@@ -64,7 +64,7 @@ def test_info_fuse_and_convert_accept_a_name(config: Path, tmp_path: Path, name:
     for file in (config.parent / "recordings").glob("lake*"):
         file.unlink()
     found = run("info", name, "--config", config)
-    assert found.count("part 1, by mavgate") + found.count("tlog, ") >= 2
+    assert found.count("by mavgate") + found.count("tlog, ") >= 2
     assert len(run("info", name, "--json", "--config", config).splitlines()) == 3
     states, table, joined = (tmp_path / name for name in ("states.csv", "again.csv", "again.tlog"))
     run("fuse", name, "-o", states, "--config", config)
