@@ -20,13 +20,15 @@ from gateway.analysis.flight import (
     smooth_track,
 )
 from gateway.analysis.metrics import errors_over_time, greatest, rms
-from gateway.analysis.pilot_figures import PilotFigures, pilot_figures
+from gateway.analysis.pilot import PilotFlight, pilot_flight_of_samples
 from gateway.analysis.signals import apply
 from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
+from gateway.recordings.flight_facts import HOME
 from gateway.recordings.fuse import FusionSettings, with_estimator
+from gateway.records import NAN
 from gateway.settings import Settings, fields_of
 from gateway.units import US_PER_S
-from gateway.vehicle_state.positions import LocalFrame, ground_distance_m
+from gateway.vehicle_state.positions import LocalFrame
 
 ESTIMATORS: Final[tuple[str, ...]] = tuple(
     name for name in OWN_ESTIMATORS if name in EstimationSettings.__struct_fields__
@@ -54,6 +56,8 @@ class Case:
     """Local frame in metres around the first fix; None for a flight without GPS."""
     smoothed_latency_s: float | None = None
     """GPS latency of the smoothed track, estimated if the motion contradicts the setting."""
+    recorded: PilotFlight | None = None
+    """The flight as its recording contains it, if it is known."""
 
     @property
     def chosen(self) -> str:
@@ -71,9 +75,9 @@ class Case:
         return fixes_of(self.flight)
 
     @cached_property
-    def figures(self) -> PilotFigures | None:
-        """Key figures of the flight; None without GPS."""
-        return None if self.frame is None else pilot_figures(self.flight, self.track, self.frame)
+    def pilot(self) -> PilotFlight:
+        """The flight as its recording contains it, else its samples and fixes."""
+        return self.recorded or pilot_flight_of_samples(self.flight)
 
     @property
     def truth_name(self) -> str:
@@ -83,7 +87,11 @@ class Case:
 
 
 def make_case(
-    flight: Flight, fusion: FusionSettings | None = None, *, smooth: bool = False
+    flight: Flight,
+    fusion: FusionSettings | None = None,
+    *,
+    smooth: bool = False,
+    recorded: PilotFlight | None = None,
 ) -> Case:
     """Fuse a flight with every estimator."""
     fusion = fusion or flight.fusion
@@ -93,27 +101,32 @@ def make_case(
         # Smoothing is not possible if the clock was set back.
         with suppress(ValueError):
             tracks[SMOOTHED], latency_s = smooth_track(flight, fusion)
-    return Case(flight, fusion, tracks, local_frame(flight), latency_s)
+    return Case(flight, fusion, tracks, local_frame(flight), latency_s, recorded)
+
+
+def recorded_summary(flight: PilotFlight) -> dict[str, float]:
+    """Return the facts of a flight that its summary contains, by name; NaN if unknown."""
+    facts = flight.facts
+    return {
+        "duration, s": facts.duration_s,
+        "distance flown, m": _known(facts.distance_m),
+        f"greatest height above {facts.height_above or HOME}, m": _known(facts.highest_m),
+        "greatest ground speed, m/s": _known(facts.fastest_mps),
+    }
 
 
 def summarise(case: Case) -> dict[str, float]:
     """Return the summary of a flight, by name."""
     flight, track = case.flight, case.track
     gap_s = np.diff(case.fixes.arrival_us) / US_PER_S
-    alt_m = track.alt_amsl_m[flight.scored]
-    alt_m = alt_m[np.isfinite(alt_m)]
     filtering = case.fusion.estimation.paper
     smooth = apply(filtering.accel_filter, filtering, flight.rate_hz, flight.imu.accel_b_mps2)
     shaking = flight.imu.accel_b_mps2 - smooth
-    speed = np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1])
     found = {
-        "duration, s": flight.duration_s,
+        **recorded_summary(case.pilot),
         "IMU samples a second": flight.rate_hz,
         "usable GPS fixes": float(len(case.fixes)),
         "longest time without a fix, s": greatest(gap_s),
-        "distance flown, m": ground_distance_m(track.time_us, track.lat_deg, track.lon_deg),
-        "greatest height above the start, m": greatest(alt_m - alt_m[:1]),
-        "greatest ground speed, m/s": greatest(speed[flight.scored]),
         "shaking above the low-pass, m/s² RMS": rms(shaking),
         "error at withheld fixes, m RMS": withheld_error_m(case, case.chosen),
     }
@@ -127,6 +140,10 @@ def summarise(case: Case) -> dict[str, float]:
         ):
             found[name] = rms(errors[key][flight.scored])
     return found
+
+
+def _known(value: float | None) -> float:
+    return NAN if value is None else value
 
 
 def withheld_error_m(case: Case, estimator: str) -> float:

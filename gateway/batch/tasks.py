@@ -18,8 +18,16 @@ from typing import Any, ClassVar, Final
 import msgspec
 
 from gateway import __version__
-from gateway.analysis.case import Case, make_case, outage_error_m, summarise, withheld_error_m
+from gateway.analysis.case import (
+    Case,
+    make_case,
+    outage_error_m,
+    recorded_summary,
+    summarise,
+    withheld_error_m,
+)
 from gateway.analysis.flight import Flight, estimator_of, flight_of_files
+from gateway.analysis.pilot import PilotFlight, read_pilot_flight
 from gateway.analysis.sweep import Axis, SweepError, grid, make_contest, run_trial, score_of
 from gateway.batch.executors import Executor, WorkFailed
 from gateway.batch.facts import began_text
@@ -121,8 +129,15 @@ class JudgeTask(FlightTask):
 
     def do(self, files: list[Path], name: str) -> Worked:
         """See `FlightTask`."""
-        read = read_batch_flight(files, self.options, name)
-        case = make_case(read.flight)
+        recorded = read_pilot_flight(files, self.options, name)
+        try:
+            read = read_batch_flight(files, self.options, name)
+        except (FlightError, ValueError):
+            # The recording can be read, but it has no samples.
+            made = _page_of(recorded, name) if self.pages else {}
+            figures = {"summary": _known(recorded_summary(recorded))}
+            return Worked(recorded.vehicle_id, began_text(recorded.begin_us), figures, made)
+        case = make_case(read.flight, recorded=recorded)
         states = fuse(read.flight.samples, estimator_of(read.flight, case.fusion)).states
         lines = fused_lines(read.header, read.flight.time_us, states)
         made = {f"fused/{name}.csv": b"".join(lines)}
@@ -131,14 +146,19 @@ class JudgeTask(FlightTask):
         return Worked(read.vehicle, read.began, _figures(case), made)
 
 
-def _page_of(case: Case, name: str) -> Files:
+def _known(figures: Mapping[str, float]) -> dict[str, float]:
+    """Leave out unknown values, since JSON cannot represent NaN."""
+    return {name: value for name, value in figures.items() if value == value}
+
+
+def _page_of(made: Case | PilotFlight, name: str) -> Files:
     """Make the page of a flight."""
     # Imported here: these require the extra `plot`, and take a second to import.
     from gateway.analysis.reporting.compose import make_report
     from gateway.analysis.reporting.page import write_report
 
     with TemporaryDirectory(prefix="mavgate-") as folder:
-        write_report(make_report(case), Path(folder), jobs=1)
+        write_report(make_report(made), Path(folder), jobs=1)
         pages = sorted(Path(folder).iterdir())
         return {f"reports/{name}/{page.name}": page.read_bytes() for page in pages}
 
@@ -256,13 +276,12 @@ def name_of(item: BatchItem) -> str:
 
 
 def _figures(case: Case) -> dict[str, Any]:
-    """Summarise one flight; unknown values are left out, since JSON cannot represent NaN."""
-    known = {name: value for name, value in summarise(case).items() if value == value}
+    """Summarise one flight."""
     held = {name: withheld_error_m(case, name) for name in case.tracks}
     drift = {name: outage_error_m(case, name) for name in case.tracks}
     found = {HELD: held, DRIFT: drift}
-    return {"summary": known} | {
-        key: {name: m for name, m in errors.items() if m == m} for key, errors in found.items()
+    return {"summary": _known(summarise(case))} | {
+        key: _known(errors) for key, errors in found.items()
     }
 
 

@@ -259,12 +259,3 @@ class GroundDistance:
                 return
             self._sum_m += step_m
         self._last = (lat_deg, lon_deg)
-
-
-def ground_distance_m(time_us: IntArray, lat_deg: FloatArray, lon_deg: FloatArray) -> float:
-    """Return the distance over ground along positions; NaN positions are skipped."""
-    distance, known = GroundDistance(), np.isfinite(lat_deg)
-    columns = (time_us[known].tolist(), lat_deg[known].tolist(), lon_deg[known].tolist())
-    for at_us, lat, lon in zip(*columns, strict=True):
-        distance.update(at_us, lat, lon)
-    return NAN if distance.distance_m is None else distance.distance_m

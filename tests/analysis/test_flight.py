@@ -11,7 +11,6 @@ from gateway.analysis.case import ESTIMATORS, make_case
 from gateway.analysis.flight import (
     Flight,
     FlightTrack,
-    LocalFrame,
     at_times,
     fixes_of,
     flight_of_blocks,
@@ -32,6 +31,7 @@ from gateway.records import ImuCalibrated, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.vehicle_state.positions import LocalFrame
 from tests.analysis.flights import DURATION_S, short_case, short_flight, true_track, with_imu
 from tests.recordings.flights import record
 from tools.simulated_flight import SimulatedFlight, fly
@@ -174,12 +174,12 @@ def test_nearest_row_is_used_within_time_limit() -> None:
     assert found.vel_n_mps[3].tolist() == [3.0, 3.0, 3.0]
 
 
-def test_report_without_gps_compass_and_reference_has_three_sections() -> None:
+def test_report_without_gps_compass_and_reference_has_four_sections() -> None:
     flight = short_flight()
     bare = replace(flight.with_fixes([False] * len(flight.fixes)), reference=None)
     bare = with_imu(bare, mag_b_ut=np.full_like(flight.imu.mag_b_ut, np.nan))
     titles = [section.title for section in make_report(make_case(bare)).sections]
-    assert titles == ["Acceleration filters", "Noise", "Timing and loss"]
+    assert titles == ["The flight", "Acceleration filters", "Noise", "Timing and loss"]
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

@@ -202,8 +202,8 @@ def test_report_folder_contains_page_and_figures(
     run("report", season / FLIGHTS[0], season / FLIGHTS[1], "-o", tmp_path)
     folder = tmp_path / "reports" / "alpha"
     assert "Flight report: alpha" in (folder / "index.html").read_text()
-    names = {"index.html", "ground_track.png", "ground_track.svg"}
-    assert {file.name for file in folder.iterdir()} == names
+    assert (folder / "ground_track.svg").exists()
+    assert "flight_map.svg" in {file.name for file in folder.iterdir()}
 
 
 def test_two_recordings_with_equal_names_are_kept_apart(season: Path, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Facts of a flight from its positions and states."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import pytest
 
@@ -71,9 +72,9 @@ HOP = [*GROUND[:20], *[9.0] * 2, *GROUND[:38]]
     ],
 )  # fmt: skip
 def test_time_in_the_air(
-    heights_m: list[float], speed_mps: float, known: dict[str, object], airborne_s: float
+    heights_m: list[float], speed_mps: float, known: dict[str, Any], airborne_s: float
 ) -> None:
-    facts = fly(heights_m, [speed_mps] * 60, **known)  # type: ignore[arg-type]
+    facts = fly(heights_m, [speed_mps] * 60, **known)
     assert facts.airborne_s == pytest.approx(airborne_s)
 
 

@@ -1,6 +1,8 @@
 """`mavgate report`: figures and tables of flights, or one flight as an HTML file."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -33,11 +35,15 @@ from gateway.config import GatewaySettings
 from gateway.extras import how_to_add, missing, require
 from gateway.output import check_folder, write_new
 from gateway.printable import figure
+from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import with_reference
 from gateway.recordings.recorded_fusion import smoothed_latency_in_words
 from gateway.recordings.recorded_table import ReadOptions
 
 if TYPE_CHECKING:
+    from gateway.analysis.case import Case
+    from gateway.analysis.pilot import PilotFlight
+    from gateway.analysis.reporting.page import Report
     from gateway.batch.statistics import Versus
     from gateway.batch.tasks import FlightResult
 
@@ -96,9 +102,10 @@ def report(
     """Make figures and tables of flights, or one HTML file of a flight.
 
     The figures and tables include those of the paper; without a recording, the built-in simulated
-    flight is used. Of many recordings or a folder, every estimator is scored on every flight;
-    finished ones are not repeated, and the exit code is 1 if one failed. The HTML file opens
-    offline in any browser: instruments, 3D, plan, plots and events.
+    flight is used. Those of the paper require IMU samples; without them the page has track, height,
+    speed, battery, modes and texts. Of many recordings or a folder, every estimator is scored on
+    every flight; finished ones are not repeated, and the exit code is 1 if one failed. The HTML
+    file opens offline in any browser: instruments, 3D, plan, plots and events.
     """
     names, others = flights or [], against or []
     kind = "many recordings" if are_many(names) else "one recording"
@@ -138,25 +145,49 @@ def _report_one(
     # These require the extra, and take a second to import.
     from gateway.analysis.case import make_case
     from gateway.analysis.reporting.compose import make_report
-    from gateway.analysis.reporting.page import count_pictures, write_report
 
     settings = [each for each in against if each.suffix == SETTINGS]
     recordings = [each for each in against if each.suffix != SETTINGS]
     if len(settings) > 1 or len(recordings) > 1:
         refuse("--against: give at most one recording and one settings file")
-    loaded = load_flight(path, gateway, options, reference)
+    recorded = None if path is None else _read_recorded(path, gateway, options)
+    try:
+        loaded = load_flight(path, gateway, options, reference)
+    except FlightError as error:
+        if recorded is None or reference or against:
+            raise
+        # The recording can be read, but it has no samples.
+        print_remarks([f"its filters are not studied: {error}"])
+        print(_drawn(lambda: make_report(recorded), output))
+        return
     other = load_flight(recordings[0], gateway, options) if recordings else loaded
     others = None
     if settings:
         others = fusion_of(read_settings(settings[0]))
         if path is None:
             others = with_reference(others, gps_latency_s=loaded.latency_s)
+    cases: list[Case] = []
+
+    def made() -> Report:
+        cases.append(make_case(loaded, smooth=smooth, recorded=recorded))
+        compared = make_case(other, others) if other is not loaded or others else None
+        return make_report(cases[0], compared)
+
+    page = _drawn(made, output)
+    used_s = cases[0].smoothed_latency_s
+    if used_s is not None and used_s != loaded.latency_s:
+        print_remarks([f"{loaded.name}: {smoothed_latency_in_words(used_s, loaded.latency_s)}"])
+    print(page)
+
+
+def _drawn(make: Callable[[], Report], output: Path) -> Path:
+    """Make a report and write it, with its progress."""
+    from gateway.analysis.reporting.page import count_pictures, write_report
+
     with progress_bar(TimeElapsedColumn()) as progress:
         task = progress.add_task("fusing", total=None)
         progress.refresh()
-        case = make_case(loaded, smooth=smooth)
-        compared = make_case(other, others) if other is not loaded or others else None
-        made = make_report(case, compared)
+        made = make()
         progress.update(task, description="drawing", total=count_pictures(made.sections))
 
         def advance() -> None:
@@ -164,11 +195,17 @@ def _report_one(
             progress.advance(task)
             progress.refresh()
 
-        page = write_report(made, output, advance)
-    used_s = case.smoothed_latency_s
-    if used_s is not None and used_s != loaded.latency_s:
-        print_remarks([f"{loaded.name}: {smoothed_latency_in_words(used_s, loaded.latency_s)}"])
-    print(page)
+        return write_report(made, output, advance)
+
+
+def _read_recorded(path: Path, settings: GatewaySettings, options: ReadOptions) -> PilotFlight:
+    """Read the flight as its recording contains it."""
+    from gateway.analysis.pilot import read_pilot_flight
+
+    files = files_of([path], folder_of(settings), "tlogs")
+    with progress_of(files) as advance:
+        options = replace(options, progress=advance)
+        return read_pilot_flight(files, options, name_of(path, files))
 
 
 def _write_html(
@@ -250,7 +287,7 @@ def _report_many(
     exit_if_failed(results)
 
 
-def _compare(results: "Sequence[FlightResult]", against: Path) -> "Versus":
+def _compare(results: Sequence[FlightResult], against: Path) -> Versus:
     from gateway.batch.statistics import versus
     from gateway.batch.tasks import read_results
 
@@ -260,7 +297,7 @@ def _compare(results: "Sequence[FlightResult]", against: Path) -> "Versus":
     return found
 
 
-def _show_versus(compared: "Versus") -> None:
+def _show_versus(compared: Versus) -> None:
     console = console_of()
     for change in compared.medians.itertuples():
         console.print(
