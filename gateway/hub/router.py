@@ -324,7 +324,7 @@ class Router:
         self._keep(client, frame, now_us)
         to_stations, table = reach is Reach.STATIONS, self._table
         ours = not to_stations and frame.target[0] in self._vehicles.systems(now_us)
-        clients = table.clients_to(frame.target, client.client_id, now_us) if client.trusted else []
+        clients = table.clients_to(frame.target, client.client_id, now_us)
         if to_stations:
             asked = client.endpoint.systems.has
             clients = [key for key in clients if table.awaits_answer(key, frame.target, asked)]
@@ -334,6 +334,8 @@ class Router:
             clients = [key for key in clients if key in links]
         if ours or clients:
             client.prove()
+        if not client.trusted:
+            clients = []
         if ours:
             self._ask(client, frame, forwarded=bool(clients))
         if clients:

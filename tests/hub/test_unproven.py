@@ -11,6 +11,7 @@ from gateway.hub.transports.datagram import UNPROVEN, UNPROVEN_FACTOR
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import MavFrame, frame_of, message_id_of
 from tests.kit.hub import FlyingHub, Rig, Station
+from tests.ports import free_port
 
 pytestmark = pytest.mark.io
 
@@ -140,10 +141,10 @@ async def test_request_right_after_the_first_heartbeat_opens_the_telemetry(
 class Router:
     """A gateway without vehicles of its own, five vehicles behind one port, and a station."""
 
-    def __init__(self, rig: Rig) -> None:
-        self.rig, self.hub = rig, rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=0.0)
-        port = self.hub.listening_ports()[0]
-        self.link, self.station = rig.station(port), rig.station(port)
+    def __init__(self, rig: Rig, options: str = "") -> None:
+        ports = ("udp-listen:127.0.0.1:0", f"udp-listen:127.0.0.1:{free_port()}{options}")
+        self.rig, self.hub = rig, rig.hub(*ports, ping_interval_s=0.0)
+        self.link, self.station = map(rig.station, self.hub.listening_ports())
         self.vehicles = [rig.sender(system) for system in range(11, 16)]
         self.frames: list[MavFrame] = []
 
@@ -174,6 +175,18 @@ async def test_station_of_a_router_is_pinged_each_second_until_it_answers(rig: R
     assert len(router.frames) == 4 * 5 * 11
     systems = {system for each in router.hub.clients() for system, _ in each.systems}
     assert systems == {11, 12, 13, 14, 15, 255}
+
+
+@pytest.mark.parametrize("options", ["", "?trusted=no"])
+async def test_request_to_a_routed_vehicle_opens_the_telemetry(rig: Rig, options: str) -> None:
+    router = Router(rig, options)
+    await router.run(2)
+    router.station.send(router.station.sender.command(99, 1))
+    await router.run(1)
+    assert router.hub.clients()[1].state == UNPROVEN
+    router.station.send(router.station.sender.command(12, 1))
+    await router.run(1)
+    assert router.hub.clients()[1].state == "open"
 
 
 async def test_station_on_this_machine_gets_all_frames_of_a_router_at_once(
