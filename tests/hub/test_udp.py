@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+from random import Random
 from typing import Any
 
 import pytest
@@ -42,6 +43,29 @@ async def test_new_client_of_a_port_is_greeted_without_a_gap(rig: Any) -> None:
     assert [frame[7] for frame in frames] == [0, 242, 30]
     assert [frame[4] for frame in frames] == [75, 76, 77]
     assert rig.incoming[0].trusted
+
+
+@pytest.mark.parametrize("seed", range(4))
+async def test_first_frames_of_new_clients_stay_in_order_while_the_loop_is_slow(
+    rig: Any, seed: int
+) -> None:
+    """Datagrams arrive in bursts of any size between two turns of the loop."""
+    random, got = Random(seed), list[bytes]()
+    reader = rig.station()
+    hub = await rig.open("udp-listen:127.0.0.1:0", f"udp:127.0.0.1:{reader.port}")
+    new = [rig.station(hub.listening_ports()[0], origin=(n, 1)) for n in range(1, 4)]
+    sent: dict[int, list[bytes]] = {n: [] for n in range(1, 4)}
+    while sum(map(len, sent.values())) < 240:
+        system = random.randint(1, 3)
+        for _ in range(random.choice((1, 3, 20))):
+            sent[system].append(new[system - 1].sender.attitude(time_ms=len(sent[system])))
+            new[system - 1].send(sent[system][-1])
+        for _ in range(random.randint(0, 2)):
+            await asyncio.sleep(0)
+            got += reader.received()
+    await rig.quiet()
+    got += reader.received()
+    assert {n: [frame for frame in got if frame[5] == n] for n in sent} == sent
 
 
 async def test_clients_of_one_port_are_distinguished(rig: Any) -> None:

@@ -114,8 +114,13 @@ class DatagramClient(Client):
         self._packer = self._packer_of(endpoint)
         super().reconfigure(endpoint)
 
-    def adopt(self, sock: socket.socket, write: Write | None = None) -> None:
-        """Use an open socket from now on; `write` sends on one that is not connected."""
+    def adopt(
+        self, sock: socket.socket, write: Write | None = None, *, is_read: bool = True
+    ) -> None:
+        """Use an open socket from now on; `write` sends on one that is not connected.
+
+        Without `is_read`, call `begin_reading` later.
+        """
         self._socket = sock
         self.words[kernel.INPUT] = sock.fileno()
         self._output = sock.fileno() if write is None else -1
@@ -124,7 +129,13 @@ class DatagramClient(Client):
         self._use(self._direct)
         self._revive()
         self._read = self._reader(sock)
-        self.loop.add_reader(sock, self._read)
+        if is_read:
+            self.begin_reading()
+
+    def begin_reading(self) -> None:
+        """Read the socket from now on, unless it has been closed."""
+        if self._socket is not None:
+            self.loop.add_reader(self._socket, self._read)
 
     def _use(self, write: Write) -> None:
         """Send by a function from now on; the compiled step sends if it is the direct one."""
@@ -330,10 +341,12 @@ class DatagramPeer(DatagramClient):
     _spent: int = 0
     """Bytes that were sent while it was unproven."""
 
-    def adopt(self, sock: socket.socket, write: Write | None = None) -> None:
+    def adopt(
+        self, sock: socket.socket, write: Write | None = None, *, is_read: bool = True
+    ) -> None:
         """Use an open socket from now on."""
         self._send_to_proven = write or sock.send
-        super().adopt(sock, write if self.is_proven else self._send_limited)
+        super().adopt(sock, write if self.is_proven else self._send_limited, is_read=is_read)
 
     def prove(self) -> None:
         """Send everything from now on."""

@@ -2,21 +2,25 @@
 
 The port's own socket receives only from unknown peers: each new client gets a connected socket on
 the same port, which the kernel prefers for that client's datagrams. `SO_REUSEPORT` allows that,
-and is set only after the bind, so that a second gateway on the same port still gets an error.
+and is set only after the bind, so that a second gateway on the same port still gets an error. The
+new socket is read only after all datagrams that waited in the port's own: so a client's frames stay
+in order.
 
 Clients are identified only by the addresses they send from. One is removed after a timeout; one
 that returns on another port (a restarted ground station) replaces its old entry as soon as that has
 missed a few heartbeats, so that no client is served twice.
 """
 
+import asyncio
 import itertools
+import math
 import socket
-from typing import Final
+from contextlib import suppress
+from typing import Final, NamedTuple
 
 from gateway.hub.endpoint import Endpoint, host_and_port, is_of_this_machine
 from gateway.hub.forwarding_step import MAX_DATAGRAM, READS
 from gateway.hub.transports.base import (
-    READ_BYTES,
     RETRY_US,
     STALE_AFTER_US,
     Client,
@@ -36,8 +40,20 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import DatagramSplitter, MavFrame
 
 ANCILLARY_BYTES: Final = 64
+LEAST_WAITING_BYTES: Final = 512
+"""Memory that the kernel counts for a waiting datagram at least: that of its own records."""
 REMOVALS: Final = 32
 """Maximum dead clients removed at one tick; those left until the next cost nothing."""
+
+
+class _Held(NamedTuple):
+    """State of a new client whose own socket is not read yet."""
+
+    read_until: int
+    """Number of datagrams of the port's socket after which none of them is the client's."""
+    first: list[tuple[bytes, Address]]
+    """Datagrams of any peer that arrived before its socket was connected, or soon after."""
+    local_host: str
 
 
 class UdpListener(Listener[DatagramPeer]):
@@ -50,6 +66,10 @@ class UdpListener(Listener[DatagramPeer]):
         """Until then no client of a full port can have become stale."""
         self._splitter = DatagramSplitter()
         """Splitter for peers that have not sent a complete frame yet."""
+        self._received = self._most_waiting = 0
+        """Datagrams of the port's own socket: read so far, and the most that may wait in it."""
+        self._held: dict[DatagramPeer, _Held] = {}
+        self._next: asyncio.Handle | None = None
 
     def tick(self, now_us: int) -> None:
         """Bind again if that failed, and remove clients that have gone."""
@@ -67,6 +87,7 @@ class UdpListener(Listener[DatagramPeer]):
         """Remove one client."""
         assert isinstance(client, DatagramPeer)
         self._by_address.pop(client.address, None)
+        self._held.pop(client, None)
         super().leave(client)
 
     def _bind(self) -> socket.socket:
@@ -78,15 +99,44 @@ class UdpListener(Listener[DatagramPeer]):
         return sock
 
     def _watch(self, sock: socket.socket) -> None:
+        most_bytes = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+        self._most_waiting = most_bytes // LEAST_WAITING_BYTES
         self._loop.add_reader(sock, self._on_readable, sock)
 
     def _on_readable(self, sock: socket.socket) -> None:
-        # One at a wake-up: to admit a client takes as long as to serve the others several times.
-        try:
-            data, ancillary, _, address = sock.recvmsg(MAX_DATAGRAM, ANCILLARY_BYTES)
-        except OSError:
+        if self._next is None:
+            self._read(sock)
+
+    def _read(self, sock: socket.socket) -> None:
+        """Process datagrams of new clients, and at most one of another peer."""
+        self._next = None
+        if self._socket is not sock:
             return
-        self._accept(data, address, local_host_of(ancillary))
+        size, is_client, is_empty = 0, True, False
+        while is_client and size < self._context.read_bytes:
+            try:
+                data, ancillary, _, address = sock.recvmsg(MAX_DATAGRAM, ANCILLARY_BYTES)
+            except OSError:
+                is_empty = True
+                break
+            self._received += 1
+            size += max(len(data), 1)
+            # To admit a client takes as long as to serve the others several times.
+            is_client = address[:2] in self._by_address
+            self._accept(data, address, local_host_of(ancillary))
+        read = math.inf if is_empty else self._received
+        due = itertools.takewhile(lambda each: each[1].read_until <= read, self._held.items())
+        for client, held in [*due]:
+            self._release(client, held)
+        if self._held:
+            self._next = self._loop.call_soon(self._read, sock)
+
+    def _release(self, client: DatagramPeer, held: _Held) -> None:
+        """Read a new client's own socket from now on."""
+        self._held.pop(client, None)
+        for data, address in held.first:
+            self._accept(data, address, held.local_host)
+        client.begin_reading()
 
     def _accept(self, data: bytes, address: Address, local_host: str) -> None:
         now_us = self._context.now_us()
@@ -125,12 +175,13 @@ class UdpListener(Listener[DatagramPeer]):
         client.identity, client.address = first.origin, address[:2]
         client.splitter = self._splitter.split_off(client.address)
         self._clients[client_id] = self._by_address[client.address] = client
-        client.adopt(sock)
+        client.adopt(sock, is_read=False)
         if is_of_this_machine(client.host, local_host):
             client.prove()
         self._context.appear(client)
         self._context.greet(client_id)
-        self._pass_on_others(sock, address, local_host)
+        read_until = self._received + self._most_waiting
+        self._held[client] = _Held(read_until, _waiting_in(sock, address), local_host)
         return client
 
     def _has_room(self, host: str, now_us: int) -> bool:
@@ -145,14 +196,12 @@ class UdpListener(Listener[DatagramPeer]):
             self._full_until_us = stalest_us + STALE_AFTER_US
         return has_room
 
-    def _pass_on_others(self, sock: socket.socket, peer: Address, local_host: str) -> None:
-        """Process datagrams of others that arrived between bind and connect of a socket."""
-        size = 0
+
+def _waiting_in(sock: socket.socket, peer: Address) -> list[tuple[bytes, Address]]:
+    """Return the datagrams that have arrived at a socket, and their senders."""
+    found = []
+    with suppress(OSError):
         for _ in range(READS):
-            try:
-                data, address = sock.recvfrom(MAX_DATAGRAM)
-            except OSError:
-                return
-            if size < READ_BYTES:
-                self._accept(data, address or peer, local_host)
-            size += len(data)
+            data, address = sock.recvfrom(MAX_DATAGRAM)
+            found.append((data, address or peer))
+    return found
