@@ -42,8 +42,8 @@ POLL_S: Final = 0.1
 ANSWER_S: Final = 3.0
 """Timeout of an answer."""
 MAX_ANSWER: Final = 1 << 20
-TOKEN_BYTES: Final = 9
-"""Bytes of a token that the URL does not set: 72 bits."""
+TOKEN_BYTES: Final = 12
+"""Bytes of a token that the URL does not set: 96 bits, 16 characters."""
 DEFAULT_BAUD: Final = {"crsf": 420_000, "ltm": 9600}
 USUAL_BAUD: Final = 115_200
 

@@ -43,6 +43,7 @@ MAPS: Final = "/maps/"
 LOGIN_STYLE: Final = "/web/panel.css"
 PUSH: Final = "/push/"
 """Paths without a login: the style sheet of the login page, and posts of devices with a token."""
+PUSH_HELP: Final = "A device posts its readings to this address: paste it into the device's app.\n"
 API_PATHS: Final = ("/v1/", "/mavlink", "/helper/", "/ws/mavlink", "/info")
 """Paths of the REST and WebSocket API, which pages of `panel.origins` may use."""
 CORS_HEADERS: Final = {
@@ -126,9 +127,12 @@ class AccessControl:
                 return
         token = _token(headers)
         role = self._logins.role_of(token)
-        if scope["type"] == "http" and scope["path"] in ("/login", "/logout"):
+        is_push = scope["type"] == "http" and scope["path"].startswith(PUSH)
+        if is_push and (answered := _answer_to_push(scope)) is not None:
+            await answered(scope, receive, with_headers(send))
+        elif scope["type"] == "http" and scope["path"] in ("/login", "/logout"):
             await self._serve_login(scope, receive, with_headers(send))
-        elif role is not None or scope["path"] == LOGIN_STYLE or scope["path"].startswith(PUSH):
+        elif role is not None or scope["path"] == LOGIN_STYLE or is_push:
             client = tuple(scope.get("client") or ("", 0))
             token = "" if self._logins.is_open else token
             scope[ROLE] = role
@@ -347,6 +351,18 @@ async def _send_in_pieces(send: Send, message: Message) -> None:
         message = {**message, "body": body[(len(body) - 1) // PIECE * PIECE :]}
     async with asyncio.timeout(WRITE_S):
         await send(message)
+
+
+def _answer_to_push(scope: Scope) -> Response | None:
+    """Return the answer to a request below `/push/`, whose path is a secret; None for a post."""
+    token = scope["path"].removeprefix(PUSH)
+    is_token = token and "/" not in token
+    if is_token and scope["method"] == "POST":
+        return None
+    if is_token and scope["method"] in ("GET", "HEAD"):
+        # The camera of a phone opens the address in the QR code.
+        return PlainTextResponse(PUSH_HELP, HTTPStatus.METHOD_NOT_ALLOWED, {"allow": "POST"})
+    return Response(status_code=HTTPStatus.NOT_FOUND)
 
 
 async def _small_body(receive: Receive) -> bytes:

@@ -78,10 +78,9 @@ def run_panel(
     app = make_app(parts)
     logging.getLogger("uvicorn.error").addFilter(without_traceback)
     limits = ConnectionLimits()
-    logins = Logins(settings.password, settings.viewer_password)
     config = uvicorn.Config(
         AccessControl(
-            app, settings, logins, limits.authenticate, limits.shut, parts.pages.end_session
+            app, settings, parts.logins, limits.authenticate, limits.shut, parts.pages.end_session
         ),
         http=LimitedProtocol,
         log_config=None,  # the log is the one of every command
@@ -163,6 +162,7 @@ def make_parts(
         RecordingJobs(),
         MapTiles(settings),
         OpenPages(),
+        Logins(settings.password, settings.viewer_password),
     )
 
 
@@ -170,7 +170,8 @@ def make_app(parts: PanelParts) -> FastAPI:
     """Build the web application."""
     app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
     pointing = pointing_router(parts.fleet, parts.clock)
-    for router in (*RestApi(parts.uplink).routers(), pointing, push_router(parts.control)):
+    push = push_router(parts.control, parts.logins.may_attempt)
+    for router in (*RestApi(parts.uplink).routers(), pointing, push):
         app.include_router(router)
     telemetry = TelemetryFeed(parts.fleet, parts.clock)
 

@@ -3,10 +3,13 @@
 import asyncio
 import hmac
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from http import HTTPStatus
 from typing import Final
 
-from fastapi import APIRouter, HTTPException, Request
+from fastapi import APIRouter, Request
+from starlette.responses import JSONResponse, Response
 
 from gateway.live.control_socket import ControlError
 from gateway.panel.uplink import ControlClient
@@ -26,41 +29,49 @@ class _Tokens:
         self._read_s = -ASK_AGAIN_S
         self._reading = asyncio.Lock()
 
-    async def check(self, token: str) -> None:
-        """Raise ControlError for a token that is wrong."""
+    async def have(self, token: str) -> bool:
+        """Return whether a token is one of the gateway's; raises ControlError without a gateway."""
         if self._has(token):
-            return
+            return True
         async with self._reading:
             if time.monotonic() - self._read_s >= ASK_AGAIN_S:
                 self._read_s = time.monotonic()
                 self._known = [*await self._control.ask("source.tokens")]
                 if not self._has(token):
-                    # Sent so that the gateway counts the wrong token.
-                    await self._control.ask("source.push", token=token, text="")
-        if not self._has(token):
-            raise ControlError("no source has this token")
+                    # Sent so that the gateway counts the wrong token, which it refuses.
+                    with suppress(ControlError):
+                        await self._control.ask("source.push", token=token, text="")
+        return self._has(token)
 
     def _has(self, token: str) -> bool:
         return any(hmac.compare_digest(each.encode(), token.encode()) for each in self._known)
 
 
-def push_router(control: ControlClient) -> APIRouter:
-    """Return the router with `/push/{token}`; the content of each post becomes one line."""
+def push_router(control: ControlClient, may_attempt: Callable[[str], bool]) -> APIRouter:
+    """Return the router with `/push/{token}`; the content of each post becomes one line.
+
+    `may_attempt` counts a wrong token of an address as a wrong password, and returns False beyond
+    the limit.
+    """
     router, tokens = APIRouter(), _Tokens(control)
     turn = asyncio.Lock()
     """Pieces of two posts must not be mixed."""
 
     @router.post("/push/{token}", include_in_schema=False)
-    async def push(token: str, request: Request) -> str:
+    async def push(token: str, request: Request) -> Response:
         try:
-            # An unknown token is refused before the content is read.
-            await tokens.check(token)
+            # An unknown token is refused before the content is read. Answers are returned: of an
+            # error that is raised, a page would be built, and its path logged.
+            if not await tokens.have(token):
+                may_go_on = may_attempt(request.client.host if request.client else "")
+                refusal = HTTPStatus.NOT_FOUND if may_go_on else HTTPStatus.TOO_MANY_REQUESTS
+                return Response(status_code=refusal)
             content = (await request.body()).replace(b"\n", b" ").decode(errors="replace") + "\n"
             async with turn:
                 for at in range(0, len(content), PIECE):
                     await control.ask("source.push", token=token, text=content[at : at + PIECE])
-        except ControlError as error:
-            raise HTTPException(HTTPStatus.NOT_FOUND, "no source takes this") from error
-        return "taken"
+        except ControlError:
+            return Response(status_code=HTTPStatus.NOT_FOUND)
+        return JSONResponse("taken")
 
     return router

@@ -37,6 +37,7 @@ from nicegui import ui
 from gateway.clock import GatewayClock
 from gateway.panel.admission import Role
 from gateway.panel.dialogues import Dialogue, Dialogues
+from gateway.panel.logins import Logins
 from gateway.panel.map_tiles import MapTiles
 from gateway.panel.open_pages import OpenPages
 from gateway.panel.panel_settings import PanelSettings
@@ -78,6 +79,7 @@ class PanelParts:
     """The catalogue and the exports of recordings."""
     tiles: MapTiles
     pages: OpenPages
+    logins: Logins
 
     @property
     def recordings_folder(self) -> Path:

@@ -15,6 +15,7 @@ An address outside of loopback is listened on only if it is given explicitly, as
 The option `id` is the vehicle; by default it is the position of the source in the list.
 """
 
+import re
 from dataclasses import dataclass
 from typing import Annotated, Final
 from urllib.parse import parse_qsl
@@ -33,6 +34,8 @@ MAX_PORT: Final = 65535
 MAX_VEHICLE: Final = 31
 OPTIONS: Final = ("baud", "id", "token")
 """Options of every kind."""
+TOKEN: Final = re.compile(r"[\w.~-]{16,64}", re.ASCII)
+"""A token that cannot be guessed, as a segment of the path of a URL."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +64,8 @@ def parse_source(url: str) -> SourceUrl:
     if not kind or not colon:
         raise ValueError(f"source {location!r}: write KIND:WHERE, such as lines:/dev/ttyUSB0")
     options = dict(parse_qsl(query, keep_blank_values=True))
+    if "token" in options and not TOKEN.fullmatch(options["token"]):
+        raise ValueError(f"source {location!r}: token= needs 16 to 64 letters, digits, - . _ or ~")
     port = 0
     if transport in NETWORK:
         address, port = _host_and_port(location, address)

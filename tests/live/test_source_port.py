@@ -172,16 +172,17 @@ async def test_server_is_polled_with_the_requests_of_the_decoder(
 
 
 async def test_posted_content_is_taken_with_the_token_and_others_are_counted() -> None:
-    async with Opened("phone:push?token=secret") as one, Opened("lines:push") as other:
+    secret = "a.secret_of_mine-1"
+    async with Opened(f"phone:push?token={secret}") as one, Opened("lines:push") as other:
         await until(lambda: "posted" in other.source.reason)
         verbs = source_verbs([one.port, other.port])
-        assert verbs["source.tokens"]() == {"secret": "phone:push", other.port.token: "lines:push"}
-        assert len(other.port.token) == 12
-        verbs["source.push"]("secret", "")
+        assert verbs["source.tokens"]() == {secret: "phone:push", other.port.token: "lines:push"}
+        assert len(other.port.token) == 16
+        verbs["source.push"](secret, "")
         assert not one.source.connected
-        verbs["source.push"]("secret", "abc")
+        verbs["source.push"](secret, "abc")
         assert (one.data, other.data, one.source.connected) == (b"abc", b"", True)
-        for wrong in ("", "secre", "sécret"):
+        for wrong in ("", secret[:-1], "sécret"):
             with pytest.raises(ControlError, match="no source has this token"):
                 verbs["source.push"](wrong, "abc")
         assert other.source.report().faults == (("token", 3),)

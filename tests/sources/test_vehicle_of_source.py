@@ -254,10 +254,15 @@ def test_url_has_transport_and_address(url: str, transport: str, address: str, p
         ("lines:stdin?id=0", "1 to 31"),
         ("lines:stdin?id=256", "1 to 31"),
         ("phone:push?geoid_m=x", "a number"),
+        ("phone:push?token=", "token= needs 16"),
+        ("phone:push?token=open-sesame", "token= needs 16"),
+        ("phone:push?token=open/sesame/open/sesame", "token= needs 16"),
     ],
 )
 def test_wrong_url_is_refused_with_the_reason_and_without_its_token(url: str, why: str) -> None:
-    secret = url + ("&" if "?" in url else "?") + "token=sesame"
+    secret = (
+        url if "token=" in url else url + ("&" if "?" in url else "?") + "token=open-sesame-open"
+    )
     with pytest.raises(ValueError, match=why.replace("'", ".")) as refusal:
         make_sources((SourceSettings(url=secret),), str)
     assert "sesame" not in str(refusal.value)
