@@ -28,6 +28,8 @@ MAX_WAITING: Final = 500
 """Maximum number of queued messages; while a broker is slow, further ones are dropped."""
 MAX_KINDS: Final = 4096
 """Maximum number of kinds of messages with a rate limit; a greater number is forged."""
+ANSWER_BYTES: Final = 2
+"""Size of all answers of MQTT 3.1.1 to a client that only publishes (sections 3.2 to 3.7)."""
 CONNECT_LIMIT_S: Final = 10.0
 GOODBYE_LIMIT_S: Final = 1.0
 DEFAULT_TOPIC: Final = "mavgate"
@@ -148,6 +150,7 @@ class Broker:
             will=aiomqtt.Will(self._status, "offline", qos=1, retain=True),
             timeout=CONNECT_LIMIT_S,
         )
+        refused = _bound_packets(client)
         try:
             async with client:
                 await client.publish(self._status, "online", qos=1, retain=True)
@@ -165,7 +168,7 @@ class Broker:
             while not self._waiting.empty():
                 self._waiting.get_nowait()
             cause = error.exceptions[0] if isinstance(error, ExceptionGroup) else error
-            raise ConnectionError(str(cause)) from error
+            raise ConnectionError(refused[-1] if refused else str(cause)) from error
 
     async def _publish(self, client: Any) -> None:
         while True:
@@ -174,6 +177,23 @@ class Broker:
 
     def _read_login(self) -> str:
         return Path(self._login).expanduser().read_text().strip() if self._login else ""
+
+
+def _bound_packets(client: Any) -> list[str]:
+    """End a connection at a packet that is no answer, before it is read; return the reasons."""
+    # Neither library has a bound, and a packet may have 256 MB.
+    paho, refused = client._client, []  # noqa: SLF001
+    receive = paho._sock_recv  # noqa: SLF001
+
+    def receive_some(size: int) -> bytes:
+        if size > ANSWER_BYTES:
+            refused.append(f"the broker sends a packet of {size} bytes, which is no answer")
+            raise ConnectionError(refused[-1])
+        data: bytes = receive(size)
+        return data
+
+    paho._sock_recv = receive_some  # noqa: SLF001
+    return refused
 
 
 async def _watch(client: Any) -> None:

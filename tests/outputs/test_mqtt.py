@@ -8,12 +8,14 @@ import socket
 import subprocess
 import sys
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import aiomqtt
 import pytest
 
+from gateway.outputs import mqtt
 from gateway.outputs.mqtt import MAX_WAITING
 from gateway.units import US_PER_S
 from tests.kit.messages import at, beat, gps
@@ -25,6 +27,10 @@ pytestmark = [
     pytest.mark.io,
     pytest.mark.skipif(shutil.which("mosquitto") is None, reason="needs mosquitto"),
 ]
+
+
+ANSWER = b"\x20\x02\x00\x00"
+"""The broker's answer to a connection."""
 
 
 class Mosquitto:
@@ -144,6 +150,34 @@ async def test_messages_are_dropped_while_the_broker_is_slow(
     for system in range(1, 255):
         outputs.hear(beat(), at(), gps(), system=system)
     assert (outputs.shown.sent, outputs.shown.dropped) == (MAX_WAITING, 3 * 254 - MAX_WAITING)
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        pytest.param(b"\x20\xff\xff\xff\x7f", "packet of 268435455", id="256 MB, no answer"),
+        pytest.param(ANSWER + b"\x30\xff\xff\xff\x7f", "packet of 268435455", id="256 MB"),
+        pytest.param(ANSWER + b"\x34\x06\x00\x01x\x00\x01", "packet of 6", id="a message"),
+    ],
+)
+async def test_packet_that_is_no_answer_ends_the_connection(
+    outputs: OutputRig, data: bytes, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mqtt, "CONNECT_LIMIT_S", 0.05)
+    has_ended = asyncio.Event()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(data + bytes(1000))
+        with suppress(ConnectionError):
+            await reader.read()
+        has_ended.set()
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    async with server:
+        await outputs.output(f"mqtt:tcp:127.0.0.1:{server.sockets[0].getsockname()[1]}")
+        await has_ended.wait()
+    await outputs.until(lambda: why in outputs.shown.reason)
 
 
 async def test_missing_extra_is_reported(
