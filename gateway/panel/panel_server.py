@@ -166,13 +166,17 @@ def make_parts(
     )
 
 
-def make_app(parts: PanelParts) -> FastAPI:
-    """Build the web application."""
-    app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
+def _add_routers(app: FastAPI, parts: PanelParts) -> None:
     pointing = pointing_router(parts.fleet, parts.clock)
     push = push_router(parts.control, parts.logins.may_attempt)
     for router in (*RestApi(parts.uplink).routers(), pointing, push):
         app.include_router(router)
+
+
+def make_app(parts: PanelParts) -> FastAPI:
+    """Build the web application."""
+    app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
+    _add_routers(app, parts)
     telemetry = TelemetryFeed(parts.fleet, parts.clock)
 
     @app.websocket(PATH)
