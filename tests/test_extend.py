@@ -27,7 +27,7 @@ from gateway.recordings.files import OTHER_FORMATS
 from gateway.recordings.reading import READERS
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import encode_head
-from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
+from gateway.recordings.workshop.convert import WRITERS, FlightToWrite, Fusing
 from gateway.records import ImuRaw, Incoming, NavState
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.sources.kinds import SOURCE_KINDS, make_sources
@@ -170,7 +170,7 @@ def test_added_format_is_written_and_read(install: Install, tmp_path: Path) -> N
     table = tmp_path / "flight.csv"
     lines = [row_to_line(TableRow(r.time_us, raw=r)) for r in samples]
     table.write_text(encode_head(header_for(settings, 1)) + "".join(lines))
-    refused = FlightToWrite([table], options, fuse=True)
+    refused = FlightToWrite([table], options, fusing=Fusing(wanted=True))
     written = tmp_path / "flight.jsonl"
     written.write_bytes(b"".join(WRITERS[".jsonl"](refused)))
     assert len(written.read_text().splitlines()) == len(samples)

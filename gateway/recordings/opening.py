@@ -60,8 +60,6 @@ class TlogFile:
     ) -> None:
         self.path = path
         source = open_tlog(path)
-        self.remarks = source.remarks
-        """Remarks for the user on its times."""
         is_plain = source.layout is Layout.TLOG and not is_packed(path)
         if is_plain:
             self._file = open_descriptor(path)
@@ -83,6 +81,8 @@ class TlogFile:
             offset += len(data)
             if progress is not None:
                 progress(len(data))
+        self.remarks = [*source.remarks, *self.index.remarks]
+        """Remarks for the user on its times and its damage."""
         # Records written from here on are not indexed, and not played.
         self._size = offset
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -26,7 +26,7 @@ from gateway.recordings.files import (
 from gateway.recordings.flight_facts import FlightFacts, FlightTally, Gap, TimesSpan, checksum
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableNote, TableReader
 from gateway.recordings.tallies import MessageTally, RowTally
-from gateway.recordings.tlog_index import TlogIndex
+from gateway.recordings.tlog_index import DAMAGED_TIME, TlogIndex
 from gateway.units import US_PER_S, counted
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
@@ -34,9 +34,6 @@ from gateway.wire.recorded_frames import Batch
 
 if TYPE_CHECKING:
     from gateway.recordings.recorded_table import ReadOptions
-
-
-DAMAGED_TIME: Final = "{} with a damaged time, replaced by that of the record before"
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,14 @@ from typing import Final
 import numpy as np
 
 from gateway.recordings.tlog import STRIDE, Timeline
+from gateway.units import counted
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.frame_scan import TIME_SIZE
 from gateway.wire.recorded_frames import Batch, Damage
 
+DAMAGED: Final = "damaged: {} in {}; `mavgate recover` leaves them out"
+DAMAGED_TIME: Final = "{} with a damaged time, replaced by that of the record before"
+INCOMPLETE: Final = "the last {} is incomplete ({}): it is still being written, or was cut off"
 MAX_DAMAGE_RUNS: Final = 1000
 """Runs that are listed, so that a file damaged throughout cannot fill the memory."""
 
@@ -63,6 +67,19 @@ class TlogIndex:
         self.last_us = int(greatest[-1])
         end = int(batch.starts[-1]) + TIME_SIZE + int(batch.sizes[-1])
         self.size = max(self.size, batch.offset + end)
+
+    @property
+    def remarks(self) -> list[str]:
+        """Describe the damage."""
+        found = []
+        if self.damaged_bytes:
+            size, runs = counted(self.damaged_bytes, "byte"), counted(len(self.damage), "place")
+            found.append(DAMAGED.format(size, runs))
+        if self.mended:
+            found.append(DAMAGED_TIME.format(counted(self.mended, "record")))
+        if self.unfinished:
+            found.append(INCOMPLETE.format("record", counted(self.unfinished, "byte")))
+        return found
 
     def offset_before(self, time_us: int, records: int = 0) -> int:
         """Return an offset before the first record that is not earlier than a time."""

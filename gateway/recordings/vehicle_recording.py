@@ -38,9 +38,10 @@ class VehicleRecording:
         """Yield the records of all senders; afterwards parameters and plans are known."""
         batches, self._batches = self._batches or self.flight.chosen(), None
         self._answers = LogAnswers()
-        self.first_us = 0
+        has_begun = False
         for batch in batches:
-            self.first_us = self.first_us or (int(batch.time_us[0]) if len(batch) else 0)
+            if len(batch) and not has_begun:
+                self.first_us, has_begun = int(batch.time_us[0]), True
             self._answers.add(batch, self.flight.senders)
             yield batch
 

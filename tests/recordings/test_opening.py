@@ -48,6 +48,16 @@ def test_recording_that_grows_is_played_as_it_was_opened(tmp_path: Path) -> None
         assert source.read(len(before), 1 << 20) == b""
 
 
+def test_damage_is_among_the_remarks(tmp_path: Path) -> None:
+    path = tmp_path / "a.tlog"
+    path.write_bytes(make_tlog(RECORDS[:9]) + b"\xff" * 99 + make_tlog(RECORDS[9:]) + b"\0" * 6)
+    with ExitStack() as opened:
+        (flight,) = open_flights([path], OPTIONS, opened)
+    damaged, incomplete = flight.remarks
+    assert "99 bytes in 1 place" in damaged
+    assert "the last record is incomplete (6 bytes)" in incomplete
+
+
 def test_other_recordings_get_separate_vehicles(tmp_path: Path) -> None:
     first = write_tlog(tmp_path / "first.tlog", RECORDS[:100])
     later = write_tlog(tmp_path / "later.tlog", RECORDS[200:])

@@ -39,7 +39,7 @@ from gateway.recordings.workshop.anonymising import (
     Anonymiser,
     Anonymity,
 )
-from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
+from gateway.recordings.workshop.convert import AS_RECORDED, WRITERS, FlightToWrite, Fusing
 from gateway.recordings.workshop.editing import FrameEdit, Renumbering
 from gateway.recordings.workshop.selection import (
     MAX_MARGIN_S,
@@ -160,7 +160,7 @@ def convert(
     anonymiser = None if anonymity is None else Anonymiser(anonymity)
     renumbering = Renumbering(_read_renames(rename), merge=merge_systems) if rename else None
     edits = TlogEdits(
-        choice, _read_state(modes or [], margin_s, armed=armed), merge,
+        read_range(begin, end), choice, _read_state(modes or [], margin_s, armed=armed), merge,
         tuple(edit for edit in (anonymiser, renumbering) if edit is not None),
     )  # fmt: skip
     _check_edits(edits, output, message or [], system or [])
@@ -168,9 +168,9 @@ def convert(
     files = recorded_files(files, "tlogs" if of_tlogs else "tables")
     how = {"system_id": system[0] if system else None, "sensors": read_sensors(sensor)}
     _write(
-        files, output, columns, how, force=force, limits=read_range(begin, end),
-        message=message[0] if message else None,
-        edits=edits if output.suffix in (".tlog", ".csv") else None,
+        files, output, columns, how,
+        edits if message or output.suffix == ".tlog" else TlogEdits(edits.limits), force=force,
+        message_id=next(iter(choice.messages)) if message and output.suffix != ".tlog" else None,
     )  # fmt: skip
     _print_edits(edits.frames)
 
@@ -180,25 +180,28 @@ def _write(
     output: Path,
     columns: Path | None,
     how: dict[str, Any],
+    edits: TlogEdits,
+    fusing: Fusing = AS_RECORDED,
     *,
     force: bool,
-    **parts: Any,
-) -> FlightToWrite:
+    message_id: int | None = None,
+) -> None:
     """Write a flight in the format of the suffix, and print the remarks and the size.
 
-    `how` are options for reading, `parts` are arguments of `FlightToWrite`.
+    `how` are options for reading.
     """
     with progress_of(files) as advance:
         options = read_options(read_settings(), columns, progress=advance, **how)
-        flight = FlightToWrite(files, options, title=output.stem, **parts)
+        flight = FlightToWrite(
+            files, options, edits, fusing, title=output.stem, message_id=message_id
+        )
         inputs = [*files, columns, CONFIG.get()]
         size = write_new(output, WRITERS[output.suffix](flight), overwrite=force, inputs=inputs)
     print_remarks(flight.remarks)
-    if (lacks := flight.lacks(output.suffix)) and flight.message is None:
+    if (lacks := flight.lacks(output.suffix)) and message_id is None:
         print_remarks([f"Dropped: {lacks}"])
     by = "".join(f"; {fusion.summary}" for fusion in flight.fusions)
     console_of().print(f"{output}: {size / 1e6:.3f} MB{by}")
-    return flight
 
 
 def _read_state(modes: Sequence[str], margin_s: float, *, armed: bool) -> StateChoice | None:
@@ -269,11 +272,10 @@ def _check_edits(edits: TlogEdits, output: Path, message: list[str], system: lis
         output.suffix not in OF_ONE_MESSAGE or len(message) > 1 or len(edits.choice.messages) > 1
     ):
         refuse(f"--message is for .tlog, and one message for {', '.join(OF_ONE_MESSAGE)}")
-    is_of_message = bool(message) and output.suffix == ".csv"
-    if is_of_message and not edits.frames:
+    if message and not edits.frames:
         return
-    other = replace(edits, choice=replace(edits.choice, systems=frozenset(), messages=frozenset()))
-    if other != TlogEdits() or len(system) > 1:
+    choice = replace(edits.choice, systems=frozenset(), messages=frozenset())
+    if replace(edits, choice=choice) != TlogEdits(edits.limits) or len(system) > 1:
         refuse(f"the options under {PANEL!r} in the help are for an output that ends in .tlog")
 
 
@@ -322,7 +324,5 @@ def fuse_log(
         "choice": fuse_with, "position": position, "system_id": system,
         "sensors": read_sensors(sensor),
     }  # fmt: skip
-    _write(
-        files, output, columns, how, force=force, limits=read_range(begin, end), fuse=True,
-        smooth=smooth, both=both, estimator=estimator, latency_s=gps_latency_s,
-    )  # fmt: skip
+    fusing = Fusing(True, both, smooth, estimator, gps_latency_s)
+    _write(files, output, columns, how, TlogEdits(read_range(begin, end)), fusing, force=force)

@@ -42,8 +42,9 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.index import Recording, list_recordings
 from gateway.recordings.moment import civil_time
-from gateway.recordings.summary import DAMAGED_TIME, FileInfo, VehicleInfo, read_summary
+from gateway.recordings.summary import FileInfo, VehicleInfo, read_summary
 from gateway.recordings.table import TableFault, TableHeader, TableReader, encode_block, encode_head
+from gateway.recordings.tlog_index import DAMAGED, DAMAGED_TIME, INCOMPLETE
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
@@ -236,16 +237,17 @@ def _show(file: Path, found: FileInfo) -> None:
         console.print(f"note at {_clock((note.time_us - begin_us) / US_PER_S)}: {note.text}")
     if found.damaged_bytes:
         console.print(
-            f"damaged: {counted(found.damaged_bytes, 'byte')} in "
-            f"{counted(found.damaged_runs, 'place')}; "
-            "`mavgate recover` leaves them out",
+            DAMAGED.format(
+                counted(found.damaged_bytes, "byte"), counted(found.damaged_runs, "place")
+            ),
             style="red",
         )
     if found.unfinished_bytes:
         console.print(
-            f"the last {'record' if found.kind == 'tlog' else 'line'} is incomplete "
-            f"({counted(found.unfinished_bytes, 'byte')}): "
-            "it is still being written, or was cut off"
+            INCOMPLETE.format(
+                "record" if found.kind == "tlog" else "line",
+                counted(found.unfinished_bytes, "byte"),
+            )
         )
     for remark in found.remarks:
         console.print(remark)

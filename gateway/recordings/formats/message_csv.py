@@ -24,19 +24,27 @@ FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")
 
 def write(batches: Iterable[Batch], message_id: int) -> Iterator[bytes]:
     """Write all messages of one type; raises FlightError if there is none."""
+    found = of_one_message(batches, message_id)
+    yield csv_lines([(*HEAD, *_names(message_id))]).encode()
+    for batch in found:
+        yield csv_lines(zip(*_columns(batch, message_id), strict=True)).encode()
+
+
+def of_one_message(batches: Iterable[Batch], message_id: int) -> Iterator[Batch]:
+    """Yield the messages of one type; raises FlightError if it is unknown, or there is none."""
     if message_id not in DEFINITIONS:
         raise FlightError(f"the fields of message {message_id} are not known")
-    yield csv_lines([(*HEAD, *_names(message_id))]).encode()
-    count = 0
+    return _chosen(batches, message_id)
+
+
+def _chosen(batches: Iterable[Batch], message_id: int) -> Iterator[Batch]:
     met: set[int] = set()
     for batch in batches:
         met |= set(np.unique(batch.message_ids).tolist())
-        rows = np.flatnonzero(batch.message_ids == message_id)
-        if len(rows):
-            count += len(rows)
-            columns = _columns(batch.chosen(batch.message_ids == message_id), message_id)
-            yield csv_lines(zip(*columns, strict=True)).encode()
-    if not count:
+        found = batch.chosen(batch.message_ids == message_id)
+        if len(found):
+            yield found
+    if message_id not in met:
         others = ", ".join(sorted(MESSAGE_NAMES.get(one, f"message {one}") for one in met))
         raise FlightError(f"the flight contains no {MESSAGE_NAMES[message_id]}, but {others}")
 

@@ -10,11 +10,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Final
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from gateway.recordings.columns import COLUMNS, TRUTHS, WHOLE_COLUMNS, TableRow, cells_of, unit_of
 from gateway.recordings.files import FlightError, is_packed, read_chunks, temporary_copy
+from gateway.recordings.formats import message_csv
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, table_of_blocks
 from gateway.recordings.table import (
     FORMAT_LINE,
@@ -25,9 +27,8 @@ from gateway.recordings.table import (
 )
 from gateway.recordings.workshop.convert import FlightToWrite, Pieces
 from gateway.vehicle_state.status_texts import text_of
-from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAMES
-from gateway.wire.mavlink_splitter import message_id_of, origin_of
-from gateway.wire.recorded_frames import fields_of
+from gateway.wire.mavlink_messages import DEFINITIONS
+from gateway.wire.recorded_frames import Batch, columns_of
 
 ROWS: Final = 16_384
 """Rows per row group, which is held in memory as a whole: about 40 MB."""
@@ -48,9 +49,9 @@ _TYPES: Final = {
 
 def write(flight: FlightToWrite) -> Iterator[bytes]:
     """Write a flight's table, or its messages of the requested type."""
-    if flight.message is None:
+    if flight.message_id is None:
         return _write_table(flight.table())
-    return _write_messages(flight, flight.message)
+    return _write_messages(flight, flight.message_id)
 
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
@@ -173,11 +174,9 @@ def _text(cell: Any) -> str:
     return repr(int(cell)) if isinstance(cell, bool) else repr(cell)
 
 
-def _write_messages(flight: FlightToWrite, name: str) -> Iterator[bytes]:
+def _write_messages(flight: FlightToWrite, message_id: int) -> Iterator[bytes]:
     """Write every message of one type, from any sender; raises FlightError if there is none."""
-    message_id = MESSAGE_IDS.get(name)
-    if message_id is None:
-        raise FlightError(f"no MAVLink message is called {name}")
+    batches = message_csv.of_one_message(flight.chosen(), message_id)
     kind = DEFINITIONS[message_id]
     schema = pa.schema(
         [
@@ -186,26 +185,37 @@ def _write_messages(flight: FlightToWrite, name: str) -> Iterator[bytes]:
             pa.field("component_id", pa.uint8()),
             *(_message_field(kind, field) for field in kind.fieldnames),
         ],
-        metadata={"mavlink.message": name},
+        metadata={"mavlink.message": kind.msgname},
     )
-    met: set[str] = set()
-    pieces, rows = Pieces(), []
+    pieces = Pieces()
     with _writer(pieces, schema) as writer:
-        for record in flight.frames():
-            found_id = message_id_of(record.frame)
-            met.add(MESSAGE_NAMES.get(found_id, f"message {found_id}"))
-            if found_id == message_id:
-                fields = fields_of(record.frame)
-                values = (_value(fields[field]) for field in kind.fieldnames)
-                rows.append((record.time_us, *origin_of(record.frame), *values))
-            if len(rows) == ROWS:
-                writer.write_table(_batch(rows, schema))
+        waiting = [schema.empty_table()]
+        for batch in batches:
+            waiting.append(_messages(batch, message_id, schema))
+            if sum(map(len, waiting)) >= ROWS:
+                writer.write_table(pa.concat_tables(waiting), row_group_size=ROWS)
+                waiting.clear()
                 yield pieces.take()
-                rows.clear()
-        if name not in met:
-            raise FlightError(f"the flight contains no {name}, but {', '.join(sorted(met))}")
-        writer.write_table(_batch(rows, schema))
+        if waiting:
+            writer.write_table(pa.concat_tables(waiting), row_group_size=ROWS)
     yield pieces.take()
+
+
+def _messages(batch: Batch, message_id: int, schema: pa.Schema) -> pa.Table:
+    """Return messages of one type as a table; NaN becomes null."""
+    values = columns_of(batch, np.arange(len(batch)), message_id)
+    times = pa.array(batch.time_us.astype("datetime64[us]")).cast(schema.field(TIME).type)
+    columns = [times, *(pa.array(ids.astype(np.uint8)) for ids in divmod(batch.origins, 256))]
+    for name in DEFINITIONS[message_id].fieldnames:
+        column, kind = values[name], schema.field(name).type
+        if column.dtype.kind == "S":
+            columns.append(pa.array([text_of(data) for data in column.tolist()], kind))
+        elif column.ndim > 1:
+            offsets = np.arange(0, column.size + 1, column.shape[1], dtype=np.int32)
+            columns.append(pa.ListArray.from_arrays(offsets, pa.array(column.ravel()), type=kind))
+        else:
+            columns.append(pa.array(np.ascontiguousarray(column), kind, from_pandas=True))
+    return pa.Table.from_arrays(columns, schema=schema)
 
 
 def _message_field(kind: Any, name: str) -> pa.Field:
@@ -215,9 +225,3 @@ def _message_field(kind: Any, name: str) -> pa.Field:
     facts = {"unit": kind.fieldunits_by_name.get(name), "enum": kind.fieldenums_by_name.get(name)}
     metadata = {key: value for key, value in facts.items() if value}
     return pa.field(name, pa.list_(one) if length and written != "char" else one, metadata=metadata)
-
-
-def _value(value: Any) -> Any:
-    if isinstance(value, bytes):
-        return text_of(value)
-    return value

@@ -4,7 +4,7 @@ import heapq
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -44,18 +44,34 @@ from gateway.recordings.tlog import Stamper
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.recordings.workshop.joining import joined_tables
 from gateway.recordings.workshop.merging import batched
-from gateway.recordings.workshop.selection import message_ids_of
 from gateway.recordings.workshop.tlog_editing import TlogEditor, TlogEdits
-from gateway.recordings.workshop.trimming import Limits, trimmed
+from gateway.recordings.workshop.trimming import trimmed
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.recorded_frames import Batch, RecordedFrame
 
+NO_EDITS: Final = TlogEdits()
 NOT_FUSED: Final = "raw samples, settings and the exact digits of states"
 NOT_IN_TABLE: Final = "all except samples, fixes and states of one vehicle"
 NOT_DRAWN: Final = (
     "samples, velocities and settings",
     "all MAVLink messages except positions, attitude and texts",
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Fusing:
+    """Whether and how the estimator is run again on a flight."""
+
+    wanted: bool = False
+    both: bool = False
+    """Keep the estimates of the autopilot, too."""
+    smooth: bool = False
+    estimator: str | None = None
+    """Instead of that of the settings, as the latency."""
+    latency_s: float | None = None
+
+
+AS_RECORDED: Final = Fusing()
 
 
 class FlightToWrite:
@@ -68,33 +84,24 @@ class FlightToWrite:
         self,
         files: Sequence[Path],
         options: ReadOptions,
+        edits: TlogEdits = NO_EDITS,
+        fusing: Fusing = AS_RECORDED,
         *,
-        limits: Limits = (None, None),
         title: str = "flight",
-        fuse: bool = False,
-        smooth: bool = False,
-        both: bool = False,
-        estimator: str | None = None,
-        latency_s: float | None = None,
-        message: str | None = None,
-        edits: TlogEdits | None = None,
+        message_id: int | None = None,
     ) -> None:
-        self.files, self.options, self.title, self.message = files, options, title, message
-        self._limits = limits
-        self._fusion_of = partial(
-            RecordedFusion, smooth=smooth, estimator=estimator, latency_s=latency_s
-        )
-        self._edits = edits or TlogEdits()
+        self.files, self.options, self.title, self.message_id = files, options, title, message_id
+        self._edits, self._fusing = edits, fusing
         kinds = {format_of(file) for file in files}
         if len(kinds) > 1:
             each = ", ".join(f"{file}: {format_of(file)}" for file in files)
             raise FlightError(f"the files differ in format; give files of one format ({each})")
         self.is_mavlink = kinds == {TLOG}
         """Whether the files contain MAVLink; the rows are then derived from it."""
-        self._estimates = estimates_of(files, fuse=fuse, both=both)
+        self._estimates = estimates_of(files, fuse=fusing.wanted, both=fusing.both)
         self.has_messages = self.is_mavlink or self._estimates != "fused"
         """Whether the files contain messages of vehicles, in MAVLink or an autopilot's log."""
-        self._as_recorded = not fuse and all(is_table(file) for file in files)
+        self._as_recorded = not fusing.wanted and all(is_table(file) for file in files)
         self.fusions: list[RecordedFusion] = []
         """The fusions made to write the file."""
         self._tables: list[RecordedTable] = []
@@ -115,13 +122,13 @@ class FlightToWrite:
         sources, edits = self._sources, self._edits
         for edit in edits.frames:
             edit.prepare(sources, edits.choice)
-        editor = TlogEditor(edits, self._limits, self.remark)
+        editor = TlogEditor(edits, self.remark)
         yield from editor.apply(self._batches(editor, sources), self.senders)
 
     def chosen(self) -> Iterator[Batch]:
         """Yield the selected MAVLink, of all messages, not edited; its senders are known."""
         choice = replace(self._edits.choice, messages=frozenset())
-        editor = TlogEditor(replace(self._edits, choice=choice), self._limits, self.remark)
+        editor = TlogEditor(replace(self._edits, choice=choice), self.remark)
         batches: Iterable[Batch] = self._batches(editor, self._sources)
         if not self.is_mavlink:
             # The senders of MAVLink that is made are known once all of it is.
@@ -170,7 +177,7 @@ class FlightToWrite:
             self._tables.append(table)
         else:
             table = self.fused().table()
-        return trimmed(table, self._limits)
+        return trimmed(table, self._edits.limits)
 
     def by_aircraft(self) -> "list[FlightToWrite]":
         """Split tables by aircraft."""
@@ -220,7 +227,11 @@ class FlightToWrite:
 
     def fused(self) -> RecordedFusion:
         """Fuse these files again."""
-        fusion = self._fusion_of(self.files, self.options)
+        how = self._fusing
+        fusion = RecordedFusion(
+            self.files, self.options,
+            smooth=how.smooth, estimator=how.estimator, latency_s=how.latency_s,
+        )  # fmt: skip
         self.fusions.append(fusion)
         return fusion
 
@@ -271,10 +282,9 @@ def add_writer(ending: str, write: Write, lacks: Lacks = Lacks()) -> None:
 
 
 def _write_csv(flight: FlightToWrite) -> Iterator[bytes]:
-    if flight.message is None:
+    if flight.message_id is None:
         return _write_table(flight)
-    (message_id,) = message_ids_of([flight.message])
-    return message_csv.write(flight.chosen(), message_id)
+    return message_csv.write(flight.chosen(), flight.message_id)
 
 
 def _write_table(flight: FlightToWrite) -> Iterator[bytes]:

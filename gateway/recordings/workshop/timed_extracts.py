@@ -112,7 +112,7 @@ class _Shown:
     """The newest state of the vehicle for subtitles."""
 
     def __init__(self) -> None:
-        self.newest_us = 0
+        self.newest_us: int | None = None
         self._state, self._ground = NewestState(), GroundDistance()
         self._at: Position | None = None
         self._mode = UNKNOWN
@@ -167,8 +167,8 @@ def subtitles(
             continue
         while begin_us + number * step <= message.time_us:
             now_us = begin_us + number * step
-            if shown.newest_us and now_us - shown.newest_us > MAX_GAP_US:
-                # No data until the next message.
+            if shown.newest_us is None or now_us - shown.newest_us > MAX_GAP_US:
+                # No data until the next message, which may be days after the start of the video.
                 number = max(number + 1, math.ceil((message.time_us - begin_us) / step))
                 break
             if (text := shown.text(names)) and now_us >= shown.newest_us:

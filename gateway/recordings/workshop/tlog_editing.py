@@ -33,6 +33,7 @@ NOTHING_LEFT: Final = "no record matches all of these options"
 class TlogEdits:
     """The edits between the files that are read and the tlog that is written."""
 
+    limits: Limits = (None, None)
     choice: FrameChoice = field(default_factory=FrameChoice)
     state: StateChoice | None = None
     """If given, keep only the time while a vehicle is in a state."""
@@ -43,15 +44,15 @@ class TlogEdits:
 
     @property
     def are_none(self) -> bool:
-        """Whether the records are not edited."""
-        return self == TlogEdits(merge=self.merge)
+        """Whether the records are not edited, but perhaps cut."""
+        return self == TlogEdits(self.limits, merge=self.merge)
 
 
 class TlogEditor:
     """Apply edits to the records of some files; remarks are complete at the end."""
 
-    def __init__(self, edits: TlogEdits, limits: Limits, remark: Callable[[str], None]) -> None:
-        self._edits, self._limits, self._remark = edits, limits, remark
+    def __init__(self, edits: TlogEdits, remark: Callable[[str], None]) -> None:
+        self._edits, self._remark = edits, remark
 
     def joined(
         self, sources: Sequence[TlogSource], progress: Progress | None = None
@@ -103,7 +104,7 @@ class TlogEditor:
                 total += len(batch)
                 yield batch
 
-        cut: Iterable[Batch] = within(all_records(), self._limits)
+        cut: Iterable[Batch] = within(all_records(), edits.limits)
         state = None
         if edits.state is not None:
             state = ChosenState(senders, edits.state, edits.choice.systems)
@@ -115,7 +116,7 @@ class TlogEditor:
         if not kept:
             if unknown:
                 raise FlightError(unknown)
-            is_cut = self._limits != (None, None) and edits.are_none
+            is_cut = edits.limits != (None, None) and edits.are_none
             raise FlightError(NOTHING_WITHIN if is_cut else NOTHING_LEFT)
         if unknown:
             self._remark(unknown)

@@ -4,6 +4,8 @@ import csv
 import json
 import re
 import struct
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,13 @@ import pytest
 from pymavlink import mavparm, mavwp
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.recordings import files
+from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.recordings.workshop.extracts import RecordedParameter
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender
-from tests.kit.recordings import START_US, records_of, write_tlog
+from tests.kit.recordings import START_US, make_records, records_of, write_tlog
+from tests.recordings.flights import OPTIONS
 
 pytestmark = pytest.mark.io
 
@@ -240,6 +245,28 @@ def test_subtitles_are_shown_at_their_rate_from_the_begin_of_the_video(
     # 1000e-7 deg in 100 ms: the field at the begin of the video is that of the recording then.
     lat = float(shown[5][2].split("  ")[-1].split(",")[0])
     assert lat == pytest.approx(LAT + 1e-4 * (25 + 10 - 23), abs=2.1e-4)
+
+
+def test_subtitles_of_a_video_years_before_the_flight_begin_with_the_flight(
+    tlog: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "flight.srt"
+    first = datetime.fromtimestamp(START_US / 1e6, UTC)
+    run("extract", tlog, "--subtitles", out, "--offset", f"{first.replace(year=2016).isoformat()}")
+    (begin, _), *_ = re.findall(r"(\d+):(\d\d):\d\d,\d{3} -->", out.read_text())
+    assert int(begin) == (first - first.replace(year=2016)).total_seconds() // 3600
+
+
+def test_recording_from_time_zero_begins_at_its_first_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "CHUNK", 500)
+    path = write_tlog(
+        tmp_path / "a.tlog", [replace(r, time_us=1000 * k) for k, r in enumerate(make_records(60))]
+    )
+    recording = VehicleRecording([path], OPTIONS)
+    recording.read()
+    assert recording.first_us == 0
 
 
 def test_subtitles_of_chosen_fields_as_ass(tlog: Path, tmp_path: Path) -> None:

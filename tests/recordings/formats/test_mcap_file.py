@@ -15,7 +15,7 @@ from mcap.summary import Summary
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import rotate
-from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
+from gateway.recordings.workshop.convert import WRITERS, FlightToWrite, Fusing
 from tests.kit.cli import invoke
 from tests.kit.recordings import records_sent, write_tlog
 from tests.recordings.flights import OPTIONS
@@ -49,7 +49,9 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mcap")
     log = flown.write(folder / "flight.ulg", flown.make_ulog())
     out = folder / "flight.mcap"
-    out.write_bytes(b"".join(WRITERS[".mcap"](FlightToWrite([log], OPTIONS, fuse=True))))
+    out.write_bytes(
+        b"".join(WRITERS[".mcap"](FlightToWrite([log], OPTIONS, fusing=Fusing(wanted=True))))
+    )
     return out
 
 
