@@ -3,6 +3,7 @@
 import logging
 import math
 import os
+import re
 from collections.abc import Iterable
 from typing import Final
 
@@ -24,6 +25,10 @@ UNKNOWN: Final = "—"
 """Shown instead of an unknown number."""
 FEW_BYTES: Final = 200
 """Bytes that may be the end of a frame, or the buffer of an adapter, not another device."""
+
+
+_FOLDERS: Final = re.compile(r"(?<![^\s'\"(=])~?/(?:[^\s/:;,]+/)*(?=[^\s/])")
+"""Folders of an absolute path, which follows a space or a quotation mark, not those of a URL."""
 
 
 class UserError(Exception):
@@ -75,6 +80,11 @@ class PrintableFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Return the whole record, a traceback included, without control characters."""
         return printable(super().format(record))
+
+
+def without_folders(text: str) -> str:
+    """Return a text for other machines: absolute paths in it are reduced to their last names."""
+    return _FOLDERS.sub("", text)
 
 
 def figure(value: float | None, form: str, unit: str = "") -> str:

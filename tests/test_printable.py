@@ -18,6 +18,7 @@ from gateway.printable import (
     printable,
     printable_json,
     receiver_state,
+    without_folders,
 )
 
 RIGHT_TO_LEFT = "\u202e"
@@ -101,6 +102,20 @@ def test_port_without_frames_is_described(
     state = receiver_state("auto", connected, received, frames)
     assert text in state
     assert (state == "receiver: auto connected") == (frames > 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("radio: /dev/ttyUSB0: No such device", "radio: ttyUSB0: No such device"),
+        ("to install it: /opt/x.y/bin/python -m pip install 'a>=2'",
+         "to install it: python -m pip install 'a>=2'"),
+        ("see '/home/jo/.config/a b' and ~/x/y.toml", "see 'a b' and y.toml"),
+        ("tcp://host:1/path is 3 m/s, 1/2 of -/- or a/b; tls:HOST:8883", None),
+    ],
+)  # fmt: skip
+def test_text_for_other_machines_has_no_folder_of_this_one(text: str, shown: str | None) -> None:
+    assert without_folders(text) == (shown or text)
 
 
 @pytest.mark.parametrize(

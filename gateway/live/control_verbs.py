@@ -12,6 +12,7 @@ from typing import Annotated, Final
 import msgspec
 
 from gateway.compiled.entry_point import LibraryError, load_entry_points
+from gateway.extras import how_to_add, missing
 from gateway.hub.endpoint import EndpointKind, parse_endpoint
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, Verbs
@@ -30,6 +31,8 @@ MAX_FRAMES: Final = 200
 """Maximum frames of an answer: some 60 bytes each, and a line of the control socket has 64 kB."""
 MAX_SAMPLES: Final = 400
 """Maximum samples between two requests: some seconds, and less than a line of the socket."""
+NEEDED_EXTRAS: Final = {"mqtt": "mqtt", EndpointKind.ZENOH: "fleet"}
+"""Extras by kind of endpoint."""
 IDLE_US: Final = 5 * US_PER_S
 """Samples are no longer collected after this time without a request."""
 Values = tuple[int, ...]
@@ -192,6 +195,9 @@ def client_verbs(hub: Hub) -> Verbs:
 
     async def add(url: str) -> tuple[str, ...]:
         endpoint = parse_endpoint(url)
+        extra = NEEDED_EXTRAS.get(endpoint.kind, "")
+        if extra and missing(extra):
+            raise ControlError(how_to_add(f"an endpoint {endpoint.kind}:", extra))
         if endpoint.kind is EndpointKind.SERIAL:
             ports = await asyncio.to_thread(list_serial_ports)
             check_listed(endpoint.host, {each.device for each in ports})

@@ -44,7 +44,7 @@ from gateway.live.service import LoopLag, ServiceNotifier, set_realtime_priority
 from gateway.live.session import SessionState
 from gateway.live.source_port import SourcePort, read_map
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.printable import reason_of
+from gateway.printable import reason_of, without_folders
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import TableHeader
 from gateway.recordings.tlog import UNRECORDED
@@ -123,7 +123,7 @@ class Daemon:
             self.now_us,
             on_foreign=self._record_foreign,
             on_gone=self._on_gone,
-            on_alert=self._announce,
+            on_alert=self._alert,
             signer=self._pipeline.signer,
             recordings=Path(settings.recording.folder).expanduser(),
         )
@@ -323,6 +323,10 @@ class Daemon:
 
     def _mark(self, location: Location | None, vehicle_id: int | None) -> None:
         self._perform(self._pipeline.mark(location, vehicle_id, self.now_us()))
+
+    def _alert(self, is_trouble: bool, text: str) -> None:
+        # Others need not know the folders of this machine.
+        self._announce(is_trouble, without_folders(text))
 
     def _announce(self, is_trouble: bool, text: str) -> None:
         status = StatusText(WARNING if is_trouble else INFO, text)

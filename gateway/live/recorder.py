@@ -41,6 +41,7 @@ from gateway.live.session import (
     session_name,
 )
 from gateway.output import sync_folder
+from gateway.printable import without_folders
 from gateway.recordings.index import RecordingError, find_recording, move_recording, part_of
 from gateway.recordings.table import NOTE, TableHeader, TableNote
 from gateway.recordings.tlog import CivilClock
@@ -393,7 +394,9 @@ class Recorder:
 
     def _say(self, action: Announce) -> None:
         (log.warning if action.is_trouble else log.info)("%s", action.text)
-        self._announce(action.is_trouble, action.text)
+        # Others need not know the folders of this machine, whose names may contain spaces.
+        text = action.text.replace(str(self.folder), self.folder.name)
+        self._announce(action.is_trouble, without_folders(text))
 
     def _open_at_once(self) -> None:
         now_us, offset_us = self._clock(), self._civil.offset_us or 0

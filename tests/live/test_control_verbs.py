@@ -1,15 +1,18 @@
 """The verbs do what docs/control.md says."""
 
 import math
+import sys
 import threading
 from collections.abc import AsyncIterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import pytest
 
+from gateway.hub.hub import Hub
 from gateway.live import control_verbs
 from gateway.live.control_socket import ControlError, ControlServer
 from gateway.live.control_verbs import RecorderVerbs, client_verbs, mark_verbs
@@ -105,6 +108,15 @@ async def test_location_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> Non
     assert math.isnan(marked[1][0].alt_amsl_m)
     assert marked[1][1] == 3
     assert marked[2] == (None, None)
+
+
+async def test_endpoint_without_its_extra_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    server = ControlServer(tmp_path / "s", client_verbs(Mock(spec=Hub)))
+    refused = await ask(server, "clients.add", url="zenoh:tcp/127.0.0.1:7447?site=a")
+    assert "an endpoint zenoh: needs the extra fleet; to install it: " in refused["error"]
 
 
 async def test_player_follows_its_verbs(clock: ManualClock, tmp_path: Path) -> None:

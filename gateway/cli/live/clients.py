@@ -95,13 +95,14 @@ def add(
     ] = False,
 ) -> None:
     """Add a client or a source, until the gateway ends or permanently."""
-    print(*ask("clients.add", {"url": url}), sep="\n")
+    ask("clients.add", {"url": url})
     if save:
         _save(CONFIG.get() or USER_CONFIG.expanduser(), url)
     snapshot = ask("status")
-    for added in (*snapshot["listeners"], *snapshot["clients"]):
-        if added["endpoint"] == url and added["reason"]:
-            console_of().print(f"{added['name']}: {added['reason']}; trying again until it works")
+    every = (*snapshot["listeners"], *snapshot["clients"])
+    added = next((one for one in every if one["endpoint"] == url), {"name": url, "reason": ""})
+    waits = f": {added['reason']}; trying again until it works" if added["reason"] else ""
+    console_of().print(f"added {added['name']}{waits}")
 
 
 def _save(file: Path, url: str) -> None:
@@ -118,7 +119,8 @@ def _save(file: Path, url: str) -> None:
 @group.command()
 def remove(name: Annotated[str, typer.Argument(help="Name or URL of the client.")]) -> None:
     """Remove a client, a source or a listening port."""
-    print(*ask("clients.remove", {"name": name}), sep="\n")
+    ask("clients.remove", {"name": name})
+    print(f"removed {name}")
 
 
 @group.command(context_settings=NEGATIVE_NUMBERS)

@@ -38,6 +38,7 @@ CLIENT = dataclasses.replace(
 )
 RADIO = dataclasses.replace(
     CLIENT,
+    endpoint="udp:10.0.0.8:14550",
     name="radio",
     state="unreachable",
     reason="No such device",
@@ -151,8 +152,8 @@ async def test_status_is_printed_as_json(asked: list[object]) -> None:
 async def test_clients_are_listed_added_removed_and_applied_again(asked: list[object]) -> None:
     assert "3722.0" in (await run("clients", "list"))
     assert json.loads(await run("clients", "list", "--json"))[0]["name"] == "tablet"
-    assert "udp:10.0.0.8:14550" in (await run("clients", "add", "udp:10.0.0.8:14550")).split()
-    assert asked == ["udp:10.0.0.8:14550"]
+    assert (await run("clients", "add", CLIENT.endpoint)) == f"added {CLIENT.name}\n"
+    assert asked == [CLIENT.endpoint]
     reported = "observers: Address already in use; trying again until it works"
     assert reported in (await run("clients", "add", CLOSED.endpoint))
     assert "no endpoint is called 'phone'" in await run("clients", "remove", "phone", code=2)
