@@ -45,6 +45,8 @@ from gateway.wire.mavlink_splitter import MavFrame
 
 MAX_KINDS: Final = 4096
 """Maximum kinds of frame per client: a vehicle sends some fifty; forged headers could be any."""
+LEAST_BYTES: Final = 10_000
+"""Bytes to a client after which it is decided whether most of them are telemetry."""
 MAX_ROUTES: Final = 1024
 """Maximum cached routes per source; more than a few hundred come from forged headers."""
 
@@ -325,6 +327,12 @@ class Fanout:
                 subscription.inserted[frame.origin] = before + 1
                 subscription.answered += len(frame.data)
                 client.send(self._renumbered(frame, newest + before + 1))
+
+    def has_mostly_telemetry(self, client_id: int) -> bool:
+        """Return whether less than half of what a client was sent were answers and requests."""
+        subscription = self._subscriptions[client_id]
+        sent = subscription.client.counters.bytes_sent
+        return sent >= LEAST_BYTES and 2 * subscription.answered < sent
 
     def numbers(self, client_id: int, origin: Origin) -> bool:
         """Return whether frames of another system are numbered for a client."""

@@ -311,9 +311,12 @@ class Hub:
     def clients(self) -> tuple[ClientStats, ...]:
         """Return the present figures of every client, in the order of their ids."""
         self._fanout.settle()
-        notes = self._router.clash_notes(self.now_us())
+        router, now_us = self._router, self.now_us()
+        notes, hints = router.clash_notes(now_us), router.foreign_hints(now_us)
         return tuple(
-            client.stats(self._router.origins(key), notes.get(key, ""), self._router.cached(client))
+            client.stats(
+                router.origins(key), notes.get(key, ""), hints.get(key, ""), router.cached(client)
+            )
             for key, client in sorted(self._clients.items())
         )
 

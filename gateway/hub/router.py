@@ -5,6 +5,7 @@ reach our vehicles, as requests that may be answered, and change nothing that ot
 """
 
 import asyncio
+from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
@@ -247,6 +248,28 @@ class Router:
                 joined = "&" if "?" in client.endpoint.url else "?"
                 notes[client_id] = f"{text}; write {client.endpoint.url}{joined}as={free}"
         return notes
+
+    def foreign_hints(self, now_us: int) -> dict[int, str]:
+        """Return, by client, the option that ends mostly foreign telemetry on a vehicle's link."""
+        hints: dict[int, str] = {}
+        vehicles = self.routed_vehicles() | {*self._vehicles.systems(now_us)}
+        shared = Counter(client.endpoint.location for client in self._clients.values())
+        for client_id, client in self._clients.items():
+            there, endpoint = self._table.systems(client_id), client.endpoint
+            is_limited = endpoint.systems or endpoint.budget or endpoint.monitor
+            if is_limited or not there.are_only_others(0) or vehicles <= there.all:
+                continue
+            if not self._fanout.has_mostly_telemetry(client_id):
+                continue
+            joined = "&" if "?" in endpoint.url else "?"
+            option = f"systems={','.join(map(str, sorted(there.vehicles)))}"
+            if shared[endpoint.location] > 1:
+                option = "budget=BYTES, the bytes/s that each link carries"
+            hints[client_id] = (
+                "most frames to it are telemetry of other vehicles; "
+                f"write {endpoint.url}{joined}{option}"
+            )
+        return hints
 
     def _is_rejected(self, client: Client, path: SystemPath, frame: MavFrame, now_us: int) -> bool:
         """Return whether a frame is a copy, or late; its system then has several paths."""

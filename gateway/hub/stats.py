@@ -80,6 +80,8 @@ class ClientStats:
     """The kept answers of the systems behind it, with their ages; see `AnswerCache.describe`."""
     note: str = ""
     """A problem of the systems behind it that the settings solve, such as two with one id."""
+    hint: str = ""
+    """An option that its link should have, and why."""
 
 
 @dataclass(frozen=True, slots=True)

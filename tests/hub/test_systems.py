@@ -317,6 +317,23 @@ class TestHub:
         await self.say(rig, (seat, GCS, 255, STATION), (seat, command(3), 255, STATION))
         assert self.origins(first)[:1] == [(255, 0)]
 
+    @pytest.mark.parametrize("options", ["", "budget=9000", "systems=3", "name=radio"])
+    async def test_link_with_mostly_telemetry_of_others_gets_a_hint(
+        self, rig: Any, options: str
+    ) -> None:
+        hub, first, second, _ = await self.open(rig, options, "")
+        await self.say(rig, (first, heartbeat(), 3, 1), (second, heartbeat(), 2, 1))
+        for _ in range(12):
+            second.send(*(packed(attitude(), 2, 1) for _ in range(30)))
+            await rig.quiet_some()
+            first.received()
+        hints = [client.hint for client in hub.clients()]
+        url = f"udp:127.0.0.1:{first.port}?{options}"
+        is_named = "=" not in options or options.startswith("name")
+        expected = f"{url}{'&' if '?' in url else '?'}systems=3"
+        assert hints[0].endswith(f"; write {expected}") == is_named
+        assert [hint for hint in hints[0 if not is_named else 1 :] if hint] == []
+
     async def test_station_gets_no_corrections_of_another_after_its_heartbeat(
         self, rig: Any
     ) -> None:

@@ -287,7 +287,7 @@ def _print_clients(console: Console, snapshot: Record) -> None:
     console.print()
     console.print(_clients(snapshot["clients"], snapshot["time_us"]))
     for client in snapshot["clients"]:
-        for text in filter(None, (client["reason"], client["note"])):
+        for text in filter(None, (client["reason"], client["note"], client["hint"])):
             console.print(f"{client['name']}: {text}", style="yellow", soft_wrap=True)
         for text in client["cached"]:
             console.print(f"{client['name']}: cached answers of {text}", soft_wrap=True)

@@ -499,9 +499,13 @@ class Client:
         return 0 if self.trusted else bucket.wait_us()
 
     def stats(
-        self, systems: tuple[Origin, ...], note: str = "", cached: tuple[str, ...] = ()
+        self,
+        systems: tuple[Origin, ...],
+        note: str = "",
+        hint: str = "",
+        cached: tuple[str, ...] = (),
     ) -> ClientStats:
-        """Return the present figures; the hub passes systems, note and kept answers."""
+        """Return the present figures; the hub passes systems, texts and kept answers."""
         renumbering = self.renumbering
         counters = {name: getattr(self.counters, name) for name in ClientCounters.__slots__}
         return ClientStats(
@@ -520,6 +524,7 @@ class Client:
             refused=renumbering.refused if renumbering else 0,
             cached=cached,
             note=note or (renumbering.reason if renumbering else ""),
+            hint=hint,
             **counters,
         )
 
