@@ -37,7 +37,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "extras": {"printable"},
     "hub": FOUNDATION | {"wire", "printable", "extras", "answers", "recordings.index"},
     "simulator": FOUNDATION | {"wire"},
-    "sources": FOUNDATION | {"wire", "printable", *COLUMN_CODEC},
+    "sources": FOUNDATION | {"wire", "printable", "hub.endpoint", *COLUMN_CODEC},
     "aircraft": FOUNDATION | {"wire", "sensing", "estimation", "vehicle"},
     "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft", "sources"},
     "status": FOUNDATION | {"hub", "vehicle", "aircraft", "printable"},

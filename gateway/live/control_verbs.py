@@ -7,19 +7,22 @@ import os
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Final
 
 import msgspec
 
 from gateway.compiled.entry_point import LibraryError, load_entry_points
 from gateway.extras import how_to_add, missing
-from gateway.hub.endpoint import EndpointKind, parse_endpoint
+from gateway.hub.endpoint import ADDED_KINDS, Endpoint, EndpointKind, parse_endpoint
 from gateway.hub.hub import Hub
+from gateway.hub.transports.url_files import check_files
 from gateway.live.control_socket import ControlError, Verbs
 from gateway.live.recorder import Recorder
 from gateway.live.serial_port import AUTO, SerialPort, SerialStatus, list_serial_ports
 from gateway.live.session import SessionState
 from gateway.live.source_port import SourcePort
+from gateway.printable import reason_of
 from gateway.recordings.index import Recording, delete_recording, find_recording, list_recordings
 from gateway.records import FusedSample, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration
@@ -190,17 +193,29 @@ def check_listed(port: str, known: set[str]) -> None:
         raise ControlError(f"{port!r} is not a serial port here; there are {listed}")
 
 
-def client_verbs(hub: Hub) -> Verbs:
-    """Return the handlers of `clients.*`."""
+def _check_added(endpoint: Endpoint, folder: Path | None) -> None:
+    """Raise ControlError for an endpoint with a device or file that only the settings may name."""
+    word, _, rest = endpoint.host.partition(":")
+    if endpoint.kind in ADDED_KINDS and word == EndpointKind.SERIAL:
+        # The carrier of an output.
+        _check_added(parse_endpoint(f"{word}:{rest}"), folder)
+    if endpoint.kind is EndpointKind.SERIAL:
+        check_listed(endpoint.host, {each.device for each in list_serial_ports()})
+    try:
+        check_files(endpoint, folder)
+    except OSError as error:
+        raise ControlError(reason_of(error)) from error
+
+
+def client_verbs(hub: Hub, folder: Path | None = None) -> Verbs:
+    """Return the handlers of `clients.*`; an added URL names only files below the folder."""
 
     async def add(url: str) -> tuple[str, ...]:
         endpoint = parse_endpoint(url)
         extra = NEEDED_EXTRAS.get(endpoint.kind, "")
         if extra and missing(extra):
             raise ControlError(how_to_add(f"an endpoint {endpoint.kind}:", extra))
-        if endpoint.kind is EndpointKind.SERIAL:
-            ports = await asyncio.to_thread(list_serial_ports)
-            check_listed(endpoint.host, {each.device for each in ports})
+        await asyncio.to_thread(_check_added, endpoint, folder)
         hub.add(url)
         return hub.endpoints()
 

@@ -90,7 +90,8 @@ class Daemon:
 
     `aircraft` has the settings of single aircraft by vehicle id; `read` reads all settings again,
     or raises ConfigError. `line` yields the frames of a simulated receiver instead of the serial
-    port, or the bytes of a source of `simulated_kind`.
+    port, or the bytes of a source of `simulated_kind`. Endpoints that are added name only files
+    below `folder`, that of the settings file.
     """
 
     _timer: asyncio.TimerHandle | None = None
@@ -102,6 +103,7 @@ class Daemon:
         read: Callable[[], GatewaySettings],
         line: Iterator[TimedFrame] | None = None,
         simulated_kind: str = "",
+        folder: Path | None = None,
     ) -> None:
         self.now_us = GatewayClock()
         self._receiver = None if line is None else PtyPort(line)
@@ -110,8 +112,7 @@ class Daemon:
         serial = settings.serial
         self._own_ids = set[int]() if line is None else {*aircraft}
         """Vehicle ids of our aircraft: the simulated ones, or those received so far."""
-        self._settings = settings
-        self._read = read
+        self._settings, self._folder, self._read = settings, folder, read
         self._plans = PlanFiles(aircraft_folder(settings), self._announce_plans)
         self._timestamps = TimestampFile(aircraft_folder(settings))
         self._pipeline = self._make_pipeline(aircraft)
@@ -133,7 +134,7 @@ class Daemon:
         self._budget = RecordingBudget()
         callbacks = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
         self._serial = SerialPort(serial, *callbacks, self.now_us, needed=needed)
-        self._sources = [SourcePort(s, self._on_source) for s in self._pipeline.ported]
+        self._sources = [SourcePort(s, self._on_source, self._hub) for s in self._pipeline.ported]
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._files = begin_worker("settings")
@@ -184,7 +185,7 @@ class Daemon:
             RecorderVerbs(self._recorder, self._has_vehicle).verbs(),
             mark_verbs(self._mark),
             SerialVerbs(self._serial, is_simulated=self._receiver is not None).verbs(),
-            client_verbs(self._hub),
+            client_verbs(self._hub, self._folder),
             source_verbs(self._sources),
             self._imu.verbs(),
             introduction_verb(self._introduction),

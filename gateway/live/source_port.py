@@ -5,12 +5,15 @@
 | serial     | as soon as the device or USB id exists        | unplugged: tried again            |
 | udp        | at once; an address in use is tried again     | never                             |
 | tcp        | when the server accepts                       | closed by the server: tried again |
-| tcp-listen | when a client connects, one at a time         | when it leaves                    |
+| tcp-listen | when a client connects; the newest one is used| when it leaves or vanishes        |
 | poll       | when the server answers                       | without an answer: tried again    |
 | push       | with the first content                        | never                             |
 | stdin      | at once                                       | at its end, for good              |
 | file       | as soon as it exists, from its beginning      | shortened: read from its beginning|
 | (a tlog)   | the same; bytes at their recorded times       | at its end, for good              |
+
+The first four are transports of the hub, with its intervals, limits and keepalive. Every source
+processes at most `PART` bytes in a turn of the event loop.
 """
 
 import asyncio
@@ -20,12 +23,17 @@ import secrets
 import stat
 import sys
 from collections.abc import Callable
-from pathlib import Path
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 import serial
 
+from gateway.hub.endpoint import Endpoint
+from gateway.hub.transports.base import Client, HubContext
+from gateway.hub.transports.byte_link import ByteLink, UdpReceiver
+from gateway.hub.transports.serial_line import SerialClient
+from gateway.hub.transports.tcp import TcpClient, TcpListener
+from gateway.hub.transports.url_files import read_text
 from gateway.live.part import TLOG
 from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports, open_port
 from gateway.printable import reason_of
@@ -36,6 +44,9 @@ from gateway.wire.framing import Fault
 log = logging.getLogger(__name__)
 
 READ_SIZE: Final = 4096
+PART: Final = 1024
+"""Bytes that are processed in a turn of the loop: 100 small frames or 500 bad lines, some 10 ms."""
+TICK_S: Final = 0.25
 RETRY_S: Final = 1.0
 FILE_POLL_S: Final = 0.05
 POLL_S: Final = 0.1
@@ -44,29 +55,111 @@ ANSWER_S: Final = 3.0
 MAX_ANSWER: Final = 1 << 20
 TOKEN_BYTES: Final = 12
 """Bytes of a token that the URL does not set: 96 bits, 16 characters."""
-DEFAULT_BAUD: Final = {"crsf": 420_000, "ltm": 9600}
-USUAL_BAUD: Final = 115_200
+NOT_OPEN: Final = {"refused": "connection refused", "unreachable": "unreachable"}
+"""Reasons of states of a transport that has not given one."""
+GONE: Final = "the other side closed the connection"
+NO_CLIENT: Final = "no client is connected"
 
 
 def read_map(path: str) -> str:
     """Read the map of columns that a source's option names; ValueError if it cannot be read."""
     try:
-        return Path(path).expanduser().read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        return read_text(path)
+    except OSError as error:
         raise ValueError(f"columns={path}: {reason_of(error)}") from error
+
+
+class _SourceSerial(SerialClient):
+    """A serial port by its device or its USB id."""
+
+    def _open(self) -> serial.Serial:
+        ports = list_serial_ports()
+        try:
+            return open_port(find_port(self.endpoint.host, ports), self.endpoint.port, ports)
+        except PortNotFoundError as error:
+            raise OSError(str(error)) from error
+
+
+class _NewestClient(TcpListener):
+    """A port whose newest client replaces the one before.
+
+    A board that lost its supply connects again long before its old connection has timed out.
+    """
+
+    def _has_room(self, host: str, now_us: int) -> bool:  # noqa: ARG002
+        for client in tuple(self._clients.values()):
+            self.leave(client)
+        return True
+
+
+LINKS: Final[dict[str, Callable[[HubContext, int, Endpoint], Client]]] = {
+    "serial": _SourceSerial,
+    "udp": UdpReceiver,
+    "tcp": TcpClient,
+}
+
+
+class _SourceLink(ByteLink):
+    """The transport of a source, which reports what happens to its port."""
+
+    read_bytes = PART
+
+    def __init__(self, hub: HubContext, endpoint: Endpoint, transport: str, port: "SourcePort"):
+        super().__init__(hub)
+        self._port = port
+        context = cast("HubContext", self)
+        if transport == "tcp-listen":
+            self.link = _NewestClient(context, endpoint)
+            return
+        self.link = link = LINKS[transport](context, hub.new_client_id(), endpoint)
+        if isinstance(link, UdpReceiver):
+            link.split = port.parts_of
+        self.appear(link)
+
+    def take(self, data: bytes, now_us: int) -> None:  # noqa: ARG002
+        """Process received bytes."""
+        self._port.feed(data)
+
+    def greet(self, client_id: int) -> None:  # noqa: ARG002
+        """Note that it is open."""
+        self._port.opened()
+
+    def vanish(self, client: Client) -> None:
+        """Note that the client of a listening port has gone."""
+        super().vanish(client)
+        self._port.lost(GONE)
+
+    def tick(self, now_us: int) -> None:
+        """Open the transport if it is closed, and note why it is not open."""
+        super().tick(now_us)
+        if isinstance(self.link, TcpListener):
+            if self.reason or not self.peers:
+                self._port.lost(self.reason or NO_CLIENT)
+        elif self.state != "open":
+            self._port.lost(self.reason or NOT_OPEN.get(self.state, ""))
 
 
 class SourcePort:
     """Keep one source open, and pass on its bytes.
 
-    `on_bytes` is called with the source and every chunk that arrives.
+    `on_bytes` is called with the source and every chunk that arrives. The hub's limits apply to
+    sources too.
     """
 
-    def __init__(self, source: SourceInput, on_bytes: Callable[[SourceInput, bytes], None]) -> None:
+    def __init__(
+        self,
+        source: SourceInput,
+        on_bytes: Callable[[SourceInput, bytes], None],
+        hub: HubContext,
+    ) -> None:
         self._source = source
         self._on_bytes = on_bytes
+        self._hub = hub
+        self._link: _SourceLink | None = None
+        self._timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None
         self._complaint = ""
+        self._is_closed = False
         self.token = ""
         """Token for pushing content; empty if this source accepts none."""
         if source.url.transport == "push":
@@ -74,20 +167,31 @@ class SourcePort:
 
     def start(self) -> None:
         """Begin to open it; needs a running event loop."""
-        self._task = asyncio.get_running_loop().create_task(self._run())
+        url = self._source.url
+        if url.endpoint is None or url.transport == "poll":
+            self._task = asyncio.get_running_loop().create_task(self._run())
+            return
+        self._link = _SourceLink(self._hub, url.endpoint, url.transport, self)
+        self._tick()
+
+    def _tick(self) -> None:
+        assert self._link is not None
+        self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
+        self._link.tick(self._hub.now_us())
 
     def close(self) -> None:
         """Close it for good."""
+        self._is_closed = True
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._link is not None:
+            self._link.close()
         if self._task is not None:
             self._task.cancel()
 
     async def _run(self) -> None:
         url = self._source.url
         read = {
-            "serial": self._serial,
-            "udp": self._udp,
-            "tcp": self._tcp,
-            "tcp-listen": self._tcp_listen,
             "poll": self._poll,
             "push": self._push,
             "stdin": self._stdin,
@@ -96,19 +200,19 @@ class SourcePort:
         while True:
             try:
                 await read()
-            except (OSError, PortNotFoundError) as error:
-                reason = str(error) if isinstance(error, PortNotFoundError) else reason_of(error)
+            except OSError as error:
                 if url.transport == "stdin":
-                    self._ended(reason)
+                    self._ended(reason_of(error))
                     return
-                self._lost(reason)
+                self.lost(reason_of(error))
             else:
                 if url.transport == "stdin" or url.address.endswith(TLOG):
                     self._ended("its end was reached")
                     return
             await asyncio.sleep(RETRY_S)
 
-    def _opened(self) -> None:
+    def opened(self) -> None:
+        """Note that it is open."""
         log.info("source %s is open", self._source.url.name)
         self._complaint = ""
         self._source.opened()
@@ -117,103 +221,48 @@ class SourcePort:
         log.info("source %s: %s", self._source.url.name, reason)
         self._source.lost(reason)
 
-    def _lost(self, reason: str) -> None:
-        """Note, and log once, the reason why it is not open."""
-        if self._source.connected or reason != self._complaint:
+    def lost(self, reason: str) -> None:
+        """Note, and log once, the reason why it is not open; empty if an open one has ended."""
+        reason = reason or (GONE if self._source.connected else "")
+        if not reason or self._is_closed:
+            return
+        if reason != NO_CLIENT and (self._source.connected or reason != self._complaint):
             log.warning("source %s: %s; trying again", self._source.url.name, reason)
         self._complaint = reason
         self._source.lost(reason)
 
-    def _feed(self, data: bytes) -> None:
+    def feed(self, data: bytes) -> None:
+        """Process received bytes."""
         self._on_bytes(self._source, data)
 
-    async def _serial(self) -> None:
-        url, ports = self._source.url, list_serial_ports()
-        baud = int(url.options.get("baud", DEFAULT_BAUD.get(url.kind, USUAL_BAUD)))
-        port = open_port(find_port(url.address, ports), baud, ports)
-        try:
-            await self._read_file(port)
-        finally:
-            port.close()
+    def parts_of(self, data: bytes) -> list[bytes]:
+        """Divide bytes to process in several turns; lines are kept whole."""
+        parts, at = [], 0
+        while at < len(data):
+            end = at + PART
+            if self._source.has_lines and end < len(data):
+                end = data.rfind(b"\n", at, end) + 1 or data.find(b"\n", end) + 1 or len(data)
+            parts.append(data[at:end])
+            at = end
+        return parts
 
-    async def _read_file(self, port: serial.Serial) -> None:
-        """Read an open port until it is disconnected."""
-        loop, lost = asyncio.get_running_loop(), asyncio.get_running_loop().create_future()
-        file = port.fileno()
-
-        def read() -> None:
-            try:
-                data = os.read(file, READ_SIZE)
-            except BlockingIOError:
-                return
-            except OSError as error:
-                data, reason = b"", reason_of(error)
-            else:
-                reason = "the device hung up"
-            if data:
-                self._feed(data)
-            elif not lost.done():
-                lost.set_result(reason)
-
-        self._opened()
-        loop.add_reader(file, read)
-        try:
-            self._lost(await lost)
-        finally:
-            loop.remove_reader(file)
-
-    async def _udp(self) -> None:
-        url = self._source.url
-        transport, protocol = await asyncio.get_running_loop().create_datagram_endpoint(
-            lambda: _Datagrams(self._feed), local_addr=(url.address, url.port)
-        )
-        self._opened()
-        try:
-            await protocol.closed
-        finally:
-            transport.close()
-
-    async def _tcp(self) -> None:
-        url = self._source.url
-        reader, writer = await asyncio.open_connection(url.address, url.port)
-        await self._stream(reader, writer)
-
-    async def _tcp_listen(self) -> None:
-        url = self._source.url
-        server = await asyncio.start_server(self._client, url.address, url.port)
-        self._source.lost("no client is connected")
-        async with server:
-            await server.serve_forever()
-
-    async def _client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._source.connected:
-            writer.close()
-            return
-        try:
-            await self._stream(reader, writer)
-        except OSError as error:
-            self._lost(reason_of(error))
-
-    async def _stream(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._opened()
-        try:
-            while data := await reader.read(READ_SIZE):
-                self._feed(data)
-            self._lost("the other side closed the connection")
-        finally:
-            writer.close()
+    async def _feed_parts(self, data: bytes) -> None:
+        """Process bytes in several turns of the loop."""
+        for part in self.parts_of(data):
+            self.feed(part)
+            await asyncio.sleep(0)
 
     async def _poll(self) -> None:
         """Send the decoder's requests, and pass each answer on as a line."""
-        decoder = self._source.decoder
+        decoder, endpoint = self._source.decoder, self._source.url.endpoint
         assert isinstance(decoder, PolledDecoder)
-        url = self._source.url
+        assert endpoint is not None
         while True:
             async with asyncio.timeout(ANSWER_S):
-                answer = await _get(url.address, url.port, decoder.request())
+                answer = await _get(endpoint.host, endpoint.port, decoder.request())
             if not self._source.connected:
-                self._opened()
-            self._feed(answer.replace(b"\n", b" ") + b"\n")
+                self.opened()
+            self.feed(answer.replace(b"\n", b" ") + b"\n")
             await asyncio.sleep(POLL_S)
 
     async def _push(self) -> None:
@@ -232,25 +281,24 @@ class SourcePort:
     def push(self, data: bytes) -> None:
         """Process content that was posted with the token."""
         if data and not self._source.connected:
-            self._opened()
-        self._feed(data)
+            self.opened()
+        self.feed(data)
 
     async def _stdin(self) -> None:
         file = sys.stdin.fileno()
         kind = os.fstat(file).st_mode
         if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or os.isatty(file)):
             # An event loop cannot wait for a file or /dev/null, which never block.
-            self._opened()
+            self.opened()
             while data := os.read(file, READ_SIZE):
-                self._feed(data)
-                await asyncio.sleep(0)
+                await self._feed_parts(data)
             return
         reader = asyncio.StreamReader(limit=READ_SIZE)
         protocol = asyncio.StreamReaderProtocol(reader)
         await asyncio.get_running_loop().connect_read_pipe(lambda: protocol, sys.stdin)
-        self._opened()
+        self.opened()
         while data := await reader.read(READ_SIZE):
-            self._feed(data)
+            await self._feed_parts(data)
 
     async def _file(self) -> None:
         """Follow a file; one that has become shorter is read again from its beginning."""
@@ -259,13 +307,12 @@ class SourcePort:
             await self._recorded(path)
             return
         with open(path, "rb", buffering=0) as file:  # noqa: PTH123
-            self._opened()
+            self.opened()
             while True:
                 while data := file.read(READ_SIZE):
-                    self._feed(data)
-                    await asyncio.sleep(0)
+                    await self._feed_parts(data)
                 if os.stat(path).st_size < file.tell():  # noqa: PTH116
-                    self._lost("the file was shortened")
+                    self.lost("the file was shortened")
                     return
                 await asyncio.sleep(FILE_POLL_S)
 
@@ -275,7 +322,7 @@ class SourcePort:
 
         scanner, loop, start_s = TlogScanner(), asyncio.get_running_loop(), None
         with open(path, "rb") as file:  # noqa: PTH123
-            self._opened()
+            self.opened()
             while block := file.read(READ_SIZE):
                 # The recording may contain gigabytes of other messages.
                 await asyncio.sleep(0)
@@ -287,7 +334,7 @@ class SourcePort:
                     time_s = record.time_us / 1e6
                     start_s = loop.time() - time_s if start_s is None else start_s
                     await asyncio.sleep(max(start_s + time_s - loop.time(), 0.0))
-                    self._feed(data)
+                    self.feed(data)
 
 
 async def _get(host: str, port: int, path: str) -> bytes:
@@ -305,20 +352,3 @@ async def _get(host: str, port: int, path: str) -> bytes:
     if head.split()[1:2] != [b"200"] or not gap or len(answer) > MAX_ANSWER:
         raise ConnectionError("no HTTP answer with status 200")
     return content
-
-
-class _Datagrams(asyncio.DatagramProtocol):
-    """Pass on datagrams; a receiver ignores network errors."""
-
-    def __init__(self, feed: Callable[[bytes], None]) -> None:
-        self._feed = feed
-        self.closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-
-    def datagram_received(self, data: bytes, _address: object) -> None:
-        """Pass on a datagram."""
-        self._feed(data)
-
-    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
-        """Report that the socket is closed."""
-        if not self.closed.done():
-            self.closed.set_result(None)

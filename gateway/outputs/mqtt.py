@@ -10,14 +10,15 @@ import asyncio
 from collections.abc import Iterable
 from contextlib import suppress
 from importlib import import_module
-from pathlib import Path
 from typing import Any, Final
 
 from gateway.extras import how_to_add
 from gateway.hub.endpoint import Endpoint, EndpointKind
 from gateway.hub.limits import RateLimit
 from gateway.hub.transports.base import RETRY_US
-from gateway.outputs.carrier import TLS, MakeContext, target_of
+from gateway.hub.transports.tls import MakeContext
+from gateway.hub.transports.url_files import read_text
+from gateway.outputs.carrier import TLS, target_of
 from gateway.outputs.output import Output
 from gateway.printable import reason_of
 from gateway.units import US_PER_S
@@ -32,6 +33,8 @@ ANSWER_BYTES: Final = 2
 """Size of all answers of MQTT 3.1.1 to a client that only publishes (sections 3.2 to 3.7)."""
 CONNECT_LIMIT_S: Final = 10.0
 GOODBYE_LIMIT_S: Final = 1.0
+MAX_LOGIN: Final = 512
+"""Maximum size of a file with user and password."""
 DEFAULT_TOPIC: Final = "mavgate"
 
 
@@ -140,13 +143,16 @@ class Broker:
         # Imported here, as it belongs to an extra.
         import aiomqtt
 
-        user, _, password = self._read_login().partition(":")
+        # Files, which a network drive may read slowly.
+        loop = asyncio.get_running_loop()
+        user, password = await loop.run_in_executor(None, self._read_login)
+        tls = await loop.run_in_executor(None, self._tls) if self._kind == TLS else None
         self.client = client = aiomqtt.Client(
             self._inner.host,
             self._inner.port,
             username=user or None,
             password=password or None,
-            tls_context=self._tls() if self._kind == TLS else None,
+            tls_context=tls,
             will=aiomqtt.Will(self._status, "offline", qos=1, retain=True),
             timeout=CONNECT_LIMIT_S,
         )
@@ -175,8 +181,15 @@ class Broker:
             topic, data = await self._waiting.get()
             await client.publish(topic, data)
 
-    def _read_login(self) -> str:
-        return Path(self._login).expanduser().read_text().strip() if self._login else ""
+    def _read_login(self) -> tuple[str, str]:
+        """Return user and password; a file of any other form is not sent to the broker."""
+        if not self._login:
+            return "", ""
+        text = read_text(self._login, MAX_LOGIN).strip()
+        user, colon, password = text.partition(":")
+        if not colon or not text.isprintable():
+            raise OSError(f"{self._login} is not one line USER:PASSWORD")
+        return user, password
 
 
 def _bound_packets(client: Any) -> list[str]:

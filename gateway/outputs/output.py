@@ -14,7 +14,8 @@ from gateway.clock import unix_time_us
 from gateway.hub.endpoint import NO_MESSAGES, Endpoint, number_from
 from gateway.hub.stats import ClientStats
 from gateway.hub.transports.base import Client
-from gateway.outputs.carrier import Carrier, client_context, target_of
+from gateway.hub.transports.tls import client_context
+from gateway.outputs.carrier import Carrier, target_of
 from gateway.vehicle_state.antenna import HOME, AntennaStation, station_from
 from gateway.vehicle_state.newest import STATE_IDS, NewestState, NewestVehicles
 from gateway.wire.mavlink_splitter import MavFrame

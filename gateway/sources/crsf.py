@@ -180,7 +180,8 @@ class CrsfDecoder(CheckedFrames):
     def feed(self, data: bytes, arrival_us: int) -> list[Any]:
         """Decode every frame that a chunk completes."""
         if self._is_datagram and data.startswith(MSP_START):
-            data = data[MSP_HEAD:-1]
+            # Without the CRC behind it, if it is there.
+            data = data[MSP_HEAD : MSP_HEAD + int.from_bytes(data[6:MSP_HEAD], "little")]
         return super().feed(data, arrival_us)
 
     def size_at(self, data: bytes, at: int) -> int:

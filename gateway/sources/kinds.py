@@ -65,9 +65,8 @@ def check_source(url: SourceUrl) -> None:
         raise ValueError(
             f"source {url.name!r}: unknown option {unknown[0]!r}; there are {', '.join(allowed)}"
         )
-    for name in ("baud", "id"):
-        if name in url.options and not url.options[name].isdecimal():
-            raise ValueError(f"source {url.name!r}: {name} must be a whole number")
+    if not url.options.get("id", "1").isdecimal():
+        raise ValueError(f"source {url.name!r}: id must be a whole number")
     if not 1 <= int(url.options.get("id", 1)) <= MAX_VEHICLE:
         raise ValueError(f"source {url.name!r}: id must be 1 to {MAX_VEHICLE}")
 

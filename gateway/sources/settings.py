@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 from urllib.parse import parse_qsl
 
+from gateway.hub.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.records import SOURCE_NODE, NodeId
 from gateway.settings import Settings, setting
 
@@ -28,9 +29,17 @@ TRANSPORTS: Final = (
 )  # fmt: skip
 PLAIN: Final = frozenset({"push", "receiver", "stdin"})
 """Transports without an address."""
-NETWORK: Final = frozenset({"udp", "tcp", "tcp-listen", "poll"})
+ENDPOINTS: Final = {
+    "serial": EndpointKind.SERIAL,
+    "udp": EndpointKind.UDP_LISTEN,
+    "tcp": EndpointKind.TCP,
+    "tcp-listen": EndpointKind.TCP_LISTEN,
+    "poll": EndpointKind.TCP,
+}
+"""Kinds of endpoints with the same address."""
+DEFAULT_BAUD: Final = {"crsf": 420_000, "ltm": 9600}
+USUAL_BAUD: Final = 115_200
 MAX_SOURCES: Final = 16
-MAX_PORT: Final = 65535
 MAX_VEHICLE: Final = 31
 OPTIONS: Final = ("baud", "id", "token")
 """Options of every kind."""
@@ -46,8 +55,9 @@ class SourceUrl:
     kind: str
     transport: str
     address: str
-    """Path of a device or file, or network host."""
-    port: int
+    """Path of a file, or the address of an endpoint."""
+    endpoint: Endpoint | None
+    """The endpoint that brings the bytes, for a serial port or an address of the network."""
     options: dict[str, str]
 
     @property
@@ -66,12 +76,21 @@ def parse_source(url: str) -> SourceUrl:
     options = dict(parse_qsl(query, keep_blank_values=True))
     if "token" in options and not TOKEN.fullmatch(options["token"]):
         raise ValueError(f"source {location!r}: token= needs 16 to 64 letters, digits, - . _ or ~")
-    port = 0
-    if transport in NETWORK:
-        address, port = _host_and_port(location, address)
-    elif transport not in PLAIN and not address:
+    if transport not in PLAIN and not address:
         raise ValueError(f"source {location!r}: has no device or file")
-    return SourceUrl(url, kind, transport, address, port, options)
+    endpoint = None
+    if (same := ENDPOINTS.get(transport)) is not None:
+        baud = options.get("baud", DEFAULT_BAUD.get(kind, USUAL_BAUD))
+        whole = f"{address}:{baud}" if transport == "serial" else address
+        if not whole.rpartition(":")[0]:
+            # An endpoint without a host would be open to the network.
+            raise ValueError(f"source {location!r}: write {transport}:HOST:PORT")
+        try:
+            endpoint = parse_endpoint(f"{same}:{whole}?trusted=yes")
+        except ValueError as error:
+            why = str(error).partition("': ")[2].replace(f"{same}:", f"{transport}:")
+            raise ValueError(f"source {location!r}: {why}") from None
+    return SourceUrl(url, kind, transport, address, endpoint, options)
 
 
 def _transport_of(address: str) -> tuple[str, str]:
@@ -80,13 +99,6 @@ def _transport_of(address: str) -> tuple[str, str]:
     if word in TRANSPORTS:
         return word, rest
     return ("stdin", "") if address == "-" else ("serial", address)
-
-
-def _host_and_port(location: str, address: str) -> tuple[str, int]:
-    host, _, port = address.rpartition(":")
-    if not (port.isdecimal() and 0 <= int(port) <= MAX_PORT and host):
-        raise ValueError(f"source {location!r}: needs HOST:PORT, such as 127.0.0.1:5600")
-    return host.strip("[]"), int(port)
 
 
 class SourceSettings(Settings, frozen=True):

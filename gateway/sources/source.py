@@ -156,6 +156,8 @@ class SourceInput:
         self.connected = False
         self.reason = "not opened yet"
         self.decoder = decoder
+        self.has_lines = not isinstance(decoder, CheckedFrames)
+        """Whether a datagram may be divided at the ends of lines only."""
         self.tunnel = TunnelWriter(node)
         self._bytes = self._records = 0
         self._faults: Counter[str] = Counter()

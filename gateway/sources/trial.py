@@ -7,6 +7,7 @@ from typing import Final
 
 from gateway.records import BaroRaw, GpsFix, ImuFlags, ImuRaw, VehicleReport
 from gateway.sources.sampling import COUNTS_PER_DPS, COUNTS_PER_MPS2, COUNTS_PER_UT
+from gateway.sources.settings import SourceUrl
 from gateway.sources.source import SourceRecord
 from gateway.units import DEG_PER_DEGE7, DEGE7_PER_DEG
 from gateway.wire.framing import Fault
@@ -26,6 +27,23 @@ GUESSES: Final = (
 """Column names that users and this project use, by quantity."""
 DEGE7: Final = frozenset({"gps_lat_dege7", "gps_lon_dege7"})
 LEAST_NAMES: Final = 3
+WIRING: Final = "its TX to the RX here, and a common ground"
+NAMES: Final = {
+    "lines": "a line of JSON, NMEA or mapped CSV",
+    "crsf": "CRSF",
+    "ltm": "LTM",
+    "phone": "from a known app",
+}
+NEEDS: Final = {
+    "lines": (
+        "accelerometer and gyroscope in one object (accel_mps2, gyro_dps), or attitude_deg",
+        "lat, lon and alt_m, or NMEA with GGA",
+    ),
+    "crsf": ("attitude frames (0x1E) of the flight controller", "GPS frames (0x02) with a fix"),
+    "ltm": ("A frames of the flight controller", "G frames with a fix"),
+    "phone": ("accelerometer and gyroscope, both switched on in the app", "location with height"),
+}
+"""What attitude and position need, by kind."""
 KINDS: Final[dict[type, str]] = {
     ImuRaw: "accelerometer and gyroscope",
     BaroRaw: "barometer",
@@ -82,9 +100,12 @@ def _fields(report: VehicleReport) -> list[str]:
 class SourceTrial:
     """Count the records and faults of a source, and summarise them."""
 
-    def __init__(self) -> None:
+    def __init__(self, url: SourceUrl) -> None:
+        self._url = url
         self.counts: Counter[str] = Counter()
         """Number of records and faults, by kind."""
+        self.records = 0
+        self._bytes = 0
         self._has_mag = self._has_fix = self._has_height = self._has_attitude = False
         self._header = ""
 
@@ -92,6 +113,7 @@ class SourceTrial:
         """Count a record or a fault; return the number of its kind so far."""
         kind = f"fault {event.kind}" if isinstance(event, Fault) else KINDS[type(event)]
         self.counts[kind] += 1
+        self.records += not isinstance(event, Fault)
         if isinstance(event, ImuRaw):
             self._has_mag |= bool(event.flags & ImuFlags.MAG_NEW)
         elif isinstance(event, GpsFix):
@@ -101,35 +123,62 @@ class SourceTrial:
             self._has_attitude |= event.attitude_rad is not None
         return self.counts[kind]
 
-    def look_at(self, text: str) -> None:
-        """Store the first line that may contain column names, to suggest a map."""
-        for line in text.splitlines():
+    def look_at(self, data: bytes) -> None:
+        """Count bytes, and store the first line that may contain column names for a map."""
+        self._bytes += len(data)
+        for line in data.decode("utf-8", "replace").splitlines():
             names = re.findall(r"[A-Za-z]\w*", line)
             if not self._header and len(names) >= LEAST_NAMES and suggested_map(line):
                 self._header = line
 
-    def summary(self, seconds: float) -> list[str]:
-        """Summarise the test: rates, missing data, and a map with which CSV can be read."""
+    def summary(self, seconds: float, reason: str = "") -> list[str]:
+        """Summarise the test: rates, missing data, and a map with which CSV can be read.
+
+        `reason` is that for which the source is not connected.
+        """
+        if not self._bytes:
+            why = f"not connected: {reason}" if reason else self._checks()
+            return [f"nothing received in {seconds:g} s: {why}"]
         lines = [f"{kind}: {n}, {n / seconds:.1f} a second" for kind, n in self.counts.items()]
-        attitude = "yes" if self._has_attitude or self.counts[KINDS[ImuRaw]] else "no"
-        why = (
-            ""
-            if attitude == "yes"
-            else "; it needs accelerometer and gyroscope (lines: in one object)"
-        )
-        lines.append(f"attitude: {attitude}{why}")
-        if self.counts[KINDS[ImuRaw]] and not self._has_mag:
-            lines.append("heading: only in flight, from GPS; else from a compass (lines: mag_ut)")
-        place = "yes" if self._has_height else "no"
-        missing = (
-            "a height (lines: alt_m or GGA)"
-            if self._has_fix
-            else "a fix (lines: lat, lon and alt_m, or NMEA)"
-        )
-        lines.append(f"position: {place}" + ("" if self._has_height else f"; it needs {missing}"))
-        if self._header and not self.counts[KINDS[ImuRaw]]:
+        if self.records:
+            lines += self._missing()
+        else:
+            what = NAMES.get(self._url.kind, self._url.kind)
+            lines.append(f"{self._bytes} bytes arrive, none is {what}: {self._likely_causes()}")
+        if self._url.kind == "lines" and self._header and not self.counts[KINDS[ImuRaw]]:
             lines += ["a map for ?columns=FILE; check its units:", *suggested_map(self._header)]
         return lines
+
+    def _checks(self) -> str:
+        """Name what may be wrong outside of this program if nothing arrives."""
+        endpoint = self._url.endpoint
+        if endpoint is None:
+            return "check the sender"
+        if self._url.transport == "serial":
+            rate = f"baud rate {endpoint.port} (?baud=)"
+            return f"check port {endpoint.host}, {rate} and wiring ({WIRING})"
+        return f"check that the sender uses {endpoint.address} of this machine, and the firewall"
+
+    def _likely_causes(self) -> str:
+        """Name what may be wrong if only other bytes arrive."""
+        if self._url.transport == "serial" and self._url.endpoint is not None:
+            return (
+                f"baud rate {self._url.endpoint.port} (?baud=)? inverted signal? another protocol?"
+            )
+        return "does the sender use another protocol?"
+
+    def _missing(self) -> list[str]:
+        """Name the data that attitude, heading and position lack."""
+        attitude_needs, position_needs = NEEDS.get(self._url.kind, ("IMU samples", "a GPS fix"))
+        lines = ["attitude: yes"]
+        if not self._has_attitude and not self.counts[KINDS[ImuRaw]]:
+            lines = [f"attitude: no; it needs {attitude_needs}"]
+        if self.counts[KINDS[ImuRaw]] and not self._has_mag:
+            lines.append("heading: only in flight, from GPS; else from a compass")
+        if self._has_height:
+            return [*lines, "position: yes"]
+        needs = "a height" if self._has_fix else position_needs
+        return [*lines, f"position: no; it needs {needs}"]
 
 
 def suggested_map(header: str) -> list[str]:

@@ -1,6 +1,7 @@
 """The verbs do what docs/control.md says."""
 
 import math
+import os
 import sys
 import threading
 from collections.abc import AsyncIterator
@@ -13,9 +14,11 @@ import msgspec
 import pytest
 
 from gateway.hub.hub import Hub
+from gateway.hub.transports import url_files
 from gateway.live import control_verbs
 from gateway.live.control_socket import ControlError, ControlServer
 from gateway.live.control_verbs import RecorderVerbs, client_verbs, mark_verbs
+from gateway.outputs import extend
 from gateway.recordings.index import Recording
 from gateway.vehicle.plan import Location
 from tests.conftest import ManualClock
@@ -164,6 +167,7 @@ async def test_player_follows_its_verbs(clock: ManualClock, tmp_path: Path) -> N
 async def test_only_listed_serial_ports_are_added_as_clients(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    extend()
     port = SimpleNamespace(device="/dev/ttyUSB9")
     monkeypatch.setattr(control_verbs, "list_serial_ports", lambda: [port])
     added: list[str] = []
@@ -176,7 +180,42 @@ async def test_only_listed_serial_ports_are_added_as_clients(
     for device in ("/dev/pts/0", "/dev/watchdog", "/dev/zero", str(tmp_path)):
         with pytest.raises(ControlError, match="is not a serial port here"):
             await add(f"serial:{device}:57600")
+    with pytest.raises(ControlError, match="is not a serial port here"):
+        await add("rotator:serial:/dev/watchdog:9600")
     wanted = [f"serial:{device}:57600" for device in ("/dev/ttyUSB9", link)]
     for url in [*wanted, "udp:127.0.0.1:14550"]:
         await add(url)
     assert added == [*wanted, "udp:127.0.0.1:14550"]
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("own/login", ""),
+        ("other", "not in"),
+        ("own/link", "not in"),
+        ("own/pipe", "not a regular file"),
+        ("own/large", "not a regular file"),
+        ("own/absent", "No such file"),
+    ],
+)
+async def test_added_endpoint_names_only_files_of_the_settings_folder(
+    name: str, why: str, tmp_path: Path
+) -> None:
+    extend()
+    (own := tmp_path / "own").mkdir()
+    (own / "login").write_text("user:password")
+    (tmp_path / "other").write_text("secret:key")
+    (own / "link").symlink_to(tmp_path / "other")
+    os.mkfifo(own / "pipe")
+    (own / "large").write_bytes(bytes(url_files.MAX_BYTES + 1))
+    added: list[str] = []
+    hub: Any = SimpleNamespace(add=added.append, remove=None, clients=None, endpoints=tuple)
+    add: Any = client_verbs(hub, own)["clients.add"]
+    for option in ("mqtt:tcp:127.0.0.1:1883?login", "cot:tls:127.0.0.1:8089?authority"):
+        if not why:
+            await add(f"{option}={tmp_path / name}")
+            continue
+        with pytest.raises(ControlError, match=why):
+            await add(f"{option}={tmp_path / name}")
+    assert len(added) == (0 if why else 2)

@@ -8,6 +8,10 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.clock import GatewayClock
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
+from gateway.hub.transports import base
 from gateway.live import source_port
 from gateway.live.control_socket import ControlError
 from gateway.live.control_verbs import source_verbs
@@ -25,6 +29,8 @@ pytestmark = pytest.mark.io
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(base, "RETRY_US", 10_000)
+    monkeypatch.setattr(source_port, "TICK_S", 0.01)
     monkeypatch.setattr(source_port, "RETRY_S", 0.01)
     monkeypatch.setattr(source_port, "FILE_POLL_S", 0.01)
     monkeypatch.setattr(source_port, "POLL_S", 0.01)
@@ -37,10 +43,13 @@ class Opened:
         parsed, node = parse_source(url), NodeId(1, 8)
         self.source = SourceInput(parsed, node, make_decoder(parsed, node))
         self.data = b""
-        self.port = SourcePort(self.source, self._take)
+        self.parts: list[bytes] = []
+        hub = Hub(HubSettings(), lambda _: None, GatewayClock())
+        self.port = SourcePort(self.source, self._take, hub)
 
     def _take(self, _source: SourceInput, data: bytes) -> None:
         self.data += data
+        self.parts.append(data)
 
     async def __aenter__(self) -> "Opened":
         self.port.start()
@@ -126,18 +135,57 @@ async def test_server_is_connected_again_after_it_has_closed() -> None:
         await until(lambda: opened.data.startswith(b"xx"))
 
 
-async def test_listening_source_serves_one_client_at_a_time() -> None:
+async def test_newest_client_of_a_listening_source_is_used(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     port = free_port()
     async with Opened(f"lines:tcp-listen:127.0.0.1:{port}") as opened:
         await until(lambda: opened.source.reason == "no client is connected")
-        _, first = await asyncio.open_connection("127.0.0.1", port)
-        first.write(b"1")
-        await until(lambda: opened.data == b"1")
-        reader, second = await asyncio.open_connection("127.0.0.1", port)
-        assert await reader.read() == b"", "closed at once"
-        second.close()
-        first.close()
-        await until(lambda: not opened.source.connected)
+        # A board that has lost its supply closes nothing.
+        boards = [socket.create_connection(("127.0.0.1", port)) for _ in range(3)]
+        for word, board in zip((b"1", b"2", b"3"), boards, strict=True):
+            await asyncio.sleep(0)
+            board.sendall(word)
+        await until(lambda: opened.data.endswith(b"3"))
+        (peer,) = opened.port._link.peers.values()
+        assert peer._socket.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+        assert peer.remote.endswith(f":{boards[2].getsockname()[1]}")
+        for board in boards:
+            board.close()
+    assert "Traceback" not in caplog.text
+    assert "CancelledError" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("url", "data", "most"),
+    [
+        ("crsf:udp", b"\xc8\x02\x0b\x00" * 5000, source_port.PART),
+        ("lines:udp", b"x\n" * 10_000, source_port.PART),
+        ("lines:udp", b"a" * 3000 + b"\n" + b"b" * 10, 3001),
+        ("crsf:tcp-listen", bytes(20_000), source_port.PART),
+        ("lines:file", b"x\n" * 10_000, source_port.PART),
+    ],
+)
+async def test_large_input_is_processed_in_parts(
+    url: str, data: bytes, most: int, tmp_path: Path
+) -> None:
+    kind, transport = url.split(":")
+    where = str(tmp_path / "log") if transport == "file" else f"127.0.0.1:{free_port()}"
+    (tmp_path / "log").write_bytes(data)
+    async with Opened(f"{url}:{where}") as opened:
+        await until(lambda: opened.source.connected or "client" in opened.source.reason)
+        address = ("127.0.0.1", int(where.rpartition(":")[2] or 0)) if ":" in where else None
+        if transport == "udp":
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+                sender.sendto(data, address)
+        elif address is not None:
+            with socket.create_connection(address) as board:
+                board.sendall(data)
+        await until(lambda: len(opened.data) == len(data))
+        assert opened.data == data
+        assert max(map(len, opened.parts)) <= most
+        if kind == "lines":
+            assert all(part.endswith(b"\n") for part in opened.parts[:-1])
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,8 @@ class Gateway:
         url, node = parse_source(f"phone:push?token={TOKEN}"), NodeId(1, 8)
         self.source = SourceInput(url, node, make_decoder(url, node))
         self.lines: list[bytes] = []
-        port = SourcePort(self.source, lambda _, data: self.lines.append(data))
+        hub: Any = None
+        port = SourcePort(self.source, lambda _, data: self.lines.append(data), hub)
         self.control = ControlServer(folder / "run.sock", source_verbs([port]))
         settings = PanelSettings(address="0.0.0.0", password=OPERATOR, insecure=True)
         app, logins = FastAPI(), Logins(settings.password, "")

@@ -72,9 +72,10 @@ def test_wrong_map_is_refused_when_the_source_is_made() -> None:
 
 
 def test_trial_names_rates_what_is_missing_and_a_map() -> None:
-    trial, text = SourceTrial(), "time,acc_x,acc_y,acc_z\n1,2,3,4\n" + json_line(speed=1)
-    trial.look_at(text)
-    events = decode(text + gga())
+    trial = SourceTrial(parse_source("lines:stdin"))
+    text = "time,acc_x,acc_y,acc_z\n1,2,3,4\n" + json_line(speed=1) + gga()
+    trial.look_at(text.encode())
+    events = decode(text)
     for event in events:
         trial.feed(event)
     shown = [*map(describe, events)]
@@ -82,9 +83,47 @@ def test_trial_names_rates_what_is_missing_and_a_map() -> None:
     assert shown[0].startswith("unused (text): 'time,acc_x,acc_y,acc_z'")
     summary = trial.summary(2.0)
     assert "fault text: 2, 1.0 a second" in summary
-    assert "attitude: no; it needs accelerometer and gyroscope (lines: in one object)" in summary
+    assert "attitude: no; it needs accelerometer and gyroscope in one object" in "".join(summary)
     assert "position: yes" in summary
     assert 'accel_y_b_mps2 = { column = "acc_y", scale = 1 }' in summary
+
+
+@pytest.mark.parametrize(
+    ("url", "data", "reason", "words"),
+    [
+        (
+            "crsf:/dev/ttyUSB0",
+            b"",
+            "",
+            "in 10 s: check port /dev/ttyUSB0, baud rate 420000",
+        ),
+        ("crsf:/dev/ttyUSB0", b"", "unplugged", "in 10 s: not connected: unplugged"),
+        ("ltm:udp:127.0.0.1:9", b"", "", "uses 127.0.0.1:9 of this machine, and the firewall"),
+        (
+            "ltm:/dev/ttyUSB0?baud=1200",
+            bytes(99),
+            "",
+            "none is LTM: baud rate 1200",
+        ),
+        (
+            "crsf:udp:127.0.0.1:9",
+            b"a,b,c,d,e\n" * 9,
+            "",
+            "90 bytes arrive, none is CRSF: does",
+        ),
+    ],
+)
+def test_trial_without_a_record_advises_by_transport(
+    url: str, data: bytes, reason: str, words: str
+) -> None:
+    trial, parsed = SourceTrial(parse_source(url)), parse_source(url)
+    trial.look_at(data)
+    for event in make_decoder(parsed, NODE).feed(data, 0):
+        trial.feed(event)
+    summary = trial.summary(10.0, reason)
+    assert words in summary[-1]
+    assert trial.records == 0
+    assert "lines" not in " ".join(summary)
 
 
 def decode(text: str | bytes, url: str = "lines:stdin", arrival_us: int = 1_000_000) -> list[Any]:

@@ -221,22 +221,26 @@ def test_faults_are_counted_with_the_newest_explained(flight: Flight) -> None:
 
 
 @pytest.mark.parametrize(
-    ("url", "transport", "address", "port"),
+    ("url", "transport", "address", "baud"),
     [
-        ("lines:/dev/ttyUSB0", "serial", "/dev/ttyUSB0", 0),
-        ("lines:usb:1a86:7523", "serial", "usb:1a86:7523", 0),
-        ("lines:udp:0.0.0.0:5600", "udp", "0.0.0.0", 5600),
-        ("lines:tcp-listen:[::1]:70", "tcp-listen", "::1", 70),
-        ("lines:tcp:host:70?id=4", "tcp", "host", 70),
+        ("lines:/dev/ttyUSB0", "serial", "/dev/ttyUSB0", 115_200),
+        ("crsf:usb:1a86:7523", "serial", "usb:1a86:7523", 420_000),
+        ("ltm:usb:1a86:7523?baud=1200", "serial", "usb:1a86:7523", 1200),
+        ("lines:udp:0.0.0.0:5600", "udp", "0.0.0.0:5600", 0),
+        ("lines:tcp-listen:[::1]:70", "tcp-listen", "[::1]:70", 0),
+        ("lines:tcp:host:70?id=4", "tcp", "host:70", 0),
         ("lines:stdin", "stdin", "", 0),
         ("lines:-", "stdin", "", 0),
         ("lines:file:/tmp/a:b", "file", "/tmp/a:b", 0),
     ],
 )
-def test_url_has_transport_and_address(url: str, transport: str, address: str, port: int) -> None:
+def test_url_has_transport_and_address(url: str, transport: str, address: str, baud: int) -> None:
     found = parse_source(url)
-    parts = (found.kind, found.transport, found.address, found.port)
-    assert parts == ("lines", transport, address, port)
+    assert (found.transport, found.address) == (transport, address)
+    if baud:
+        assert (found.endpoint.host, found.endpoint.port) == (address, baud)
+    elif found.endpoint is not None:
+        assert found.endpoint.address == address
 
 
 @pytest.mark.parametrize(
@@ -245,7 +249,9 @@ def test_url_has_transport_and_address(url: str, transport: str, address: str, p
         ("lines", "KIND:WHERE"),
         ("lines:", "no device"),
         ("lines:udp:5600", "HOST:PORT"),
-        ("lines:udp:host:99999", "HOST:PORT"),
+        ("lines:udp:127.0.0.1:99999", "port 99999 is not"),
+        ("lines:udp:host:5600", "not an address"),
+        ("lines:/dev/ttyUSB0?baud=x", "baud rate 'x'"),
         ("line:stdin", "did you mean 'lines'"),
         ("lines-udp:0.0.0.0:5600", "did you mean 'lines'"),
         ("crsf:stdin?pitch=left", "up or down"),

@@ -30,7 +30,14 @@ from gateway.cli.live.run import (
     serve,
     with_endpoints,
 )
-from gateway.cli.support.options import CONFIG, RadioName, folder_of, read_options, read_settings
+from gateway.cli.support.options import (
+    CONFIG,
+    RadioName,
+    folder_of,
+    read_options,
+    read_settings,
+    settings_file,
+)
 from gateway.cli.support.recording_options import files_of, progress_of
 from gateway.cli.support.terminal import refuse
 from gateway.clock import unix_time_us
@@ -122,7 +129,8 @@ def demo(
 
         def daemon() -> Daemon:
             log.info("recording.mode is not used here: %s", "recording" if record else NOT_RECORDED)
-            made = Daemon(own(settings), aircraft, lambda: own(read()), line, tracker or "")
+            start = (own(settings), aircraft, lambda: own(read()), line, tracker or "")
+            made = Daemon(*start, settings_file().parent)
             daemons.append(made)
             return made
 

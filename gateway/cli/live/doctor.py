@@ -33,7 +33,7 @@ from gateway.config import (
 )
 from gateway.extras import how_to_add, missing
 from gateway.hub.endpoint import LISTENING, Endpoint, EndpointKind, parse_endpoint
-from gateway.hub.transports.ws_protocol import valid_until_s
+from gateway.hub.transports.tls import valid_until_s
 from gateway.live.control_socket import live_sockets
 from gateway.live.part_files import free_bytes_near
 from gateway.live.serial_port import (

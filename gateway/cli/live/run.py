@@ -13,7 +13,7 @@ import msgspec
 import typer
 
 from gateway.cli.live.panel import PanelProcess, launched_panel
-from gateway.cli.support.options import CONFIG, read_settings
+from gateway.cli.support.options import CONFIG, read_settings, settings_file
 from gateway.cli.support.terminal import refuse
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import ConfigError, GatewaySettings, load_aircraft
@@ -98,7 +98,8 @@ def run_gateway(
     if settings.serial.port != NO_RECEIVER or settings.sources:
         # A router has no estimator, and its hub also forwards without compiled functions.
         load_entry_points()
-    daemon = serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page)
+    folder = settings_file().parent
+    daemon = serve(lambda: Daemon(settings, aircraft, read, folder=folder), plain=plain, panel=page)
     run_event_loop(daemon, settings.hub.event_loop)
 
 

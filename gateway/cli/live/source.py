@@ -7,6 +7,8 @@ import typer
 
 from gateway.cli.support.terminal import refuse
 from gateway.clock import GatewayClock
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
 from gateway.live.source_port import SourcePort, read_map
 from gateway.printable import printable
 from gateway.sources.kinds import make_sources
@@ -29,31 +31,30 @@ def try_source(
 ) -> None:
     """Test a tracker: show its data, its rates, and data missing for attitude and position.
 
-    The exit code is 1 if nothing was received.
+    The exit code is 1 if no record was decoded.
     """
     try:
         (source,) = make_sources((SourceSettings(url=url),), read_map)
     except ValueError as error:
         refuse(str(error))
     trial = asyncio.run(_listen(source, seconds))
-    if not source.report().connected and not trial.counts:
-        print(f"not connected: {source.reason}")
-    for line in trial.summary(seconds):
-        print(line)
-    if not trial.counts:
+    for line in trial.summary(seconds, source.reason):
+        print(printable(line))
+    if not trial.records:
         raise typer.Exit(1)
 
 
 async def _listen(source: SourceInput, seconds: float) -> SourceTrial:
-    trial, clock = SourceTrial(), GatewayClock()
+    trial, clock = SourceTrial(source.url), GatewayClock()
 
     def show(found: SourceInput, data: bytes) -> None:
-        trial.look_at(data.decode("utf-8", "replace"))
+        trial.look_at(data)
         for event in found.events(data, clock()):
             if trial.feed(event) <= SHOWN:
                 print(printable(describe(event)))
 
-    port = SourcePort(source, show)
+    # Not started: only its limits and its clock are used.
+    port = SourcePort(source, show, Hub(HubSettings(), lambda _: None, clock))
     port.start()
     await asyncio.sleep(seconds)
     port.close()

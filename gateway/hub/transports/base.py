@@ -259,6 +259,8 @@ class Client:
     words: Words = field(init=False)
     """Its state in the compiled step."""
     loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop)
+    sink: "Callable[[bytes, int], None] | None" = None
+    """Takes all received bytes, and the time, of a link that does not carry MAVLink."""
     is_proven = True
     """Whether it is certain that it receives; False only of peers whose address may be forged."""
     may_return: ClassVar[bool] = True
@@ -468,6 +470,15 @@ class Client:
         self.counters.received += frames
         self.counters.bytes_received += size
         self.heard_us = max(self.heard_us or 0, heard_us)
+
+    def sink_bytes(self, data: bytes, now_us: int) -> bool:
+        """Pass received bytes to the sink; return whether there is one."""
+        if self.sink is None:
+            return False
+        self.counters.bytes_received += len(data)
+        self.heard_us = now_us
+        self.sink(data, now_us)
+        return True
 
     def count_garbage(self, size: int) -> None:
         """Count received bytes that are not MAVLink."""

@@ -59,9 +59,7 @@ class SerialClient(QueuedClient):
         if self._port is not None or not self._is_retry_due(now_us):
             return
         try:
-            port = serial.Serial(
-                self.endpoint.host, self.endpoint.port, timeout=0, write_timeout=0, exclusive=True
-            )
+            port = self._open()
         except (OSError, ValueError) as error:
             self.become("unreachable", error)
             return
@@ -71,6 +69,11 @@ class SerialClient(QueuedClient):
         self.become("open")
         self.loop.add_reader(port.fileno(), self._on_readable, port)
         self.context.greet(self.client_id)
+
+    def _open(self) -> serial.Serial:
+        """Open the port; raises OSError or ValueError."""
+        device, baud = self.endpoint.host, self.endpoint.port
+        return serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
 
     def receive_frame(self, frame: MavFrame, now_us: int) -> None:
         """Route one frame; those of the radio report the room in its buffer."""
@@ -136,7 +139,7 @@ class SerialClient(QueuedClient):
 
     def _on_readable(self, port: serial.Serial) -> None:
         try:
-            data = os.read(port.fileno(), READ_BYTES)
+            data = os.read(port.fileno(), min(READ_BYTES, self.context.read_bytes))
         except BlockingIOError:
             return
         except OSError as error:

@@ -27,6 +27,9 @@ SLOW_CHUNK_BYTES: Final = 512
 """The same for a slow connection: joined frames can no longer be overtaken."""
 USER_TIMEOUT_MS: Final = 30_000
 """Time without an acknowledgement after which a peer is gone; a paused one may resume sooner."""
+PROBE_S: Final = 5
+"""Interval of keepalive probes of an idle peer, s: a vanished one is noticed within the time above,
+and not only at the next probe, after 75 s by default."""
 SEND_BUFFER_BYTES: Final = 32_768
 """Most bytes that the peer has not acknowledged: those in flight on a long link."""
 UNSENT_BYTES: Final = 2048
@@ -129,7 +132,8 @@ class QueuedClient(Client):
 
     def accept_rest(self, data: bytes, now_us: int) -> None:
         """Process received bytes, without the compiled step."""
-        self.receive(self._splitter.feed(data), len(data), now_us)
+        if not self.sink_bytes(data, now_us):
+            self.receive(self._splitter.feed(data), len(data), now_us)
 
     @property
     def queue_bytes(self) -> int:
@@ -206,6 +210,7 @@ class StreamClient(QueuedClient):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT_MS)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, USER_TIMEOUT_MS // 2000)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, PROBE_S)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         self._socket = sock

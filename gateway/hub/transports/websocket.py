@@ -6,21 +6,14 @@ left to the kernel, which closes a connection that acknowledges nothing.
 """
 
 import contextlib
-import ssl
 from typing import Final
 
 from wsproto.frame_protocol import CloseReason
 
 from gateway.hub.endpoint import TLS_KINDS
-from gateway.hub.transports.stream import StreamClient
 from gateway.hub.transports.tcp import TcpClient
-from gateway.hub.transports.ws_protocol import (
-    TlsLayer,
-    WsCaller,
-    WsInput,
-    WsProtocol,
-    caller_context,
-)
+from gateway.hub.transports.tls import TlsLayer, TlsStream, client_context
+from gateway.hub.transports.ws_protocol import WsCaller, WsInput, WsProtocol
 from gateway.printable import reason_of
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
@@ -33,11 +26,10 @@ UNREAD_BYTES: Final = 65_536
 """Maximum bytes outside the queue: answers to a peer that sends requests and never reads."""
 
 
-class WebStream(StreamClient):
+class WebStream(TlsStream):
     """A peer behind a WebSocket, with or without TLS."""
 
     _web: WsProtocol
-    _tls: TlsLayer | None = None
     _is_gathering = False
     _connected_us = _received_us = _pinged_us = 0
     _answers = False
@@ -48,14 +40,19 @@ class WebStream(StreamClient):
         self._connected_us = self._received_us = self.context.now_us()
         self._answers = False
         self.become("connecting")
+        self._web = self._protocol()
         try:
-            self._tls = self._secure() if self.endpoint.kind in TLS_KINDS else None
+            if self.endpoint.kind in TLS_KINDS:
+                self.begin_tls(self._secure())
+            elif self._web.hello:
+                self._write(self._socket, self._web.hello)
         except OSError as error:
             self.give_up(reason_of(error))
-            return
-        self._web = self._protocol()
-        if hello := self._web.hello if self._tls is None else self._tls.feed(b"")[1]:
-            self._write(self._socket, hello)
+
+    def secured(self) -> None:
+        """Request the upgrade."""
+        if self._web.hello:
+            self._send_control(self._web.hello)
 
     def _protocol(self) -> WsProtocol:
         """Create the protocol of a new connection."""
@@ -70,12 +67,8 @@ class WebStream(StreamClient):
         self.become("open")
         self.context.greet(self.client_id)
 
-    def give_up(self, reason: str) -> None:
-        """Close the connection and record the reason."""
-        raise NotImplementedError
-
     def _wrap(self, frames: bytes) -> bytes:
-        return self._encrypt(self._web.wrap(frames))
+        return self.encrypt(self._web.wrap(frames))
 
     @property
     def is_direct(self) -> bool:
@@ -100,7 +93,7 @@ class WebStream(StreamClient):
     def accept(self, data: bytes, now_us: int) -> None:
         """Process received bytes."""
         self._received_us = now_us
-        plain = self._decrypt(data) if self._tls is not None else data
+        plain = self.decrypt(data)
         if not plain or self._socket is None:
             return
         found = self._web.feed(plain)
@@ -116,7 +109,7 @@ class WebStream(StreamClient):
     def _send_control(self, data: bytes) -> bool:
         """Send a protocol message before the queue; return whether the peer is still connected."""
         assert self._socket is not None
-        data = self._encrypt(data)
+        data = self.encrypt(data)
         if not self._partial:
             self._write(self._socket, data)
         elif len(self._partial) < UNREAD_BYTES:
@@ -146,34 +139,8 @@ class WebStream(StreamClient):
         """Send a close message if there is room, and close; waiting frames are lost."""
         if self._socket is not None and self.state == "open" and not self._partial:
             with contextlib.suppress(OSError):
-                self._socket.send(self._encrypt(self._web.close(CloseReason.GOING_AWAY)))
+                self._socket.send(self.encrypt(self._web.close(CloseReason.GOING_AWAY)))
         super().close()
-
-    def _decrypt(self, data: bytes) -> bytes:
-        """Return the plain bytes of some network bytes."""
-        assert self._tls is not None
-        assert self._socket is not None
-        was_open = self._tls.is_open
-        try:
-            plain, reply = self._tls.feed(data)
-        except ssl.SSLError as error:
-            with contextlib.suppress(OSError):
-                self._socket.send(self._tls.outgoing())
-            text = f"tls: {error.reason or error}".replace("_", " ").lower()
-            if isinstance(error, ssl.SSLCertVerificationError):
-                text += f": {error.verify_message}"
-            self.give_up(text)
-            return b""
-        if reply:
-            self._write(self._socket, reply)
-        if self._tls.is_open and not was_open and self._web.hello and self._socket is not None:
-            self._send_control(self._web.hello)
-        if self._tls.is_ended and not plain and self._socket is not None:
-            self._broke()
-        return plain
-
-    def _encrypt(self, data: bytes) -> bytes:
-        return data if self._tls is None else self._tls.wrap(data)
 
     def _receive_payload(self, found: WsInput, now_us: int) -> None:
         if found.payload:
@@ -195,7 +162,7 @@ class WsClient(WebStream, TcpClient):
         return WsCaller(self.endpoint.address, self.endpoint.path)
 
     def _secure(self) -> TlsLayer:
-        return TlsLayer(caller_context(self.context.settings), self.endpoint.host)
+        return TlsLayer(client_context(self.context.settings.tls_authority), self.endpoint.host)
 
     def give_up(self, reason: str) -> None:
         """Close the connection, and keep the reason until another is made."""

@@ -8,8 +8,9 @@ from gateway.hub.endpoint import TLS_KINDS, Endpoint, admits_page
 from gateway.hub.stats import LogRateLimiter
 from gateway.hub.transports.base import Client, HubContext
 from gateway.hub.transports.stream import StreamListener
+from gateway.hub.transports.tls import TlsLayer, server_context
 from gateway.hub.transports.websocket import WebStream
-from gateway.hub.transports.ws_protocol import TlsLayer, WsProtocol, WsServer, server_context
+from gateway.hub.transports.ws_protocol import WsProtocol, WsServer
 
 log = logging.getLogger(__name__)
 

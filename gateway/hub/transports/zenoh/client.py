@@ -132,7 +132,8 @@ class ZenohClient(Client):
 
     async def _open(self) -> None:
         try:
-            config = session_config(self.endpoint.host, self.endpoint.config)
+            endpoint = self.endpoint
+            config = await off_loop(session_config, endpoint.host, endpoint.config)
             session = await off_loop(open_session, config)
         except ModuleNotFoundError:
             self.become("unreachable")

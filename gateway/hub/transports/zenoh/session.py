@@ -37,13 +37,13 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from stat import S_ISREG
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
 
 from gateway.hub.endpoint import is_loopback
 from gateway.hub.send_queue import BULK_IDS
+from gateway.hub.transports.url_files import regular_file
 from gateway.printable import reason_of
 from gateway.wire.mavlink_messages import ids_of
 
@@ -164,7 +164,7 @@ def session_config(locator: str, file: str, mode: str = "client") -> "zenoh.Conf
     listens = "listen" if mode == "router" else "connect"
     try:
         if file:
-            config = zenoh.Config.from_file(_regular_file(file))
+            config = zenoh.Config.from_file(regular_file(file, MAX_CONFIG))
         else:
             config = zenoh.Config()
             config.insert_json5("transport/link/tx/queue/size/data", str(BATCHES))
@@ -177,19 +177,9 @@ def session_config(locator: str, file: str, mode: str = "client") -> "zenoh.Conf
         config.insert_json5(drop, "0")
     except zenoh.ZError as error:
         raise ValueError(f"zenoh: {_message_of(error)}") from None
-    return config
-
-
-def _regular_file(file: str) -> Path:
-    """Return a configuration's path; reading a device or a pipe could block the loop for ever."""
-    path = Path(file).expanduser()
-    try:
-        found = path.stat()
     except OSError as error:
-        raise ValueError(f"zenoh: {path}: {reason_of(error)}") from None
-    if not S_ISREG(found.st_mode) or found.st_size > MAX_CONFIG:
-        raise ValueError(f"zenoh: {path} is not a regular file of at most {MAX_CONFIG} bytes")
-    return path
+        raise ValueError(f"zenoh: {reason_of(error)}") from None
+    return config
 
 
 def open_session(config: "zenoh.Config") -> "zenoh.Session":
