@@ -130,9 +130,8 @@ def demo(
         def daemon() -> Daemon:
             log.info("recording.mode is not used here: %s", "recording" if record else NOT_RECORDED)
             start = (own(settings), aircraft, lambda: own(read()), line, tracker or "")
-            made = Daemon(*start, settings_file().parent)
-            daemons.append(made)
-            return made
+            daemons.append(Daemon(*start, settings_file().parent))
+            return daemons[-1]
 
         run_event_loop(serve(daemon, plain=plain, panel=page), settings.hub.event_loop)
 
