@@ -187,6 +187,21 @@ def save_endpoint(file: Path, url: str) -> None:
         table["endpoints"].append(url)
     else:
         table["endpoints"] = urls
+    _replace_document(file, document)
+
+
+def save_values(file: Path, values: Mapping[str, Any]) -> None:
+    """Set sections or single values of a settings file; otherwise as `save_endpoint`."""
+    document = _document(file)
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            document.setdefault(name, tomlkit.table()).update(value)
+        else:
+            document[name] = value
+    _replace_document(file, document)
+
+
+def _replace_document(file: Path, document: Any) -> None:
     # The mode is kept: a service must still be able to read a file that root changed.
     rights = stat.S_IMODE(file.stat().st_mode) if file.exists() else PRIVATE
     _write_document(file, document, rights)

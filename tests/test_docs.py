@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import typer
 
-from gateway.cli.app import app
+from gateway.cli.app import COMMANDS, app, load_command
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -96,6 +96,21 @@ def check(command: list[str]) -> None:
         assert (ROOT / words[0]).exists(), words[0]
     elif program.startswith("python") and words[:1] == ["-m"]:
         assert find_spec(words[1]) is not None, words[1]
+
+
+CODE = re.compile(r"`mavgate ([^`\n]+)`")
+
+
+@pytest.mark.parametrize("name", [*NAMES, "config/gateway.toml", "docs/troubleshooting.toml"])
+def test_commands_in_the_text_exist(name: str) -> None:
+    """The leading words of each are a command, or one with its subcommand."""
+    for words in map(str.split, CODE.findall((ROOT / name).read_text())):
+        if words[0][0] in "-…":
+            continue
+        assert words[0] in COMMANDS, words
+        below = getattr(load_command(words[0]), "commands", {})
+        second = words[1] if len(words) > 1 else "-"
+        assert not below or second in below or second[0] in "-…", words
 
 
 @pytest.mark.io

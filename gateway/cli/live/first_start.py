@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, NoReturn
+from typing import TYPE_CHECKING, Annotated, Final, Literal, NoReturn
 
 import typer
 from msgspec.structs import replace
@@ -22,9 +22,11 @@ from gateway.cli.live.calibrate import (
     poses_on,
     simulated_receiver,
 )
-from gateway.cli.support.options import read_settings
+from gateway.cli.support.options import read_settings, settings_file
+from gateway.cli.support.phone import guide_phone
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
+from gateway.extras import require
 from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
 from gateway.printable import figure
 from gateway.records import LORA_CHANNEL, GpsFix, LinkReport, NodeStatus, RawRecord, channel_name
@@ -66,6 +68,10 @@ class Observed:
 
 @app.command()
 def setup(
+    what: Annotated[
+        Literal["boards", "phone"],
+        typer.Argument(help="Our boards, or a phone that posts the readings of its sensors."),
+    ] = "boards",
     *,
     vehicle: Annotated[
         int | None,
@@ -82,8 +88,14 @@ def setup(
 
     Each calibration is saved when it is done; the exit code is 1 if one is not. The gateway
     must not run at the same time: the receiver's port is read by one program at a time.
+
+    A phone: asks for a password, stores the settings, and shows the QR code that the phone needs.
     """
     settings = read_settings()
+    if what == "phone":
+        require("a phone", "panel")
+        guide_phone(settings, settings_file(), _head)
+        return
     serial = settings.serial if port is None else replace(settings.serial, port=port)
     if not simulated:
         _guide(settings, serial, vehicle)

@@ -9,10 +9,12 @@ from pathlib import Path
 import pytest
 
 from gateway.cli.live import calibrate, first_start
+from gateway.cli.support import phone
 from gateway.clock import GatewayClock
 from gateway.config import load, load_aircraft
 from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import SerialPort
+from gateway.panel.logins import matches
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.simulator.trajectory import Workbench
@@ -138,3 +140,27 @@ def test_port_that_is_no_receiver_is_named_with_what_to_do(
 
 def test_missing_port_ends_with_what_to_do(tmp_path: Path) -> None:
     assert "mavgate flash receiver" in setup("--port", tmp_path / "none", code=2)
+
+
+def test_phone_gets_an_address_a_password_and_a_url_that_stay(
+    config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(phone, "own_address", lambda: "192.168.1.20")
+    config.write_text(f'# mine\n{config.read_text()}\n[[sources]]\nurl = "crsf:stdin"\n')
+    words = ("setup", "phone", "-c", config)
+    assert "Aborted" in invoke(*words, answers="tower\ntower\nn\n", code=1).output
+    assert load(config).panel.password == ""
+    first = invoke(*words, answers="tower\ntower\ny\n", code=0).output
+    settings = load(config)
+    assert (settings.panel.enabled, settings.panel.insecure) == (True, True)
+    assert matches("tower", settings.panel.password)
+    crsf, pushed = (source.url for source in settings.sources)
+    token = pushed.removeprefix("phone:push?token=")
+    assert (crsf, len(token)) == ("crsf:stdin", 32)
+    assert f"\nhttp://192.168.1.20:14590/push/{token}\n" in first
+    assert "\u2580" in first, "the QR code"
+    assert config.read_text().startswith("# mine")
+    # A second time nothing is asked or changed.
+    before = config.read_bytes()
+    assert token in invoke(*words, code=0).output
+    assert config.read_bytes() == before
