@@ -347,7 +347,8 @@ def _check_path(path: str, value: Any, field: Field) -> Iterator[str]:
 
 def _unknown_key(path: str, key: str, fields: Mapping[str, Field]) -> str:
     near = difflib.get_close_matches(key, fields, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else f"; known here: {', '.join(fields)}"
+    known = f"; known here: {', '.join(fields)}; a newer mavgate may have it"
+    hint = f"; did you mean {near[0]!r}?" if near else known
     return f"{path}: no such setting{hint}"
 
 

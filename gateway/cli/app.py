@@ -9,6 +9,7 @@ import gc
 import io
 import logging
 import os
+import subprocess
 import sys
 from difflib import get_close_matches
 from functools import partial
@@ -102,6 +103,8 @@ EPILOG: Final = "`mavgate --help` lists the options of all commands: --config, -
 SMALL: Final = frozenset({"flash", "record", *MODULES["live.clients"]})
 """Commands that mostly send requests to a gateway; extensions are loaded only with settings."""
 ISO: Final = "%Y-%m-%d %H:%M:%S"
+GIT_S: Final = 5.0
+"""Limit of the time in which git names the commit."""
 
 
 def load_command(name: str) -> Any:
@@ -216,8 +219,21 @@ app = typer.Typer(
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        print(f"mavgate {__version__}")
+        print(f"mavgate {__version__}{_commit()}")
         raise typer.Exit
+
+
+def _commit() -> str:
+    """Return the commit of the clone from which this runs; empty if it is installed."""
+    clone = Path(__file__).resolve().parents[2]
+    if not (clone / ".git").exists():
+        return ""
+    words = ["git", "-C", str(clone), "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=GIT_S)
+    except (OSError, subprocess.SubprocessError):
+        return " (of a clone)"
+    return f" (commit {done.stdout.strip()})"
 
 
 @app.callback()

@@ -192,7 +192,8 @@ def _decode(block: bytes, offset: int) -> SettingsBlock:
     values = _LAYOUT.unpack(block[: _LAYOUT.size])
     version, program, clock_mhz, major, minor = values[1:6]
     if version != VERSION:
-        raise FlashError(f"the settings block has version {version}; this mavgate reads {VERSION}")
+        text = f"the settings block has version {version}; this mavgate reads {VERSION}"
+        raise FlashError(f"{text}: use a newer one")
     found = dict(zip(BoardSettings.__struct_fields__, values[6:], strict=True))
     try:
         found["radio"] = RADIOS[found["radio"]]

@@ -301,7 +301,7 @@ class TableReader:
             self._read_names(text.split(","))
         elif text.startswith(FORMAT_PREFIX) and text != FORMAT_LINE:
             version = text.removeprefix(FORMAT_PREFIX)
-            raise ValueError(f"table version {version!r}; this mavgate reads version 1 only")
+            raise ValueError(f"table version {version!r}; this mavgate reads 1: use a newer one")
         for prefix, kind in _COMMENTS.items():
             if text.startswith(prefix):
                 found: TableComment = msgspec.json.decode(text.removeprefix(prefix), type=kind)
