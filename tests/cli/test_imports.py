@@ -1,10 +1,13 @@
 """What a command may import: to list, to ask and to run must not cost what others need."""
 
 import json
+import os
+import re
+from pathlib import Path
 
 import pytest
 
-from tests.kit.process import python
+from tests.kit.process import Process, python
 
 pytestmark = pytest.mark.io
 
@@ -41,6 +44,20 @@ def test_gateway_imports_no_optional_part() -> None:
         "gateway.simulator.simulator_settings",
         "gateway.simulator.timed_frame",
     }
+
+
+@pytest.mark.slow
+def test_running_gateway_has_loaded_no_library_of_analysis(tmp_path: Path) -> None:
+    config = '[serial]\nport = "none"\n[recording]\nmode = "always"\nfolder = "."\n'
+    source = "lines:udp:127.0.0.1:0"
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "PYTHONPROFILEIMPORTTIME": "1"}
+    words = ("run", "--plain", "--source", source, "--endpoint", "udp-listen:127.0.0.1:0")
+    with Process(tmp_path, *words, config=config, env=environment, cwd=tmp_path) as process:
+        process.until(r"INFO source .* is open")
+        assert process.end() == 0
+    loaded = set(re.findall(r"^import time:.*\| +(\w+)", process.log.read_text(), re.MULTILINE))
+    assert "gateway" in loaded
+    assert loaded & {*NEVER, "scipy", "numba"} == set()
 
 
 @pytest.mark.parametrize(
