@@ -1,6 +1,6 @@
 """Compile the kernels into one library, which the gateway loads without a compiler.
 
-    python -m tools.build_kernels [--force] [--output FILE [--architecture aarch64]]
+    python -m tools.build_kernels [--check | --force] [--output FILE [--architecture aarch64]]
 
 Machine code of sources that were compiled before is taken from the user's cache folder.
 
@@ -63,12 +63,17 @@ SHOW_S: Final = 0.2
 def main() -> None:
     """Build the library of this source tree, unless it is current."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument(
+        "--check", action="store_true", help="compile nothing; exit code 1 if it is not current"
+    )
     parser.add_argument("--force", action="store_true", help="compile it even if it is current")
     parser.add_argument("--output", type=Path, help="where to build it, for a package")
     parser.add_argument(
         "--architecture", choices=ARCHITECTURES, help="for a wheel, which runs on older systems too"
     )
     options = parser.parse_args()
+    if options.check:
+        sys.exit(0 if is_current() else 1)
     if options.output or options.force or not is_current():
         build_installed(options.output or LIBRARY, options.architecture, rebuild=options.force)
 

@@ -1,6 +1,8 @@
 #!/bin/sh
 # Make the virtual environment .venv, install locked packages into it, and compile the kernels.
-# usage: tools/set_up.sh LOCK_FILE...
+# usage: tools/set_up.sh [LOCK_FILE...]
+# Without a lock file only the kernels are compiled. The compiler is 280 MB that nothing else uses: unless
+# a lock file lists it, it has a folder of its own, which is removed after the kernels are compiled.
 # The kernels are compiled while the packages that they do not need are installed.
 # Prints one line per step, and the output of a step only if it fails. Installs Debian's
 # python3-venv if it is missing and this user may install packages.
@@ -24,8 +26,9 @@ fi
 step_of=set-up
 . tools/steps.sh
 compiling=
-kernel_log=$(mktemp) compiler_lock=$(mktemp)
-trap 'rm -f "$step_log" "$kernel_log" "$compiler_lock"; [ -z "$compiling" ] || kill "$compiling" 2>/dev/null || :' EXIT
+compiler=$PWD/.venv/compiler
+kernel_log=$(mktemp) lock_of_step=$(mktemp)
+trap 'rm -rf "$step_log" "$kernel_log" "$lock_of_step" .venv/compiler; [ -z "$compiling" ] || kill "$compiling" 2>/dev/null || :' EXIT
 
 # The lock lists every package with its hashes; packages that it does not list are not installed.
 install() {
@@ -39,21 +42,35 @@ if [ ! -x .venv/bin/pip ]; then
     fi
     step "virtual environment .venv with $("$python" --version)" "$python" -m venv .venv
 fi
-awk '/^[a-z]/ { on = /^(msgspec|pygeomag)==/ } on' requirements.lock |
-    cat requirements-build.lock - >"$compiler_lock"
-step "the packages that compile the kernels" \
-    install --require-hashes --requirement "$compiler_lock"
+# `entries NAME...` prints those entries of a lock file, `entries -v NAME...` all others.
+entries() {
+    [ "$1" = -v ] && { shift; keep=0; } || keep=1
+    awk -v keep="$keep" -v names=" $* " '
+        /^[A-Za-z]/ { name = $0; sub(/==.*/, "", name); on = (index(names, " " name " ") > 0) == keep } on'
+}
+case "$*" in *-dev.lock*) compiler= ;; esac
+entries msgspec pygeomag <requirements.lock | cat requirements-build.lock - >"$lock_of_step"
+step "the packages that compile the kernels: 80 MB${compiler:+, removed later}" \
+    install ${compiler:+--target "$compiler" --no-compile} --require-hashes --requirement "$lock_of_step"
 if ! command -v cc >/dev/null; then
-    step "a linker, as there is no C compiler" \
-        install --require-hashes --requirement requirements-linker.lock
+    step "a linker, as there is no C compiler: 90 MB" install ${compiler:+--target "$compiler" --no-compile} \
+        --require-hashes --requirement requirements-linker.lock
 fi
-.venv/bin/python -m tools.build_kernels >"$kernel_log" 2>&1 &
+PYTHONPATH=$compiler .venv/bin/python -m tools.build_kernels >"$kernel_log" 2>&1 &
 compiling=$!
 for lock; do
-    count=$(grep -c '^[A-Za-z]' "$lock")
-    step "$count packages of $lock" install --require-hashes --requirement "$lock"
+    case $lock in
+        # The demo uses neither the fleet's package nor a second event loop.
+        requirements.lock) size="96 MB" skipped="eclipse-zenoh uvloop" ;;
+        *) size="500 MB" skipped= ;;
+    esac
+    # shellcheck disable=SC2086 # the list is meant to be split
+    entries -v $skipped <"$lock" >"$lock_of_step"
+    step "$(grep -c '^[A-Za-z]' "$lock_of_step") packages of $lock: $size" \
+        install ${compiler:+--no-compile} --require-hashes --requirement "$lock_of_step"
 done
-step "mavgate itself" install --no-build-isolation --editable .
+# Only here: pip would not install again what it finds in the folder of the compiler.
+[ $# = 0 ] || PYTHONPATH=$compiler step "mavgate itself" install --no-build-isolation --editable .
 
 end_of_compiling() {
     wait "$compiling" || { cat "$kernel_log"; return 1; }
