@@ -1,13 +1,16 @@
-"""The Debian package, installed into a root of its own by dpkg."""
+"""The wheel, and the Debian package of it, installed into a root of its own by dpkg."""
 
+import gzip
 import os
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
 
+from gateway.cli.app import COMMANDS
 from gateway.config import aircraft_folder, load
 from gateway.live.control_socket import GROUP, SERVICE_FOLDER
 from gateway.live.serial_port import KNOWN_ADAPTERS
@@ -22,16 +25,44 @@ pytestmark = [
 UNIT = "usr/lib/systemd/system/mavgate.service"
 
 
+SOURCE_TIME_S = 1_700_000_000
+"""Time of all files of a wheel, s since 1970."""
+
+
 @pytest.fixture(scope="module")
-def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two wheels of the same sources, made in two folders."""
+    skipped = shutil.ignore_patterns(".*", "build", "dist", "__pycache__", "tests", "firmware")
+    words = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w"]
+    made = list[Path]()
+    for name in ("first", "second"):
+        folder = tmp_path_factory.mktemp(name)
+        shutil.copytree(ROOT, folder / "source", ignore=skipped)
+        environment = os.environ | {"SOURCE_DATE_EPOCH": str(SOURCE_TIME_S)}
+        command = [sys.executable, *words, folder, folder / "source"]
+        subprocess.run(command, check=True, env=environment)
+        made.extend(folder.glob("mavgate-*-py3-none-linux_*.whl"))
+    return made
+
+
+def test_wheel_has_the_kernels_and_two_builds_are_equal(wheels: list[Path]) -> None:
+    first, second = wheels
+    assert first.read_bytes() == second.read_bytes()
+    with zipfile.ZipFile(first) as archive:
+        names = archive.namelist()
+        assert archive.read("gateway/compiled/kernels.so").startswith(b"\x7fELF")
+    assert not [name for name in names if name.startswith(("tests/", "tools/"))]
+
+
+@pytest.fixture(scope="module")
+def package(wheels: list[Path]) -> Path:
     """The package without its dependencies, which are the same locked ones as here."""
-    folder = tmp_path_factory.mktemp("deb")
     subprocess.run(
-        [ROOT / "tools" / "make_deb.sh", folder],
+        [ROOT / "tools" / "make_deb.sh", wheels[0].parent],
         check=True,
         env=os.environ | {"PYTHON": sys.executable, "LOCK": ""},
     )
-    [made] = folder.glob("mavgate_*.deb")
+    [made] = wheels[0].parent.glob("mavgate_*.deb")
     return made
 
 
@@ -157,13 +188,16 @@ def test_every_known_adapter_has_its_rule(unpacked: Path) -> None:
     assert 'ATTR{latency_timer}="1"' in rules
 
 
-def test_documents_and_completion_are_installed(unpacked: Path) -> None:
+def test_documents_manual_page_and_completion_are_installed(unpacked: Path) -> None:
     documents = unpacked / "usr/share/doc/mavgate"
     shipped = {path.name for path in documents.glob("*.md")}
     assert shipped >= {path.name for path in (ROOT / "docs").glob("*.md")}
     bash, zsh = "bash-completion/completions/mavgate", "zsh/vendor-completions/_mavgate"
     for path in (bash, zsh, "fish/vendor_completions.d/mavgate.fish"):
         assert "_MAVGATE_COMPLETE" in (unpacked / "usr/share" / path).read_text()
+    page = gzip.decompress((unpacked / "usr/share/man/man1/mavgate.1.gz").read_bytes()).decode()
+    described = page.replace("\\-", "-")
+    assert [name for name in COMMANDS if f".SS mavgate {name} " not in described] == []
 
 
 def test_no_file_names_the_folder_of_the_build(unpacked: Path) -> None:

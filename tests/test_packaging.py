@@ -1,11 +1,7 @@
 """The lock files and the list of third-party licences."""
 
 import re
-import shutil
-import subprocess
-import sys
 import tomllib
-import zipfile
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -64,19 +60,3 @@ def test_licence_texts_of_all_installed_packages_are_found(tmp_path: Path) -> No
     assert text.count("=" * 78) >= len(names)
     assert "Chris Liechti" in text
     assert "GNU LESSER GENERAL PUBLIC LICENSE" in text, "that of pymavlink"
-
-
-@pytest.mark.io
-@pytest.mark.slow
-def test_wheel_contains_the_kernels_for_its_platform(tmp_path: Path) -> None:
-    source = tmp_path / "source"
-    skipped = shutil.ignore_patterns(".*", "build", "dist", "__pycache__", "tests", "firmware")
-    shutil.copytree(ROOT, source, ignore=skipped)
-    words = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", tmp_path]
-    subprocess.run([sys.executable, *words, source], check=True)
-    [wheel] = tmp_path.glob("mavgate-*-py3-none-linux_*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        names = archive.namelist()
-        archive.extract("gateway/compiled/kernels.so", tmp_path)
-    assert (tmp_path / "gateway/compiled/kernels.so").read_bytes().startswith(b"\x7fELF")
-    assert not [name for name in names if name.startswith(("tests/", "tools/"))]
