@@ -13,7 +13,6 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from multiprocessing.connection import Connection
@@ -21,7 +20,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from pymavlink.dialects.v20 import all as mavlink
 
 from gateway import __version__
 from gateway.analysis.flight import FlightTrack, FloatArray, flight_of_files, fuse_track
@@ -34,11 +32,12 @@ from gateway.printable import printable, reason_of
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import with_estimator
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.tallies import FACT_IDS, VehicleTally
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.recordings.workshop.convert import FlightToWrite
 from gateway.units import US_PER_S
-from gateway.vehicle_state.positions import Continuity, GroundDistance
-from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.vehicle_state.positions import Continuity
+from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES
 
 WEB: Final = Path(__file__).parent / "web"
 COMPONENTS: Final = (
@@ -64,7 +63,7 @@ READ: Final = frozenset(
 RESOLUTION: Final = {
     "lat_deg": 1e-6, "lon_deg": 1e-6, "q_nb.0": 5e-4, "q_nb.1": 5e-4, "q_nb.2": 5e-4,
     "q_nb.3": 5e-4, "fix_type": 1.0, "satellites": 1.0, "heading_deg": 1.0, "battery_v": 0.01,
-    "battery_percent": 1.0, "mark_distance_m": 1.0, "mark_bearing_deg": 1.0,
+    "battery_percent": 1.0,
 }  # fmt: skip
 DEFAULT_RESOLUTION: Final = 0.1
 """Resolution of the other columns, m or m/s."""
@@ -98,7 +97,8 @@ class PageFlight:
     histories: dict[int, FlightHistory] = field(default_factory=dict)
     breaks: dict[int, list[int]] = field(default_factory=dict)
     """Times at which the track of an aircraft begins again after an interruption, µs."""
-    distances: dict[int, GroundDistance] = field(default_factory=dict)
+    tallies: dict[int, VehicleTally] = field(default_factory=dict)
+    """Facts of each aircraft."""
     texts: list[tuple[int, int, int, str]] = field(default_factory=list)
     """Time in µs, system id, severity and text of each STATUSTEXT."""
     compared: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
@@ -113,10 +113,13 @@ def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageF
     """
     flight = PageFlight(name)
     recorded = FlightToWrite(files, options)
-    reader = mavlink.MAVLink(None)
     tracks: defaultdict[int, Continuity] = defaultdict(Continuity)
-    for message in recorded.vehicle_messages(READ):
-        _add(flight, message, reader, tracks[message.system_id])
+    for message in recorded.vehicle_messages(READ | FACT_IDS):
+        system_id = message.system_id
+        if system_id not in flight.tallies:
+            flight.tallies[system_id] = VehicleTally(recorded.senders.vehicle(system_id))
+        flight.tallies[system_id].update(message)
+        _add(flight, message, tracks[system_id])
     flight.remarks += recorded.remarks
     flight.histories = {key: one for key, one in flight.histories.items() if len(one) > 1}
     if not flight.histories:
@@ -125,7 +128,7 @@ def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageF
     return flight
 
 
-def _add(flight: PageFlight, message: VehicleMessage, reader: Any, track: Continuity) -> None:
+def _add(flight: PageFlight, message: VehicleMessage, track: Continuity) -> None:
     """Add the next message of an aircraft."""
     system_id, time_us = message.system_id, message.time_us
     if (text := message.text) is not None:
@@ -133,12 +136,10 @@ def _add(flight: PageFlight, message: VehicleMessage, reader: Any, track: Contin
             flight.texts.append((time_us, system_id, text.severity, text.text))
         return
     vehicle = flight.aircraft.setdefault(system_id, VehicleState(system_id, "recorded"))
-    with suppress(mavlink.MAVError):
-        vehicle.update(reader.decode(bytearray(message.frame)), time_us)
+    vehicle.state.update(MESSAGE_NAMES[message.message_id], message.fields, time_us)
     if (at := message.position) is None or vehicle.state.position is None:
         return
     place = (time_us, at.lat_deg, at.lon_deg, message.boot_us)
-    flight.distances.setdefault(system_id, GroundDistance()).update(*place)
     history = flight.histories.setdefault(system_id, FlightHistory(MAX_ROWS))
     if time_us - history.newest_us < STEP_US and len(history):
         return
@@ -168,7 +169,7 @@ def add_comparison(flight: PageFlight, compared: Connection) -> None:
 def _compare(argument: tuple[Sequence[Path], ReadOptions], sender: Connection) -> None:
     """Send the civil time of clock time zero and the tracks, or the reason why there are none."""
     try:
-        sensors, table, _ = flight_of_files(*argument, name="")
+        sensors, table, _ = flight_of_files(*argument, name=argument[0][0].name)
         tracks = {
             name: fuse_track(sensors, with_estimator(sensors.fusion, name)) for name in ESTIMATORS
         }
@@ -231,7 +232,7 @@ def _data_of(flight: PageFlight) -> dict[str, Any]:
                 "home": _spot(flight.aircraft[system_id].home),
                 "columns": dict(_columns_of(history, zero_us)),
                 "breaks": [time_us - zero_us for time_us in flight.breaks.get(system_id, ())],
-                "distance_m": flight.distances[system_id].distance_m,
+                **_facts_of(flight.tallies[system_id]),
             }
             for system_id, history in sorted(flight.histories.items())
         ],
@@ -245,6 +246,12 @@ def _data_of(flight: PageFlight) -> dict[str, Any]:
         },
         "remarks": [printable(remark) for remark in flight.remarks],
     }
+
+
+def _facts_of(tally: VehicleTally) -> dict[str, Any]:
+    facts = tally.facts()
+    names = ("distance_m", "airborne_s", "highest_m", "height_above")
+    return {name: getattr(facts, name) for name in names}
 
 
 def _spot(spot: Any) -> dict[str, float] | None:

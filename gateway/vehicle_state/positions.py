@@ -32,6 +32,8 @@ GPS_IDS: Final = (MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["GPS2_RAW"])
 GLOBAL_POSITION_INT_ID: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
 LOCAL_POSITION_NED_ID: Final = MESSAGE_IDS["LOCAL_POSITION_NED"]
 ORIGIN_ID: Final = MESSAGE_IDS["GPS_GLOBAL_ORIGIN"]
+NO_ORIGIN_M: Final = 1.0
+"""Heights above the sea and above home that are equal and less than this are unknown."""
 INTERRUPTION_US: Final = 60 * US_PER_S
 """Longer time without a position that breaks a track; narrow links send one every 10 s."""
 RESTART_US: Final = 5 * US_PER_S
@@ -170,6 +172,9 @@ def position_of(
     if message_id != LOCAL_POSITION_NED_ID:
         lat_deg, lon_deg = (fields[name] * DEG_PER_DEGE7 for name in (source.lat, source.lon))
         alt_m = fields[source.alt] * source.alt_unit_m
+        if alt_m == alt_home_m and abs(alt_m) < NO_ORIGIN_M:
+            # ArduPilot before its first fix: heights from an origin that is not set.
+            alt_m = alt_home_m = NAN
     elif origin is None:
         return None
     else:

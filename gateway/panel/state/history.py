@@ -15,7 +15,7 @@ HISTORY_COLUMNS: Final = {
             "alt_amsl_m", "alt_home_m", "q_nb.0", "q_nb.1", "q_nb.2", "q_nb.3", "rate_b_radps.0",
             "rate_b_radps.1", "rate_b_radps.2", "vel_n_mps.0", "vel_n_mps.1", "vel_n_mps.2",
             "groundspeed_mps", "airspeed_mps", "climb_mps", "heading_deg", "pos_std_m", "fix_type",
-            "satellites", "mark_distance_m", "mark_bearing_deg", "battery_v", "battery_percent",
+            "satellites", "battery_v", "battery_percent",
         ),
         "f",
     ),

@@ -48,8 +48,6 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     """Newest GPS fix of two dimensions or more."""
     home: Location | None
     mark: Location | None
-    mark_distance_m: float
-    mark_bearing_deg: float
     battery_v: float
     battery_percent: float
     armed: bool

@@ -16,6 +16,7 @@ from gateway.vehicle.plan import Location
 from gateway.vehicle_state.newest import NewestState
 from gateway.vehicle_state.positions import (
     GPS_IDS,
+    UNKNOWN_U16,
     Position,
     TrackPoint,
     named_position,
@@ -119,7 +120,6 @@ class VehicleState:
         state, gps = self.state, self.state.fix()
         (q_nb, rates), (battery_v, battery_percent) = state.attitude(), state.battery()
         at, hud = state.position or UNKNOWN_POSITION, state.fields.get("VFR_HUD")
-        mark, distance_m, bearing_deg = self._mark()
         return Instant(
             system_id=self.system_id,
             time_us=self._moved_us,
@@ -133,7 +133,7 @@ class VehicleState:
             lat_deg=at.lat_deg,
             lon_deg=at.lon_deg,
             alt_amsl_m=hud["alt"] if hud and not state.position else at.alt_amsl_m,
-            alt_home_m=at.alt_home_m,
+            alt_home_m=self._alt_home_m(at),
             vel_n_mps=at.vel_n_mps,
             groundspeed_mps=hud["groundspeed"] if hud else at.groundspeed_mps,
             airspeed_mps=state.airspeed_mps(),
@@ -144,9 +144,7 @@ class VehicleState:
             satellites=state.satellites(),
             fix=self.fix,
             home=self.home,
-            mark=mark,
-            mark_distance_m=distance_m,
-            mark_bearing_deg=bearing_deg,
+            mark=self._mark(),
             battery_v=battery_v,
             battery_percent=battery_percent,
             attitude_s=self._age_s(now_us, *ATTITUDES),
@@ -156,6 +154,12 @@ class VehicleState:
             battery_s=self._age_s(now_us, "BATTERY_STATUS", "SYS_STATUS"),
             armed=state.is_armed(),
         )
+
+    def _alt_home_m(self, at: Position) -> float:
+        """Return the height above home, as reported or else from that of home."""
+        if math.isfinite(at.alt_home_m) or self.home is None:
+            return at.alt_home_m
+        return at.alt_amsl_m - self.home.alt_amsl_m
 
     def _age_s(self, now_us: int, *names: str) -> float:
         """Return the age of the newest of some messages; NaN if none was received."""
@@ -169,17 +173,18 @@ class VehicleState:
             return float(estimator["pos_horiz_accuracy"])
         return gps.h_acc_m if gps else NAN
 
-    def _mark(self) -> tuple[Location | None, float, float]:
-        """Return the mark, and the distance and bearing reported by the aircraft."""
+    def _mark(self) -> Location | None:
+        """Return the mark, from the distance and bearing that the aircraft reports if need be."""
         way, at = self.state.fields.get("NAV_CONTROLLER_OUTPUT"), self.state.position
-        if way is None or at is None or not way["wp_dist"]:
-            return self.exact_mark, NAN, NAN
-        bearing_deg, distance_m = float(way["target_bearing"] % 360), float(way["wp_dist"])
-        if self.exact_mark is not None:
-            return self.exact_mark, distance_m, bearing_deg
+        if self.exact_mark is not None or way is None or at is None:
+            return self.exact_mark
+        distance_m = float(way["wp_dist"])
+        if not 0.0 < distance_m < UNKNOWN_U16:
+            # The field saturates at 65 km.
+            return None
+        bearing_deg = float(way["target_bearing"] % 360)
         lat_deg, lon_deg = vincenty.vreckon(at.lat_deg, at.lon_deg, distance_m, bearing_deg)
-        lon_deg = wrap_180(float(lon_deg))
-        return Location(float(lat_deg), lon_deg), distance_m, bearing_deg
+        return Location(float(lat_deg), wrap_180(float(lon_deg)))
 
     def _note_fix(self, now_us: int) -> None:
         if (at := self.fix) is None:

@@ -50,6 +50,7 @@ export default {
   },
   unmounted() {
     this.leave?.();
+    mavgate.displayed = null;
     this.watcher.disconnect();
     cancelAnimationFrame(this.frame);
     clearTimeout(this.staleTimer);
@@ -113,6 +114,8 @@ export default {
         if (Math.abs(to - shown[field]) > 0.005) this.moving = true;
       }
       this.shown = shown;
+      // The numbers show this moment too.
+      mavgate.displayed = shown;
     },
     draw(now) {
       const canvas = this.$refs.canvas;
@@ -401,8 +404,9 @@ export default {
       g.fillText(text, w / 2 + 0.4 * u, y + 4.6 * u);
     },
     bug({ g, u, w, y, pixels, font }, heading) {
-      const bearing = this.goal?.mark_bearing_deg;
-      if (!known(bearing)) return;
+      const { mark, lat_deg, lon_deg } = this.goal ?? {};
+      if (!mark || !known(lat_deg)) return;
+      const bearing = mavgate.bearing_deg([lat_deg, lon_deg], [mark.lat_deg, mark.lon_deg]);
       const half = w / 2 - 1.5 * u;
       const off = Math.max(-half, Math.min(half, mavgate.wrap_deg(bearing - heading) * pixels));
       g.fillStyle = MARK;

@@ -393,9 +393,8 @@ export default {
       this.circle = radius === null ? "" : mavgate.show("length", radius).join(" ");
       this.way = "";
       if (state.mark) {
-        const reported = state.mark_distance_m !== null;
-        const distance = reported ? state.mark_distance_m : this.map.distance(here, at(state.mark));
-        const bearing = reported ? state.mark_bearing_deg : mavgate.bearing_deg(here, at(state.mark));
+        const distance = mavgate.distance_m(here, at(state.mark));
+        const bearing = mavgate.bearing_deg(here, at(state.mark));
         this.way = `mark ${mavgate.show("distance", distance, 2).join(" ")}, ${Math.round(bearing) % 360}°`;
       }
       this.position = `${state.lat_deg.toFixed(6)}, ${state.lon_deg.toFixed(6)}`;

@@ -9,7 +9,8 @@ import plots from "./flight_plots.js";
 const SPEEDS = [0.5, 1, 2, 5, 10, 50];
 const SEVERITIES = ["Emergency", "Alert", "Critical", "Error", "Warning", "Notice", "Info", "Debug"];
 const PARTS = [
-  ["Height", "m", [["alt_home_m", "above home"], ["alt_amsl_m", "above sea"]]],
+  ["Height above home", "m", [["alt_home_m", "above home"]]],
+  ["Height above sea", "m", [["alt_amsl_m", "above sea"]], false, true],
   ["Speed", "m/s", [["groundspeed_mps", "ground speed"], ["airspeed_mps", "airspeed"], ["climb_mps", "climb"]]],
   ["Attitude", "°", [["roll_deg", "roll"], ["pitch_deg", "pitch"]]],
   ["Heading", "°", [["heading_deg", "heading"]], true],
@@ -91,15 +92,17 @@ export default {
     },
     facts() {
       const begin = this.flight.begin_us > YEAR_2000_US ? `${new Date(this.flight.begin_us / 1000).toISOString().slice(0, 16).replace("T", " ")} UTC, ` : "";
-      return `${begin}${mavgate.duration(this.duration_s)}, ${(this.length_m() / 1000).toFixed(1)} km`;
+      const { distance_m, airborne_s, highest_m, height_above } = this.flight.aircraft.find(({ system_id }) => String(system_id) === this.selected);
+      const height = highest_m === null ? "" : `, highest ${Math.round(highest_m)} m above ${height_above}`;
+      return `${begin}${mavgate.duration(this.duration_s)}, ${(distance_m / 1000).toFixed(2)} km, in the air ${mavgate.clock(airborne_s)}${height}`;
     },
     groups() {
       const columns = mavgate.histories[this.selected];
       if (!columns) return [];
       const time_s = columns.time_us.map((us) => us / 1e6);
       const all = { ...columns, ...this.angles[this.selected] };
-      const shown = PARTS.map(([title, unit, series, is_heading]) => ({
-        title, unit, is_heading, series: series.filter(([key]) => all[key]?.some((v) => Number.isFinite(v) && v !== 0)).map(([key, name]) => ({ name, time_s, values: all[key] })),
+      const shown = PARTS.map(([title, unit, series, is_heading, is_small]) => ({
+        title, unit, is_heading, is_small, series: series.filter(([key]) => all[key]?.some((v) => Number.isFinite(v) && v !== 0)).map(([key, name]) => ({ name, time_s, values: all[key] })),
       })).filter(({ series }) => series.length);
       const compared = Object.entries(this.compared);
       for (const [key, title, unit, is_heading] of compared.length ? COMPARED : [])
@@ -117,7 +120,10 @@ export default {
       this.angles[id] = add_angles(columns);
       mavgate.vehicles[id] = { system_id: aircraft.system_id, title: aircraft.title, model: aircraft.model, origin: "live", generation: 0, home: aircraft.home, mark: null, lat_deg: columns.lat_deg[0], lon_deg: columns.lon_deg[0], alt_amsl_m: columns.alt_amsl_m[0] };
       const track = mavgate.track(id);
-      track.points = columns.lat_deg.map((lat, n) => [lat, columns.lon_deg[n], columns.alt_amsl_m[n] ?? 0, columns.time_us[n]]).filter(([lat]) => lat !== null);
+      const has_height = columns.alt_amsl_m.some((alt) => alt !== null);
+      const points = columns.lat_deg.map((lat, n) => [lat, columns.lon_deg[n], columns.alt_amsl_m[n], columns.time_us[n]]);
+      // A track has heights, or it lies at zero.
+      track.points = points.filter(([lat, , alt]) => lat !== null && (alt !== null || !has_height)).map(([lat, lon, alt, us]) => [lat, lon, alt ?? 0, us]);
       track.breaks = new Set(aircraft.breaks.map((us) => track.points.findIndex(([, , , time_us]) => time_us >= us - 500)));
       track.version = 1;
       this.duration_s = Math.max(this.duration_s, columns.time_us.at(-1) / 1e6);
@@ -146,12 +152,16 @@ export default {
       requestAnimationFrame(turn);
     };
     requestAnimationFrame(turn);
-    this.go(0);
+    this.go(this.first_s());
   },
   methods: {
     clock: (seconds) => mavgate.clock(seconds),
-    length_m() {
-      return this.flight.aircraft.find(({ system_id }) => String(system_id) === this.selected).distance_m;
+    // Where attitude, position and height are known, if they are at any time.
+    first_s() {
+      const columns = mavgate.histories[this.selected];
+      const all = ["q_nb.0", "lat_deg", "alt_amsl_m"].filter((name) => columns[name].some((value) => value !== null));
+      const at = columns.time_us.findIndex((_, n) => all.every((name) => columns[name][n] !== null));
+      return at > 0 ? columns.time_us[at] / 1e6 : 0;
     },
     go(seconds) {
       this.at_s = Math.min(this.duration_s, Math.max(0, seconds));

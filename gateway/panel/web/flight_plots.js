@@ -14,7 +14,7 @@ const NARROW = 620; // below it the names of the lines have a row of their own
 export default {
   template: `
     <section class="card flight-plots" aria-label="Plots">
-      <div v-for="(group, n) in groups" :key="group.title" class="plot">
+      <div v-for="(group, n) in groups" :key="group.title" :class="{ plot: true, small: group.is_small }">
         <canvas :ref="(canvas) => (canvases[n] = canvas)" role="img" :aria-label="group.title"
           @wheel.prevent="zoom" @pointerdown="grab" @pointermove="drag" @pointerup="drop" @dblclick="whole"></canvas>
       </div>

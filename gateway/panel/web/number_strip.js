@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 // The flight in numbers: each with its unit, and its age if it is old.
 const OLD_S = 1.5;
-const EVERY_MS = 200;
+const EVERY_MS = 50;
 const rad = Math.PI / 180;
 const EARTH_M = 6371000;
+const LEAST_SIGHT_M = 3; // an error of the position of that size turns the direction by a radian
 
 export default {
   template: `
@@ -15,7 +16,7 @@ export default {
     </dl>`,
   data: () => ({ items: [], limit: OLD_S }),
   mounted() {
-    // At most a few times a second, and always once after the last change.
+    // At most that often, and always once after the last change.
     const update = () => {
       this.timer = undefined;
       this.items = mavgate.state ? items_of(mavgate.state) : [];
@@ -31,7 +32,8 @@ export default {
 function items_of(state) {
   const past = mavgate.past_us !== null;
   const age = (name) => (past ? 0 : (state[name] ?? 0));
-  const q = state.q_nb;
+  const displayed = mavgate.displayed;
+  const q = displayed?.fresh === state.system_id && displayed.q ? displayed.q : state.q_nb;
   const angles = q && q[0] !== null ? mavgate.euler_deg(q) : [null, null, null];
   const angle = (value, digits = 1) => (Number.isFinite(value) ? value.toFixed(digits) : "—");
   const heading = Number.isFinite(angles[2]) ? angles[2] : state.heading_deg;
@@ -40,11 +42,11 @@ function items_of(state) {
   // Latitude and longitude are one item, without a line break between them.
   const position = (name, lat, lon) => ({ ...item(name, Number.isFinite(lat) ? `${lat.toFixed(6)}, ${lon.toFixed(6)}` : "—", "°", "position_s"), is_wide: true });
   const quantity = (name, kind, value, age_name, digits = 1) => item(name, ...mavgate.show(kind, value, digits), age_name);
-  const way = (name, spot, distance_m, bearing_deg) => {
+  const way = (name, spot) => {
     if (!spot || !Number.isFinite(here[0])) return [];
     const to = [spot.lat_deg, spot.lon_deg];
-    const [text, unit] = mavgate.show("distance", distance_m ?? mavgate.distance_m(here, to), 2);
-    const bearing = Math.round(bearing_deg ?? mavgate.bearing_deg(here, to)) % 360;
+    const [text, unit] = mavgate.show("distance", mavgate.distance_m(here, to), 2);
+    const bearing = Math.round(mavgate.bearing_deg(here, to)) % 360;
     return [item(name, text, `${unit} ${bearing}°`, "position_s")];
   };
   // Direction of an antenna at home; the Earth's curvature lowers the line by half the arc.
@@ -53,6 +55,8 @@ function items_of(state) {
     if (!Number.isFinite(rise_m) || !Number.isFinite(here[0]) || home.alt_amsl_m === null || state.alt_amsl_m === null) return [];
     const from = [home.lat_deg, home.lon_deg];
     const distance_m = mavgate.distance_m(from, here);
+    // Directly above home the direction is unknown.
+    if (distance_m < LEAST_SIGHT_M) return [item("From home", "—", "", "position_s")];
     const elevation = (Math.atan2(rise_m, distance_m) - distance_m / 2 / EARTH_M) / rad;
     return [item("From home", `${Math.round(mavgate.bearing_deg(from, here)) % 360}°`, `${elevation.toFixed(1)}° up`, "position_s")];
   };
@@ -64,9 +68,9 @@ function items_of(state) {
     quantity("Climb", "climb", state.climb_mps, "hud_s"),
     quantity("Above home", "altitude", state.alt_home_m, "position_s"),
     quantity("Above sea", "altitude", state.alt_amsl_m, "position_s"),
-    ...way("To home", state.home, null, null),
+    ...way("To home", state.home),
     ...sight(state.home),
-    ...way("To mark", state.mark, state.mark_distance_m, state.mark_bearing_deg),
+    ...way("To mark", state.mark),
     position("Latitude, longitude", ...here),
     ...(state.mark ? [position("Mark at", state.mark.lat_deg, state.mark.lon_deg)] : []),
     item("Satellites", state.fix_type ? angle(state.satellites, 0) : "—", "", "gps_s"),
