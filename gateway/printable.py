@@ -23,6 +23,8 @@ LONGEST: Final = 2000
 """Maximum characters of a log line; an address requested from the panel may have 60,000."""
 UNKNOWN: Final = "—"
 """Shown instead of an unknown number."""
+NO_RECEIVER: Final = "none"
+"""Setting `serial.port` of a gateway that has no receiver."""
 FEW_BYTES: Final = 200
 """Bytes that may be the end of a frame, or the buffer of an adapter, not another device."""
 
@@ -120,9 +122,12 @@ def unknown_choice(what: str, word: str, choices: Iterable[str]) -> str:
 
 
 def receiver_state(port: str, connected: bool, bytes_received: int, frames: int) -> str:
-    """Describe the receiver's port; a wrong device or bit rate also opens, but yields no frames."""
-    if not connected and port == "none":
-        return "receiver: none"
+    """Describe the receiver's port; empty if none is configured.
+
+    A wrong device or bit rate also opens, but yields no frames.
+    """
+    if not connected and port == NO_RECEIVER:
+        return ""
     if not connected:
         return f"receiver: not connected (serial.port = {port})"
     return f"receiver: {port} {_reception(bytes_received, frames)}"

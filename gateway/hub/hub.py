@@ -21,7 +21,14 @@ from gateway.hub.router import Router
 from gateway.hub.routing_table import Origin, OwnVehicles
 from gateway.hub.send_queue import NOT_TELEMETRY_IDS, Numbering
 from gateway.hub.settings import HubSettings
-from gateway.hub.stats import ClientAlerts, ClientStats, HubCounters, ListenerStats, LogRateLimiter
+from gateway.hub.stats import (
+    ClientAlerts,
+    ClientStats,
+    HubCounters,
+    ListenerStats,
+    LogRateLimiter,
+    name_with_remote,
+)
 from gateway.hub.transports.base import (
     READ_BYTES,
     UNTRUSTED_READ_BURST,
@@ -360,7 +367,8 @@ class Hub:
         self._clients[client.client_id] = client
         self._share_reads()
         self._fanout.add(client)
-        self._log_connection(client, f"client {client.client_id}: {client.remote}")
+        name = name_with_remote(client.name, client.remote)
+        self._log_connection(client, f"client {client.client_id}: {name}")
 
     def reconfigure(self, client: Client) -> None:
         """Apply a client's changed options from the next frame on."""
@@ -394,7 +402,8 @@ class Hub:
         self._vehicles.remove(client.client_id)
         if self._clients.pop(client.client_id, None):
             self._share_reads()
-            self._log_connection(client, f"client {client.client_id} has gone: {client.remote}")
+            name = name_with_remote(client.name, client.remote)
+            self._log_connection(client, f"client {client.client_id} has gone: {name}")
             if self._on_gone is not None:
                 self._on_gone(client.client_id)
         client.close()

@@ -27,6 +27,11 @@ Key = int | str
 """Id of a client, or URL of a listening port."""
 
 
+def name_with_remote(name: str, remote: str) -> str:
+    """Return the name of a client with the address of its peer."""
+    return name if remote in name else f"{name} {remote}"
+
+
 @dataclass(slots=True)
 class ClientCounters:
     """Counters of one client since it appeared."""

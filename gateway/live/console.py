@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.geometry.quaternion import to_euler
-from gateway.hub.stats import ClientStats, ListenerStats
+from gateway.hub.stats import ClientStats, ListenerStats, name_with_remote
 from gateway.printable import UNKNOWN, PrintableFormatter, figure, receiver_state
 from gateway.records import (
     GpsFix,
@@ -32,7 +32,14 @@ from gateway.records import (
     board_name,
     channel_name,
 )
-from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot
+from gateway.status import (
+    VEHICLE_HEADS,
+    AircraftStatus,
+    RecorderStatus,
+    RelativeLocation,
+    Snapshot,
+    vehicle_cells,
+)
 from gateway.units import MV_PER_V, US_PER_S, counted
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 
@@ -101,7 +108,8 @@ class LiveView:
         status = {one.vehicle_id: one for one in snapshot.aircraft}
         for vehicle_id, state in snapshot.states:
             flying += [Text(), _aircraft(vehicle_id, state, status.get(vehicle_id)), _flags(state)]
-        if not snapshot.states:
+        flying += [Text(), _vehicles(snapshot)] if snapshot.vehicles else []
+        if not snapshot.states and not snapshot.vehicles:
             flying.append(Text("No aircraft yet.", style="dim"))
         others: list[RenderableType] = [_clients(snapshot)]
         others += [*_ports(snapshot), *_troubles(snapshot), Text()]
@@ -172,8 +180,9 @@ def _link_line(snapshot: Snapshot) -> Text:
     up = f"{snapshot.time_us // US_PER_S // 60}:{snapshot.time_us // US_PER_S % 60:02d}"
     line = Text(f"up {up}  ")
     state = receiver_state(report.port, report.connected, report.bytes_received, report.frames)
-    line.append(state, style="green" if report.connected else "red")
-    line.append(f"  serial {counted(report.frames, 'frame')}, {report.frames_lost} lost")
+    if state:
+        line.append(state, style="green" if report.connected else "red")
+        line.append(f"  serial {counted(report.frames, 'frame')}, {report.frames_lost} lost")
     for kind, count in report.faults:
         line.append(f", {counted(count, f'{kind} fault')}", style="yellow")
     for source in report.sources:
@@ -275,6 +284,14 @@ def _aircraft(vehicle_id: int, state: NavState, known: AircraftStatus | None) ->
     return grid
 
 
+def _vehicles(snapshot: Snapshot) -> _Grid:
+    """Show all vehicles of the hub, own and foreign."""
+    grid = _Grid(*VEHICLE_HEADS)
+    for row in snapshot.vehicles:
+        grid.add_row(*vehicle_cells(row))
+    return grid
+
+
 def _fix_cells(fix: GpsFix | None) -> tuple[str | Text, ...]:
     if fix is None:
         return (UNKNOWN,) * 4
@@ -332,8 +349,11 @@ def _troubles(snapshot: Snapshot) -> list[Text]:
 
 def _client_cells(client: ClientStats) -> tuple[str, ...]:
     figures = (client.sent, client.dropped, client.received)
-    name = client.name if client.remote in client.name else f"{client.name} {client.remote}"
-    return (name, client.state, *(str(figure) for figure in figures))
+    return (
+        name_with_remote(client.name, client.remote),
+        client.state,
+        *(str(figure) for figure in figures),
+    )
 
 
 def _since_received(now_us: int, client: ClientStats) -> str:

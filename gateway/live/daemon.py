@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import msgspec
 
@@ -39,12 +39,13 @@ from gateway.live.other_gateways import conflicts, identity_verb, log_other_gate
 from gateway.live.pty_port import PtyPort
 from gateway.live.recorder import Recorder
 from gateway.live.recording_budget import RecordingBudget
-from gateway.live.serial_port import AUTO, NO_RECEIVER, SerialPort
+from gateway.live.serial_port import AUTO, SerialPort
 from gateway.live.service import LoopLag, ServiceNotifier, set_realtime_priority
 from gateway.live.session import SessionState
 from gateway.live.source_port import SourcePort, read_map
+from gateway.live.vehicle_watch import RECEIVER, VehicleWatch
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.printable import reason_of, without_folders
+from gateway.printable import NO_RECEIVER, reason_of, without_folders
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import TableHeader
 from gateway.recordings.tlog import UNRECORDED
@@ -54,7 +55,7 @@ from gateway.simulator.timed_frame import TimedFrame
 from gateway.sources.kinds import make_sources
 from gateway.sources.settings import SourceSettings
 from gateway.sources.source import SourceInput
-from gateway.status import Snapshot, status_of
+from gateway.status import Snapshot, VehicleRow, status_of
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
 from gateway.vehicle.service import (
@@ -72,9 +73,6 @@ from gateway.vehicle.service import (
 from gateway.vehicle.telemetry.announcements import Announcer
 from gateway.wire.mavlink_messages import ids_of
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
-
-if TYPE_CHECKING:
-    from gateway.live.system_metrics import SystemMetrics
 
 log = logging.getLogger(__name__)
 
@@ -139,7 +137,7 @@ class Daemon:
         self._opening: asyncio.Task[None] | None = None
         self._files = begin_worker("settings")
         self._metrics = MetricsServer(self._metrics_text)
-        self._systems: SystemMetrics | None = None
+        self._vehicles = VehicleWatch()
         """None in a gateway that serves no metrics."""
         self._notifier = ServiceNotifier()
         self._sent: Counter[int] = Counter()
@@ -281,28 +279,31 @@ class Daemon:
             forged=self._pipeline.forged,
             simulated=self._receiver is not None,
             aircraft=tuple(status_of(one, self.now_us()) for _, one in aircraft),
+            vehicles=self._vehicle_rows(),
             recorder=self._recorder.status(),
             requests=self._pipeline.failed_requests,
             slow_s=self._lag.longest_us / US_PER_S if self._lag.is_slow else 0.0,
         )
+
+    def _vehicle_rows(self) -> tuple[VehicleRow, ...]:
+        link = ", ".join(source.url for source in self._pipeline.report.sources)
+        own = {key: one.vehicle.telemetry.mode[1] for key, one in self._pipeline.aircraft.items()}
+        return self._vehicles.rows(self.now_us(), own, self._hub.clients(), link or RECEIVER)
 
     def _serve_metrics(self) -> None:
         port = self._settings.hub.metrics_port
         if port:
             # Imported here, since most gateways serve no metrics; not at the first request, because
             # loading the library then would stop the telemetry for 0.3 s.
-            systems = import_module("gateway.live.system_metrics")
-            self._systems = self._systems or systems.SystemMetrics()
-        else:
-            self._systems = None
+            import_module("gateway.live.system_metrics")
         self._metrics.listen(port)
 
     def _metrics_text(self) -> Iterator[str]:
         from gateway.live.metrics import prometheus_text, text_of
+        from gateway.live.system_metrics import system_families
 
         yield from prometheus_text(self.snapshot())
-        if self._systems is not None:
-            yield from text_of(self._systems.families(self.now_us()))
+        yield from text_of(system_families(self._vehicles, self.now_us()))
 
     def announce(self, text: str) -> None:
         """Announce an event that is not a problem to the ground stations."""
@@ -383,10 +384,10 @@ class Daemon:
         self._perform(out)
 
     def _record_foreign(self, frames: Sequence[bytes]) -> None:
+        now_us = self.now_us()
         for frame in frames:
             self._record(frame)
-            if self._systems is not None:
-                self._systems.feed(frame_of(frame), self.now_us(), is_received=True)
+            self._vehicles.feed_received(frame, now_us)
 
     def _record(self, frame: bytes) -> None:
         """Record a frame of another sender, unless it contains a key or a password."""
@@ -403,9 +404,8 @@ class Daemon:
         for sent in frames:
             message_id, to = sent.message_id, sent.client_id
             self._sent[message_id] += 1
-            if self._systems is not None:
-                header = sent.header or frame_of(sent.frame)
-                self._systems.feed(header, self.now_us(), is_received=False)
+            if to is None:
+                self._vehicles.feed(sent.header or frame_of(sent.frame), self.now_us())
             if message_id not in UNRECORDED and (
                 to is None
                 or to == RECORDED_ONLY

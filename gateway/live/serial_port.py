@@ -23,7 +23,7 @@ import serial
 from msgspec.structs import replace
 from serial.tools import list_ports
 
-from gateway.printable import UserError, reason_of
+from gateway.printable import NO_RECEIVER, UserError, reason_of
 from gateway.settings import Settings, setting
 from gateway.units import BITS_PER_BYTE, US_PER_S
 from gateway.wire.framing import Fault, FrameDecoder
@@ -58,8 +58,6 @@ KNOWN_ADAPTERS: Final = {
 """USB serial chips of Arduino-class boards and programming cables."""
 AUTO: Final = "auto"
 """Setting `port` that selects a known USB adapter, or several that are tried."""
-NO_RECEIVER: Final = "none"
-"""Setting `port` of a gateway that only routes."""
 
 
 class SerialSettings(Settings, frozen=True):

@@ -1,45 +1,19 @@
-"""Metrics of every vehicle of the hub, foreign ones included, from their newest MAVLink.
-
-The lost frames of a system are counted by its sequence numbers; with several links to one system,
-only frames that all of them lost count.
-"""
+"""Metrics of every vehicle of the hub, foreign ones included, from their newest MAVLink."""
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import Final
 
 from prometheus_client.core import Metric
 
 from gateway.live.metrics import Labels, counter, gauge
+from gateway.live.vehicle_watch import VehicleWatch
 from gateway.records import NAN
 from gateway.units import US_PER_S
-from gateway.vehicle_state.newest import STATE_IDS, NewestState, NewestVehicles
-from gateway.wire.mavlink_splitter import MavFrame
+from gateway.vehicle_state.newest import NewestState
 
-MAX_SYSTEMS: Final = 32
-"""Maximum values of the label, each a time series; more are forged."""
 SYSTEM: Final = ("system",)
-HALF: Final = 128
-"""A sequence number that is further ahead is an older one, of a late or repeated frame."""
 Value = Callable[[NewestState, int], float]
-
-
-@dataclass(slots=True)
-class _Stream:
-    """Frame counters of the vehicle of a system."""
-
-    sequence: int
-    frames: int = 0
-    lost: int = 0
-
-    def count(self, sequence: int) -> None:
-        ahead = (sequence - self.sequence) & 0xFF
-        if self.frames and not 0 < ahead < HALF:
-            return
-        self.lost += ahead - 1 if self.frames else 0
-        self.frames += 1
-        self.sequence = sequence
 
 
 def _position(name: str) -> Value:
@@ -64,44 +38,22 @@ GAUGES: Final[dict[str, tuple[str, Value]]] = {
 }
 
 
-class SystemMetrics:
-    """The values of all systems, fed with the frames of the hub."""
-
-    def __init__(self) -> None:
-        self._vehicles = NewestVehicles()
-        self._streams: dict[int, _Stream] = {}
-
-    def feed(self, frame: MavFrame, now_us: int, *, is_received: bool) -> None:
-        """Process a frame of a vehicle, received or of our own."""
-        system_id = frame.origin[0]
-        known = self._vehicles.states
-        if system_id not in known and len(self._present(now_us)) >= MAX_SYSTEMS:
-            return
-        if frame.message_id in STATE_IDS:
-            self._vehicles.feed(frame, now_us)
-        if is_received and self._vehicles.components.is_known(*frame.origin):
-            stream = self._streams.setdefault(system_id, _Stream(frame.sequence))
-            stream.count(frame.sequence)
-
-    def families(self, now_us: int) -> Iterator[Metric]:
-        """Yield the metrics of the systems that were received recently."""
-        present = self._present(now_us)
-        for name, (text, value_of) in GAUGES.items():
-            samples = [
-                (_label(system_id), _known(value_of(state, now_us)))
-                for system_id, state in present.items()
-            ]
-            yield gauge(f"system_{name}", text, SYSTEM, samples)
-        streams = [(_label(key), self._streams[key]) for key in present if key in self._streams]
-        text = "Frames of the vehicle that were received; copies by a second link are not counted."
-        frames = [(label, float(stream.frames)) for label, stream in streams]
-        yield counter("system_frames", text, SYSTEM, frames)
-        text = "Frames of the vehicle that were lost on the way here, by their sequence numbers."
-        lost = [(label, float(stream.lost)) for label, stream in streams]
-        yield counter("system_frames_lost", text, SYSTEM, lost)
-
-    def _present(self, now_us: int) -> dict[int, NewestState]:
-        return dict(list(self._vehicles.heard(now_us).items())[:MAX_SYSTEMS])
+def system_families(watch: VehicleWatch, now_us: int) -> Iterator[Metric]:
+    """Yield the metrics of the systems that were received recently."""
+    present = watch.present(now_us)
+    for name, (text, value_of) in GAUGES.items():
+        samples = [
+            (_label(system_id), _known(value_of(state, now_us)))
+            for system_id, state in present.items()
+        ]
+        yield gauge(f"system_{name}", text, SYSTEM, samples)
+    streams = [(_label(key), watch.streams[key]) for key in present if key in watch.streams]
+    text = "Frames of the vehicle that were received; copies by a second link are not counted."
+    frames = [(label, float(stream.frames)) for label, stream in streams]
+    yield counter("system_frames", text, SYSTEM, frames)
+    text = "Frames of the vehicle that were lost on the way here, by their sequence numbers."
+    lost = [(label, float(stream.lost)) for label, stream in streams]
+    yield counter("system_frames_lost", text, SYSTEM, lost)
 
 
 def _label(system_id: int) -> Labels:

@@ -24,6 +24,7 @@ from gateway.vehicle_state.positions import (
     position_of,
 )
 from gateway.vehicle_state.senders import AUTOPILOT, FIRST_GROUND_STATION
+from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAMES, ids_of
 from gateway.wire.mavlink_splitter import MavFrame
@@ -44,6 +45,8 @@ QUALITY_OLD_US: Final = 15 * US_PER_S
 ATTITUDE_FRESH_US: Final = US_PER_S
 """Maximum age of a quaternion that is preferred to the angles."""
 UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
+MAX_MODES: Final = 256
+"""Maximum number of modes of one vehicle; their number in AVAILABLE_MODES is one byte."""
 UNKNOWN_SATELLITES: Final = 255
 UNKNOWN_U32: Final = 0xFFFFFFFF
 LEAST_SPEED_MPS: Final = 0.2
@@ -54,7 +57,7 @@ _ABSOLUTE, _CONSTANT = mavlink.ESTIMATOR_POS_HORIZ_ABS, mavlink.ESTIMATOR_CONST_
 STATE_IDS: Final = frozenset(RANKS) | ids_of(
     *("HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "VFR_HUD", "BATTERY_STATUS", "SYS_STATUS"),
     *("HOME_POSITION", "GPS_GLOBAL_ORIGIN", "ESTIMATOR_STATUS", "EKF_STATUS_REPORT"),
-    "RADIO_STATUS",
+    *("RADIO_STATUS", "AVAILABLE_MODES"),
 )
 """Messages from which the state is derived."""
 
@@ -105,6 +108,8 @@ class NewestState:
     def __init__(self) -> None:
         self.fields: dict[str, Fields] = {}
         """Fields of the newest message of each name."""
+        self.modes: dict[int, str] = {}
+        """Names of the custom modes from AVAILABLE_MODES, by number."""
         self.heard_us: dict[str, int] = {}
         """When each of these messages arrived."""
         self.position: Position | None = None
@@ -119,6 +124,9 @@ class NewestState:
         self.heard_us[name] = now_us
         if name == "GPS_GLOBAL_ORIGIN":
             self._origin = named_position(fields)
+        elif name == "AVAILABLE_MODES" and len(self.modes) < MAX_MODES:
+            text = fields["mode_name"]
+            self.modes[fields["custom_mode"]] = text if isinstance(text, str) else text_of(text)
         message_id = MESSAGE_IDS.get(name, -1)
         if message_id not in RANKS:
             return False
@@ -246,7 +254,7 @@ class NewestState:
         # HIGH_LATENCY2 contains the upper half of PX4's custom mode.
         is_half = "base_mode" not in beat and beat["autopilot"] == mavlink.MAV_AUTOPILOT_PX4
         number = beat["custom_mode"] << 16 if is_half else beat["custom_mode"]
-        return mode_name(beat["autopilot"], beat["type"], number)
+        return mode_name(beat["autopilot"], beat["type"], number) or self.modes.get(number, "")
 
 
 def _accuracy_m(accuracy_mm: int) -> float:

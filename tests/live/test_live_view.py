@@ -22,7 +22,14 @@ from gateway.records import (
     PipeCounters,
     ReceiverStatus,
 )
-from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot, summary_line
+from gateway.status import (
+    AircraftStatus,
+    RecorderStatus,
+    RelativeLocation,
+    Snapshot,
+    VehicleRow,
+    summary_line,
+)
 from tests.client_stats import TABLET
 from tests.kit.records import FIX, NOTHING
 
@@ -162,6 +169,26 @@ def test_summary_line_contains_receiver_nodes_aircraft_and_clients() -> None:
         "receiver: /dev/ttyUSB0 connected; aircraft 1.0 board 100 Hz 10 lost; "
         "aircraft 1 at -7.765612 110.372834 171.5 m, roll -12 pitch +3 yaw 270; 1 client"
     )
+
+
+ROW = VehicleRow(
+    *(3, "quadrotor", "GUIDED", True, 47.4, 8.5, 488.0, 3, 12.3, 80.0, "field radio", 0.4, 0.02),
+)
+
+
+def test_router_shows_its_vehicles_and_no_receiver() -> None:
+    """Without a receiver, which is not lost if it is not configured."""
+    report = LinkReport(0, False, "none", 0, 0, 0, (), (), None)
+    silent = replace(ROW, system_id=4, lat_deg=None, fix_type=0, age_s=9.0, armed=False)
+    router = Snapshot(0, report, (), (), (), HubCounters(), vehicles=(ROW, silent))
+    assert summary_line(router) == (
+        "vehicle 3 (quadrotor) GUIDED armed at 47.400000, 8.500000 on field radio 2.0% lost; "
+        "vehicle 4 (quadrotor) GUIDED disarmed no fix on field radio silent for 9.0 s 2.0% lost; "
+        "0 clients"
+    )
+    text = text_of(router)
+    assert ("receiver" in text, "serial" in text, "No aircraft" in text) == (False,) * 3
+    assert "12.3 V 80 %" in text
 
 
 BOARD = NodeStatus(0, NodeId(1, 0), 0, (1, 4), 1, 7, 0, 12, 3, 450, 900, 100, 3290)

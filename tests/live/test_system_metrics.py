@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,10 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.live.metrics import prometheus_text, text_of
-from gateway.live.system_metrics import MAX_SYSTEMS, SystemMetrics
+from gateway.live.system_metrics import system_families
+from gateway.live.vehicle_watch import DECODED_US, MAX_SYSTEMS, VehicleWatch
 from gateway.units import US_PER_S
 from gateway.vehicle_state.newest import HEARD_US
-from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.mavlink import packed
 from tests.kit.messages import at, beat, gps
 from tests.live.test_metrics import SNAPSHOT
@@ -21,13 +22,13 @@ ROOT = Path(__file__).resolve().parents[2]
 BATTERY = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 12_400, -1, 80, 0, 0, 0, 0, 0, 0)
 
 
-def feed(systems: SystemMetrics, *messages: Any, now_us: int = 0, **sender: Any) -> None:
+def feed(systems: VehicleWatch, *messages: Any, now_us: int = 0, **sender: Any) -> None:
     for message in messages:
-        systems.feed(frame_of(packed(message, **sender)), now_us, is_received=True)
+        systems.feed_received(packed(message, **sender), now_us)
 
 
-def lines(systems: SystemMetrics, now_us: int = 0) -> list[str]:
-    text = "".join(text_of(systems.families(now_us)))
+def lines(systems: VehicleWatch, now_us: int = 0) -> list[str]:
+    text = "".join(text_of(system_families(systems, now_us)))
     return [line for line in text.splitlines() if not line.startswith("#")]
 
 
@@ -45,14 +46,14 @@ def lines(systems: SystemMetrics, now_us: int = 0) -> list[str]:
     ],
 )
 def test_values_of_a_foreign_vehicle_have_samples(line: str) -> None:
-    systems = SystemMetrics()
+    systems = VehicleWatch()
     feed(systems, beat(), at(), gps(), BATTERY, system=9)
     feed(systems, at(alt_m=1.0), system=9, component=154)
     assert line in lines(systems, 2 * US_PER_S)
 
 
 def test_old_position_and_gone_system_have_no_samples() -> None:
-    systems = SystemMetrics()
+    systems = VehicleWatch()
     feed(systems, beat(), at())
     assert not any("altitude" in line for line in lines(systems, 6 * US_PER_S))
     assert lines(systems, HEARD_US)
@@ -71,7 +72,7 @@ def test_old_position_and_gone_system_have_no_samples() -> None:
 def test_lost_frames_are_counted_by_sequence_numbers(
     sequences: list[int], frames: int, lost: int
 ) -> None:
-    systems = SystemMetrics()
+    systems = VehicleWatch()
     for sequence in sequences:
         feed(systems, beat(), sequence=sequence)
     feed(systems, gps(), component=154, sequence=77)
@@ -80,8 +81,34 @@ def test_lost_frames_are_counted_by_sequence_numbers(
     assert f'mavgate_system_frames_lost_total{{system="1"}} {float(lost)}' in found
 
 
+def test_row_of_a_vehicle_has_mode_position_link_and_loss() -> None:
+    systems = VehicleWatch()
+    names = mavlink.MAVLink_available_modes_message(1, 1, 0, 7, 0, b"Survey")
+    # A foreign autopilot whose modes no table has.
+    mode = mavlink.MAVLink_heartbeat_message(2, 0, 129, 7, 4, 3)
+    feed(systems, mode, at(), gps(), BATTERY, names, system=9)
+    for sequence in (1, 2, 4):
+        feed(systems, mode, system=9, sequence=sequence)
+    client = replace(SNAPSHOT.clients[0], name="field radio", systems=((9, 1), (9, 154)))
+    (row,) = systems.rows(2 * US_PER_S, {}, [client])
+    assert (row.kind, row.mode, row.armed, row.link) == ("quadrotor", "Survey", True, "field radio")
+    assert (row.alt_amsl_m, row.battery_v, row.age_s) == (488.13, 12.4, 2.0)
+    assert row.loss == pytest.approx(1 / 5)
+    (own,) = systems.rows(2 * US_PER_S, {9: "Tracking"}, [client])
+    assert (own.mode, own.link) == ("Tracking", "receiver")
+
+
+def test_messages_of_one_kind_are_decoded_at_intervals() -> None:
+    systems = VehicleWatch()
+    for alt_m, now_us in ((1.0, 0), (2.0, DECODED_US - 1), (3.0, DECODED_US)):
+        feed(systems, beat(), at(alt_m=alt_m), now_us=now_us)
+        shown = systems.present(now_us)[1].position
+        assert shown is not None
+        assert shown.alt_amsl_m == {1.0: 1.0, 2.0: 1.0, 3.0: 3.0}[alt_m]
+
+
 def test_number_of_systems_is_bounded_and_room_is_made_by_those_that_have_gone() -> None:
-    systems = SystemMetrics()
+    systems = VehicleWatch()
     for system in range(1, MAX_SYSTEMS + 10):
         feed(systems, beat(), system=system)
     assert len([line for line in lines(systems) if "armed" in line]) == MAX_SYSTEMS
@@ -90,7 +117,7 @@ def test_number_of_systems_is_bounded_and_room_is_made_by_those_that_have_gone()
 
 
 def test_dashboard_uses_metrics_that_exist() -> None:
-    systems = SystemMetrics()
+    systems = VehicleWatch()
     feed(systems, beat(), at(), gps(), BATTERY)
     known = set(re.findall(r"^(mavgate_\w+)", "\n".join(lines(systems)), re.M))
     known |= set(re.findall(r"^(mavgate_\w+)", "".join(prometheus_text(SNAPSHOT)), re.M))

@@ -23,6 +23,7 @@ from gateway.cli.support.terminal import (
 from gateway.live.other_gateways import Gateway, other_gateways
 from gateway.printable import UNKNOWN, figure, printable, receiver_state
 from gateway.records import NodeId, RadioState, board_name
+from gateway.status import VEHICLE_HEADS, VehicleRow, vehicle_cells
 from gateway.units import MV_PER_V, US_PER_S, counted
 
 US_PER_MS: Final = 1000
@@ -51,7 +52,7 @@ def status(
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Show the status of the gateway: receiver, nodes, aircraft, clients.
+    """Show the status of the gateway: receiver, nodes, vehicles, clients.
 
     If several gateways, players or fleets run here, all are listed; `--socket` chooses one.
     """
@@ -74,6 +75,9 @@ def status(
     if nodes := snapshot["report"]["nodes"]:
         console.print()
         console.print(_nodes(nodes, snapshot))
+    if snapshot["vehicles"]:
+        console.print()
+        console.print(_vehicles(snapshot["vehicles"]))
     _print_clients(console, snapshot)
 
 
@@ -169,10 +173,14 @@ def _summary(snapshot: Record) -> str:
     up = duration_text(snapshot["time_us"] // US_PER_S)
     received = report["bytes_received"], report["frames"]
     receiver = receiver_state(report["port"], report["connected"], *received)
-    received, lost = (sum(node[key] for node in report["nodes"]) for key in ("received", "lost"))
-    serial = f"serial: {counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
-    radio = f"radio: {counted(received, 'payload')}, {lost} lost"
-    lines = [f"up {up}, {receiver}", f"{serial}; {radio}", *_source_lines(snapshot)]
+    lines = [", ".join(filter(None, [f"up {up}", receiver]))]
+    if receiver:
+        payloads, lost = (
+            sum(node[key] for node in report["nodes"]) for key in ("received", "lost")
+        )
+        serial = f"serial: {counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
+        lines.append(f"{serial}; radio: {counted(payloads, 'payload')}, {lost} lost")
+    lines += _source_lines(snapshot)
     if report["receiver"] is not None:
         problem = RadioState(report["receiver"]["radio"]).problem
         lines += [f"receiver: {problem}"] if problem else []
@@ -247,6 +255,14 @@ def _requests(found: Sequence[Record], now_us: int) -> Table:
             str(entry["count"]),
             f"{(now_us - entry['time_us']) / US_PER_S:.1f}",
         )
+    return table
+
+
+def _vehicles(rows: Sequence[Record]) -> Table:
+    """Show all vehicles, own and foreign."""
+    table = table_of(*VEHICLE_HEADS, left=8)
+    for row in rows:
+        table.add_row(*vehicle_cells(VehicleRow(**row)))
     return table
 
 

@@ -36,15 +36,9 @@ from gateway.hub.endpoint import LISTENING, Endpoint, EndpointKind, parse_endpoi
 from gateway.hub.transports.tls import valid_until_s
 from gateway.live.control_socket import live_sockets
 from gateway.live.part_files import free_bytes_near
-from gateway.live.serial_port import (
-    AUTO,
-    NO_RECEIVER,
-    PortNotFoundError,
-    fitting_ports,
-    list_serial_ports,
-)
+from gateway.live.serial_port import AUTO, PortNotFoundError, fitting_ports, list_serial_ports
 from gateway.output import PRIVATE, write_new
-from gateway.printable import reason_of
+from gateway.printable import NO_RECEIVER, reason_of
 
 app = typer.Typer()
 

@@ -20,9 +20,9 @@ from gateway.config import ConfigError, GatewaySettings, load_aircraft
 from gateway.extras import require
 from gateway.live.daemon import Daemon
 from gateway.live.other_gateways import conflicts
-from gateway.live.serial_port import NO_RECEIVER
 from gateway.live.service import run_event_loop
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals
+from gateway.printable import NO_RECEIVER
 from gateway.sources.settings import SourceSettings
 from gateway.status import summary_line
 

@@ -1,0 +1,132 @@
+"""The newest state of every vehicle of the hub, foreign ones included, and their lost frames.
+
+Status, live view and metrics are made of it. A message of one kind is decoded a few times a second
+at most, since a router passes on thousands. The lost frames of a system are counted by its sequence
+numbers; with several links to one system, only frames that all of them lost count.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.hub.stats import ClientStats
+from gateway.status import VehicleRow
+from gateway.units import US_PER_S
+from gateway.vehicle_state.newest import STATE_IDS, NewestState, NewestVehicles
+from gateway.vehicle_state.senders import MODES_ID
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
+
+MAX_SYSTEMS: Final = 32
+"""Maximum vehicles; more are forged."""
+DECODED_US: Final = US_PER_S // 5
+"""Minimum interval at which messages of one kind are decoded."""
+HALF: Final = 128
+"""A sequence number that is further ahead is an older one, of a late or repeated frame."""
+RECEIVER: Final = "receiver"
+"""Link of a vehicle of the receiver's boards."""
+
+
+@dataclass(slots=True)
+class FrameCounter:
+    """Frame counters of the vehicle of a system."""
+
+    sequence: int
+    frames: int = 0
+    lost: int = 0
+
+    def count(self, sequence: int) -> None:
+        """Count a frame with this sequence number."""
+        ahead = (sequence - self.sequence) & 0xFF
+        if self.frames and not 0 < ahead < HALF:
+            return
+        self.lost += ahead - 1 if self.frames else 0
+        self.frames += 1
+        self.sequence = sequence
+
+
+class VehicleWatch:
+    """The states of all vehicles, fed with the frames of the hub."""
+
+    def __init__(self) -> None:
+        self.streams: dict[int, FrameCounter] = {}
+        """Counters of received frames by system id."""
+        self._vehicles = NewestVehicles()
+        self._decoded_us: dict[tuple[int, int], int] = {}
+        """When each message of each system was last decoded."""
+
+    def feed_received(self, data: bytes, now_us: int) -> None:
+        """Process a frame that was received from another sender."""
+        frame = frame_of(data)
+        self.feed(frame, now_us)
+        if self._vehicles.components.is_known(*frame.origin):
+            stream = self.streams.setdefault(frame.origin[0], FrameCounter(frame.sequence))
+            stream.count(frame.sequence)
+
+    def feed(self, frame: MavFrame, now_us: int) -> None:
+        """Process a frame of a vehicle, received or of our own."""
+        if frame.message_id not in STATE_IDS:
+            return
+        system_id, key = frame.origin[0], (frame.origin[0], frame.message_id)
+        is_old = now_us - self._decoded_us.get(key, -DECODED_US) >= DECODED_US
+        if not is_old and frame.message_id != MODES_ID:
+            return
+        known = self._vehicles.states
+        if system_id not in known and len(self.present(now_us)) >= MAX_SYSTEMS:
+            return
+        if self._vehicles.feed(frame, now_us) is not None:
+            self._decoded_us[key] = now_us
+
+    def present(self, now_us: int) -> dict[int, NewestState]:
+        """Return the vehicles that were received recently."""
+        return dict(list(self._vehicles.heard(now_us).items())[:MAX_SYSTEMS])
+
+    def rows(
+        self,
+        now_us: int,
+        own: Mapping[int, str],
+        clients: Iterable[ClientStats],
+        link: str = RECEIVER,
+    ) -> tuple[VehicleRow, ...]:
+        """Return the status of each vehicle.
+
+        `own` are the modes of the gateway's own vehicles by system id, and `link` is their link.
+        """
+        links = {system_id: client.name for client in clients for system_id, _ in client.systems}
+        return tuple(
+            self._row(
+                (system_id, state),
+                now_us,
+                own.get(system_id) or state.mode(),
+                link if system_id in own else links.get(system_id, ""),
+            )
+            for system_id, state in self.present(now_us).items()
+        )
+
+    def _row(self, known: tuple[int, NewestState], now_us: int, mode: str, link: str) -> VehicleRow:
+        system_id, state = known
+        at, fix = state.valid_position(now_us), state.fix()
+        volts, percent = state.battery()
+        stream = self.streams.get(system_id)
+        kind = mavlink.enums["MAV_TYPE"].get(state.kind())
+        return VehicleRow(
+            system_id=system_id,
+            kind="" if kind is None else kind.name.removeprefix("MAV_TYPE_").lower(),
+            mode=mode,
+            armed=state.is_armed(),
+            lat_deg=None if at is None else at.lat_deg,
+            lon_deg=None if at is None else at.lon_deg,
+            alt_amsl_m=_known(at.alt_amsl_m) if at is not None else None,
+            fix_type=None if fix is None else fix.fix_type,
+            battery_v=_known(volts),
+            battery_percent=_known(percent),
+            link=link,
+            age_s=state.age_us(now_us, *state.heard_us) / US_PER_S,
+            loss=stream.lost / (stream.lost + stream.frames) if stream else None,
+        )
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None
