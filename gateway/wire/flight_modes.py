@@ -12,10 +12,11 @@ PX4_AUTO_MODES: Final = {
     9: "PRECLAND",
 }  # fmt: skip
 ARDUPILOT_MODES: Final = {
+    **dict.fromkeys((1, 16, *range(19, 26)), "PLANE_MODE"),
     **dict.fromkeys((2, 3, 4, 13, 14, 15, 29, 35), "COPTER_MODE"),
     **dict.fromkeys((10, 11), "ROVER_MODE"), 12: "SUB_MODE", 5: "TRACKER_MODE",
 }  # fmt: skip
-"""Enumeration of the modes by MAV_TYPE; of others it is that of aeroplanes."""
+"""Enumeration of the modes by MAV_TYPE; those of other types are not known."""
 
 
 def mode_name(autopilot: int, mav_type: int, number: int) -> str:
@@ -24,6 +25,6 @@ def mode_name(autopilot: int, mav_type: int, number: int) -> str:
         return PX4_AUTO_MODES.get(number >> 24, "") or PX4_MODES.get(number >> 16 & 0xFF, "")
     if autopilot != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
         return ""
-    words = ARDUPILOT_MODES.get(mav_type, "PLANE_MODE")
-    entry = mavlink.enums[words].get(number)
+    words = ARDUPILOT_MODES.get(mav_type, "")
+    entry = mavlink.enums[words].get(number) if words else None
     return "" if entry is None else str(entry.name).removeprefix(f"{words}_")

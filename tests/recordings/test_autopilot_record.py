@@ -18,6 +18,7 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.message_table import UNITS
 from gateway.recordings.opening import open_flights
 from gateway.recordings.reading import open_record
+from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 from gateway.wire.recorded_frames import RecordedFrame, fields_of
@@ -198,6 +199,40 @@ def test_parameters_and_mission_are_answered_as_of_the_played_moment(tmp_path: P
             ]
 
 
+TEXT_FORMATS = """\
+FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns
+FMT, 3, 6, MODE, Mh, Mode,ThrCrs
+FMT, 9, 23, ATT, IccccCCCC, TimeMS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw,ErrRP,ErrYaw
+FMT, 134, 67, MSG, Z, Message
+"""
+COPTER, PLANE = (2, [0, 5, 9]), (1, [0, 5, 9])
+TEXT_LOGS = {
+    "title line and numbers": ("ArduCopter V3.2.1 (36b405fb)\n", ["0", "5", "9"], COPTER),
+    "title line and names": ("ArduCopter V3.2.1\n", ["STABILIZE", "Loiter", "LAND"], COPTER),
+    "text and numbers": ("MSG, ArduPlane V3.5\n", ["0", "5", "9"], PLANE),
+    "names of one firmware": ("", ["STABILIZE", "AltHold", "Mode(99)", "LAND"], (2, [0, 2, 99, 9])),
+    "former names": ("ArduPlane V2.7\n", ["MANUAL", "FLY_BY_WIRE_A"], (1, [0, 5])),
+    "names of several firmwares": ("", ["AUTO", "RTL"], (0, [0])),
+    "numbers without a firmware": ("", ["0", "5", "9"], (0, [0, 5, 9])),
+}
+"""Lines before the data, modes, and the expected MAV_TYPE and custom modes."""
+
+
+@pytest.mark.parametrize("name", TEXT_LOGS)
+def test_text_log_has_type_and_modes_of_its_firmware(tmp_path: Path, name: str) -> None:
+    head, modes, (mav_type, expected) = TEXT_LOGS[name]
+    lines = [TEXT_FORMATS + head]
+    for number, mode in enumerate(modes):
+        at = f"ATT, {60_000 + 2000 * number}, 0.00, 0.50, 0.00, -0.73, 66.63, 66.08, 0.1, 0.2\n"
+        lines += [f"MODE, {mode}, 430\n", at]
+    records = translated(flown.write(tmp_path / "flight.log", "".join(lines).encode()))
+    beats = messages_of(records, "HEARTBEAT")
+    assert {beat["type"] for beat in beats} == {mav_type}
+    assert list(dict.fromkeys(beat["custom_mode"] for beat in beats)) == expected
+    names = {mode_name(3, mav_type, number) for number in expected}
+    assert (names == {""}) == (mav_type == 0)
+
+
 PLAN_FORMATS = FORMATS | {
     "PARM": (129, "QNff", "TimeUS,Name,Value,Default"),
     "FNCE": (147, "QBBBLLBf", "TimeUS,Tot,Seq,Type,Lat,Lng,Count,Radius"),
@@ -327,6 +362,24 @@ def px4_log(seconds: float = 4.0) -> bytes:
         log.add("vehicle_attitude", t, *q)
         log.add("vehicle_global_position", t, 47.3977418, 8.5455939, 500.25, 1.0)
     return b"".join(log.parts)
+
+
+def test_receiver_without_a_fix_is_replaced_by_the_one_with_fixes(tmp_path: Path) -> None:
+    fields = PX4_FORMATS["vehicle_gps_position"]
+    log = flown.Ulog({"vehicle_gps_position": fields, "sensor_gps": fields}, {})
+    for number in range(10):
+        fix = (473977418 + number, 85455939, 500250, 547000, 0.2, 0.1, 1.5, 2.5, 0.8, 1.1)
+        motion = (3.0, 3.0, 0.0, -0.5)
+        t, utc_us = 1000 + number * 100_000, 1_780_000_000_000_000
+        nothing = [0] * len(fix), [0] * len(motion)
+        log.add("vehicle_gps_position", t, 0, *nothing[0], *nothing[1], 0, 0, False, 0)
+        log.add("sensor_gps", t, utc_us + t, *fix, *motion, 0, 3, True, 14)
+    records = translated(flown.write(tmp_path / "flight.ulg", b"".join(log.parts)))
+    fixes = messages_of(records, "GPS_RAW_INT")
+    assert [(one["fix_type"], one["lat"]) for one in fixes] == [
+        (3, 473977418 + number) for number in range(10)
+    ]
+    assert len(messages_of(records, "GLOBAL_POSITION_INT")) == 10
 
 
 PX4_EXPECTED: dict[str, dict[str, float]] = {

@@ -415,7 +415,7 @@ def sensors_of(log: Any, damage: PrintedDamage) -> dict[str, int]:
         names = {name for name, of in KINDS.items() if of == kind}
         least = FIX_2D if kind == "GPS" else 0.0
         seen: set[int] = set()
-        for message in islice(_each(log, damage, names), MAX_LOOKED_AT):
+        for message in islice(each_of(log, damage, names), MAX_LOOKED_AT):
             values = (getattr(message, column, 0) for column in columns)
             if any(isinstance(v, int | float) and abs(v) >= least and v != 0 for v in values):
                 seen.add(sensor_of(message.get_type(), message))
@@ -425,7 +425,7 @@ def sensors_of(log: Any, damage: PrintedDamage) -> dict[str, int]:
     return found
 
 
-def _each(log: Any, damage: PrintedDamage, names: set[str]) -> Iterator[Any]:
+def each_of(log: Any, damage: PrintedDamage, names: set[str]) -> Iterator[Any]:
     """Yield the messages of these names up to the first damage, and rewind the log."""
     log.type_list = None
     try:

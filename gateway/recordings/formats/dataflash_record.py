@@ -3,7 +3,7 @@
 import contextlib
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.resources import files
 from itertools import chain
@@ -31,6 +31,7 @@ from gateway.recordings.formats.dataflash import (
     LogClock,
     Message,
     PrintedDamage,
+    each_of,
     items_of,
     open_log,
     own_us_of,
@@ -75,6 +76,11 @@ RALLY_FRAMES: Final = {
     1: GLOBAL_RELATIVE,
     3: mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
 }
+TITLE_BYTES: Final = 1 << 16
+"""Bytes at the begin of a text log that are searched for the title line."""
+_NOT_IN_WORDS: Final = re.compile(r"[^0-9A-Za-z]")
+_FORMER_NAMES: Final = {"FLYBYWIREA": "FBWA", "FLYBYWIREB": "FBWB", "HYBRID": "POSHOLD"}
+"""Other names of modes, and the names in the table of modes."""
 _FIRMWARE: Final = re.compile(r"(Copter|Plane|Rover|Sub|Blimp|Tracker)\s*V\d", re.IGNORECASE)
 _FRAME_TYPES: Final = {
     1: mavlink.MAV_TYPE_QUADROTOR, 2: mavlink.MAV_TYPE_HEXAROTOR, 3: mavlink.MAV_TYPE_OCTOROTOR,
@@ -116,11 +122,12 @@ def instance_of(name: str, message: Message) -> int:
 class RowReader:
     """Convert the messages of a log to rows and events."""
 
-    def __init__(self, unused: frozenset[str]) -> None:
+    def __init__(self, unused: frozenset[str], modes: Mapping[str, int]) -> None:
         self.clock: LogClock[tuple[str, Message]] = LogClock()
         self._columns: dict[str, set[str]] = {}
         self._own_us = 0
         self._unused = unused
+        self._modes = modes
         for source in table().sources:
             self._columns.setdefault(source.topic, set()).add(source.name)
         for where in table().lanes.values():
@@ -168,7 +175,7 @@ class RowReader:
             case "PARM":
                 return LoggedParameter(str(m.Name), float(m.Value))
             case "MODE":
-                mode = _mode_of(m)
+                mode = _mode_of(m, self._modes)
                 return None if mode is None else Mode(mode)
             case "ARM":
                 return Armed(bool(m.ArmState))
@@ -207,14 +214,45 @@ def _has_time(name: str, message: Message) -> bool:
     )
 
 
-def _mode_of(m: Message) -> int | None:
+def _mode_of(m: Message, modes: Mapping[str, int]) -> int | None:
+    """Return the number of a mode, which a text log may give by name; None if it is unknown."""
     for name in ("ModeNum", "Mode"):
         value = getattr(m, name, None)
         if isinstance(value, int):
             return value
-        if isinstance(value, str) and value.isdigit():
-            return int(value)
+        if isinstance(value, str):
+            plain = _NOT_IN_WORDS.sub("", value).upper()
+            digits = plain.removeprefix("MODE")
+            if digits.isdigit():
+                return int(digits)
+            if plain in modes:
+                return modes[plain]
     return None
+
+
+def _firmware_of(log: Any, damage: PrintedDamage) -> str:
+    """Return the firmware of a log, such as copter; empty if it is unknown.
+
+    It is named in a text, in the title line of a text log, or follows from the names of the modes.
+    """
+    texts = [str(message.Message) for message in each_of(log, damage, {"MSG"})]
+    if isinstance(log, DFReader_text):
+        texts.append(bytes(log.data_map[:TITLE_BYTES]).decode("ascii", "replace"))
+    named = next((found[1].lower() for text in texts if (found := _FIRMWARE.search(text))), "")
+    if named or not isinstance(log, DFReader_text):
+        return named
+    modes = (getattr(message, "Mode", 0) for message in each_of(log, damage, {"MODE"}))
+    words = {_NOT_IN_WORDS.sub("", mode).upper() for mode in modes if isinstance(mode, str)}
+    words = {word for word in words if not word.removeprefix("MODE").isdigit()}
+    fitting = [kind for kind in table().modes if words and words <= _modes_of(kind).keys()]
+    return fitting[0] if len(fitting) == 1 else ""
+
+
+def _modes_of(firmware: str) -> dict[str, int]:
+    """Return the numbers of a firmware's modes by name, in upper case without other characters."""
+    known = table().modes.get(firmware, {})
+    found = {_NOT_IN_WORDS.sub("", name): int(mode) for mode, name in known.items()}
+    return found | {old: found[new] for old, new in _FORMER_NAMES.items() if new in found}
 
 
 def _item_of(name: str, m: Message) -> LoggedItem:
@@ -256,15 +294,16 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
         vehicle_id=options.system_id or system_id_of(log.params),
         autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
         mav_type=mavlink.MAV_TYPE_GENERIC,
-        kind="",
+        kind=_firmware_of(log, damage),
         present=frozenset(present - unused | {"PARM", "SENSORS", "HOME"}),
         counts=counts,
         units=_units_of(log),
         primary=sensors_of(log, damage) | dict(options.sensors),
         defaults=dict(getattr(log, "param_defaults", {})),
     )
-    _set_begin(path, found, _begin_of(log, damage))
-    reader = RowReader(frozenset(unused))
+    modes = _modes_of(found.kind)
+    _set_begin(path, found, _begin_of(log, damage, modes))
+    reader = RowReader(frozenset(unused), modes)
 
     # Not `found` itself: the reference cycle would keep the log open.
     remarks = found.remarks
@@ -276,10 +315,8 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
 
     stream = entries()
     head: list[Entry] = []
-    for entry in stream:
+    while not (head and isinstance(head[-1], LogRow)) and (entry := next(stream, None)):
         head.append(entry)
-        if isinstance(entry, LogRow):
-            break
     if not head or not present & {"ATT", "IMU", "POS", "GPS"}:
         raise FlightError(f"{path}: has no ATT, POS, GPS or IMU, so there is nothing to play")
     found.unix_us_at_zero = unix_us_at(log, reader.clock.zero_us or 0)
@@ -313,17 +350,12 @@ def _other_filter(log: Any, present: set[str]) -> set[str]:
     return third if log.params.get("AHRS_EKF_TYPE") == _SECOND else second
 
 
-def _begin_of(log: Any, damage: PrintedDamage) -> list[tuple[int, Event]]:
+def _begin_of(log: Any, damage: PrintedDamage, modes: Mapping[str, int]) -> list[tuple[int, Event]]:
     """Read the events of a log up to the first damage, and rewind the log."""
-    reader, entries = RowReader(frozenset(table().topics)), []
-    log.type_list = None
-    try:
-        while message := damage.counting(lambda: log.recv_match(type=set(EVENTS), strict=True)):
-            entries += reader.feed(message.get_type(), message)
-    except Exception:  # noqa: BLE001 - as for `open_log`
-        entries += reader.flush()
-    finally:
-        log._rewind(keep_messages=True)  # noqa: SLF001 - the public one clears the parameters
+    reader, entries = RowReader(frozenset(table().topics), modes), []
+    for message in each_of(log, damage, set(EVENTS)):
+        entries += reader.feed(message.get_type(), message)
+    entries += reader.flush()
     return [entry for entry in entries if not isinstance(entry, LogRow)]
 
 
@@ -354,12 +386,11 @@ def _set_begin(path: Path, found: AutopilotLog, entries: list[tuple[int, Event]]
         found.remarks.append(
             f"{path}: does not state whether it was armed; assumed armed throughout"
         )
-    _find_type(found, [event.text for _, event in entries if isinstance(event, Text)])
+    _set_type(found)
 
 
-def _find_type(found: AutopilotLog, texts: list[str]) -> None:
-    firmware = next((known[1].lower() for text in texts if (known := _FIRMWARE.search(text))), "")
-    found.kind, frame = firmware, int(found.parameters.get("FRAME_CLASS", 0))
+def _set_type(found: AutopilotLog) -> None:
+    firmware, frame = found.kind, int(found.parameters.get("FRAME_CLASS", 0))
     kind = table().vehicle_types.get(firmware, mavlink.MAV_TYPE_GENERIC)
     if firmware == "copter":
         kind = _FRAME_TYPES.get(frame, kind)

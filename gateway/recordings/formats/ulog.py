@@ -14,7 +14,7 @@ import io
 import math
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -131,6 +131,25 @@ def in_order(topic: Topic) -> tuple[Topic, int]:
     return {name: column[order] for name, column in topic.items()}, int(np.count_nonzero(~sound))
 
 
+def instances_of(
+    kind: str, topics: Mapping[Instance, Topic], wanted: int | None = None
+) -> list[Instance]:
+    """Return the instances of topics with a kind of data, the preferred one first."""
+    return [
+        (name, k)
+        for name in SOURCES[kind]
+        for k in sorted(k for other, k in topics if other == name and wanted in (None, k))
+    ]
+
+
+def first_with_data(
+    kind: str, topics: Mapping[Instance, Topic], found: Sequence[Instance]
+) -> Instance | None:
+    """Return the first instance with data; for IMU and GPS the first one if none has data."""
+    default = found[0] if found and kind in ("IMU", "GPS") else None
+    return next((one for one in found if _has_data(kind, topics[one])), default)
+
+
 def unix_us_at_boot(gps: Topic) -> int | None:
     """Return the civil time at zero of the autopilot's clock, from its fixes; None without any."""
     if "time_utc_usec" not in gps:
@@ -176,14 +195,8 @@ class Px4Log:
     def _choose(
         self, kind: str, topics: Mapping[Instance, Topic], wanted: int | None
     ) -> Instance | None:
-        """Choose the first source with data; for IMU and GPS the first one if none has data."""
-        found = [
-            (name, k)
-            for name in SOURCES[kind]
-            for k in sorted(k for other, k in topics if other == name and wanted in (None, k))
-        ]
-        default = found[0] if found and kind in ("IMU", "GPS") else None
-        chosen = next((one for one in found if _has_data(kind, topics[one])), default)
+        found = instances_of(kind, topics, wanted)
+        chosen = first_with_data(kind, topics, found)
         if chosen is None:
             self.chosen += [] if wanted is None else [f"has no {kind} {wanted + 1}"]
         elif chosen != (found[0][0], 0):

@@ -22,10 +22,13 @@ from gateway.recordings.autopilot_record import (
 )
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats.ulog import (
+    SOURCES,
     Instance,
     Topic,
     damage_of,
+    first_with_data,
     in_order,
+    instances_of,
     load,
     system_id_of,
     unix_us_at_boot,
@@ -39,12 +42,11 @@ ARMED: Final = 2
 FIRMWARE: Final = 0
 """Kind of default parameters: those of the firmware, independent of the vehicle."""
 STATUS: Final = "vehicle_status"
-GPS_TOPICS: Final = ("vehicle_gps_position", "sensor_gps")
 SHOWN: Final = (
     "vehicle_attitude",
     "vehicle_global_position",
     "vehicle_local_position",
-    *GPS_TOPICS,
+    *SOURCES["GPS"],
 )
 """Topics of which at least one is required to show anything."""
 _KINDS: Final = {
@@ -78,12 +80,12 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
             columns = _used_columns(data.data)
             topics[data.name, data.multi_id], count = in_order(columns)
             dropped += count
+    topics, primary = _with_fixes(topics, dict(options.sensors).get("GPS"))
     present = {name for (name, _), topic in topics.items() if len(topic["timestamp"])}
     if not present & {*SHOWN}:
         raise FlightError(f"{path}: has none of {', '.join(SHOWN)}, so there is nothing to play")
     zero_us = min(int(t["timestamp"][0]) for t in topics.values() if len(t["timestamp"]))
-    boot_us = _boot_us(topics)
-    mav_type = _type_of(log, topics)
+    boot_us, mav_type = _boot_us(topics), _type_of(log, topics)
     events = _events_of(log, topics)
     first = {type(event): event for _, event in reversed(events)}
     odd = [f"left out {counted(dropped, 'row')} with an impossible time"] if dropped else []
@@ -98,7 +100,7 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
         present=frozenset(present | {"SENSORS"}),
         counts=counts,
         unix_us_at_zero=None if boot_us is None else boot_us + zero_us,
-        primary={name: number for kind, number in options.sensors for name in _named(kind)},
+        primary=primary,
         parameters=_parameters(log.initial_parameters),
         defaults=_parameters(log.get_default_parameters(FIRMWARE)),
         modes={
@@ -110,8 +112,15 @@ def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
     )
 
 
-def _named(kind: str) -> tuple[str, ...]:
-    return GPS_TOPICS if kind == "GPS" else ()
+def _with_fixes(
+    topics: dict[Instance, Topic], wanted: int | None
+) -> tuple[dict[Instance, Topic], dict[str, int]]:
+    """Leave out the topic of GPS receivers that has no fixes; return the instance to use, too."""
+    gps = first_with_data("GPS", topics, instances_of("GPS", topics, wanted))
+    if gps is None:
+        return topics, {} if wanted is None else dict.fromkeys(SOURCES["GPS"], wanted)
+    others = {*SOURCES["GPS"]} - {gps[0]}
+    return {one: topic for one, topic in topics.items() if one[0] not in others}, dict([gps])
 
 
 def _used_columns(topic: Mapping[str, Any]) -> Topic:
@@ -134,7 +143,9 @@ def _used() -> frozenset[str]:
 
 
 def _boot_us(topics: Mapping[Instance, Topic]) -> int | None:
-    found = (unix_us_at_boot(topic) for (name, _), topic in topics.items() if name in GPS_TOPICS)
+    found = (
+        unix_us_at_boot(topic) for (name, _), topic in topics.items() if name in SOURCES["GPS"]
+    )
     return next((us for us in found if us is not None), None)
 
 
