@@ -18,25 +18,31 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from operator import itemgetter
 from typing import Any, Final
 
 import msgspec
 import numpy as np
-from mcap.writer import Writer
+from numpy.typing import NDArray
 
 from gateway import __version__
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import multiply, to_euler
 from gateway.recordings.columns import unit_of
+from gateway.recordings.formats.mcap_writer import McapWriter
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
-from gateway.recordings.workshop.convert import FlightToWrite, Pieces
-from gateway.records import Quat
+from gateway.recordings.workshop.convert import FlightToWrite
+from gateway.records import NAN, Quat
 from gateway.units import M_PER_MM, US_PER_S, counted
 from gateway.vehicle_state.positions import Position, position_of
 from gateway.vehicle_state.status_texts import JoinedText, text_of
+from gateway.wire.frame_scan import TIME_SIZE
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
-from gateway.wire.mavlink_splitter import frame_of
-from gateway.wire.recorded_frames import fields_of
+from gateway.wire.mavlink_splitter import SEQUENCE_V1, SEQUENCE_V2, START_V2
+from gateway.wire.recorded_frames import Batch, columns_of
+
+Row = tuple[int, int, bytes, int]
+"""Time in µs, channel, JSON, and sequence number of a message of the file."""
 
 MAP: Final = "map"
 LOG_TOPIC: Final = "/log"
@@ -61,6 +67,7 @@ _AXIS: Final = {"type": "number"}
 _NUMBERS: Final = {"float": "number", "double": "number", "char": "string"}
 GPS_ID: Final = MESSAGE_IDS["GPS_RAW_INT"]
 ESTIMATOR_ID: Final = MESSAGE_IDS["ESTIMATOR_STATUS"]
+_UNKNOWN: Final = Position(NAN, NAN)
 LAST_US: Final = (2**64 - 1) // 1000
 """Latest time that the format can hold, µs; later times are replaced by it."""
 
@@ -145,15 +152,6 @@ def schema_of_message(kind: Any) -> dict[str, Any]:
     return {"title": f"mavlink.{kind.msgname}", "type": "object", "properties": fields}
 
 
-def plain(value: Any) -> Any:
-    """Convert a field to JSON: text, numbers and lists; NaN and infinity become null."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, np.ndarray):
-        return [plain(item) for item in value.tolist()]
-    return text_of(value) if isinstance(value, bytes) else value
-
-
 @dataclass(frozen=True, slots=True)
 class Shown:
     """A message of a topic."""
@@ -208,14 +206,15 @@ class FoxgloveView:
         vehicle.q_nb, vehicle.has_attitude = q_nb, True
         w, x, y, z = multiply(multiply(_ENU_OF_NED, q_nb), _FRD_OF_FLU)
         turned = {"x": x, "y": y, "z": z, "w": w}
-        at = {"timestamp": _time(time_us)}
-        on_map_m = self._on_map_m(vehicle)
-        frames = {"parent_frame_id": MAP, "child_frame_id": vehicle.frame}
-        transform = at | frames | {"translation": on_map_m, "rotation": turned}
+        on_map_m, timestamp = self._on_map_m(vehicle), _time(time_us)
+        transform = {
+            "timestamp": timestamp, "parent_frame_id": MAP, "child_frame_id": vehicle.frame,
+            "translation": on_map_m, "rotation": turned,
+        }  # fmt: skip
         yield Shown(TF_TOPIC, "foxglove.FrameTransform", transform)
         if vehicle.position is not None:
             pose = {"position": on_map_m, "orientation": turned}
-            content = at | {"frame_id": MAP, "pose": pose}
+            content = {"timestamp": timestamp, "frame_id": MAP, "pose": pose}
             yield Shown(f"/{vehicle.frame}/pose", "foxglove.PoseInFrame", content)
         yield self._state(vehicle)
 
@@ -229,18 +228,16 @@ class FoxgloveView:
         return {"x": east, "y": north, "z": _or_zero(at.alt_amsl_m - zero.alt_amsl_m)}
 
     def _state(self, vehicle: _Vehicle) -> Shown:
-        roll, pitch, yaw = map(math.degrees, to_euler(vehicle.q_nb))
-        content: dict[str, float | None] = dict.fromkeys(SCHEMAS["mavgate.State"]["properties"])
+        """Return the state, in which unknown values are NaN, thus null in JSON."""
+        roll, pitch, yaw = (NAN, NAN, NAN)
         if vehicle.has_attitude:
-            content |= {"roll_deg": roll, "pitch_deg": pitch, "heading_deg": yaw % 360.0}
-        at = vehicle.position
-        if at is not None:
-            content |= {
-                "alt_amsl_m": plain(at.alt_amsl_m),
-                "height_m": plain(at.alt_home_m),
-                "speed_mps": plain(at.groundspeed_mps),
-                "climb_mps": plain(-at.vel_n_mps[2]),
-            }
+            roll, pitch, yaw = map(math.degrees, to_euler(vehicle.q_nb))
+        at = vehicle.position or _UNKNOWN
+        content = {
+            "roll_deg": roll, "pitch_deg": pitch, "heading_deg": yaw % 360.0,
+            "alt_amsl_m": at.alt_amsl_m, "height_m": at.alt_home_m,
+            "speed_mps": at.groundspeed_mps, "climb_mps": -at.vel_n_mps[2],
+        }  # fmt: skip
         return Shown(f"/{vehicle.frame}/state", "mavgate.State", content)
 
     def _located(self, vehicle: _Vehicle, at: Position, time_us: int) -> Iterator[Shown]:
@@ -292,7 +289,7 @@ def _fix(
         "frame_id": frame,
         "latitude": at.lat_deg,
         "longitude": at.lon_deg,
-        "altitude": plain(at.alt_amsl_m),
+        "altitude": at.alt_amsl_m,
         "position_covariance": covariance,
         "position_covariance_type": covariance_type if accuracy_m else COVARIANCE_UNKNOWN,
     }
@@ -306,58 +303,81 @@ def _time(time_us: int) -> dict[str, int]:
 class _Topics:
     """Channels and schemas of one file, each registered on first use."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: McapWriter) -> None:
         self._writer = writer
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
 
-    def add(
-        self, topic: str, schema: dict[str, Any], content: Any, time_us: int, sequence: int = 0
-    ) -> None:
+    def channel(self, topic: str, schema: dict[str, Any]) -> int:
+        """Return the channel of a topic."""
         channel = self._channels.get(topic)
         if channel is None:
-            number = self._schema(schema)
-            channel = self._writer.register_channel(topic, "json", number)
+            channel = self._writer.add_channel(topic, "json", self._schema(schema))
             self._channels[topic] = channel
-        time_ns = min(time_us, LAST_US) * 1000
-        data = msgspec.json.encode(content)
-        self._writer.add_message(channel, time_ns, data, time_ns, sequence)
-
-    def add_shown(self, shown: Iterable[Shown], time_us: int) -> None:
-        for one in shown:
-            self.add(one.topic, SCHEMAS[one.schema], one.content, time_us)
+        return channel
 
     def _schema(self, schema: dict[str, Any]) -> int:
         name = schema["title"]
         if name not in self._schemas:
             data = msgspec.json.encode(schema)
-            self._schemas[name] = self._writer.register_schema(name, "jsonschema", data)
+            self._schemas[name] = self._writer.add_schema(name, "jsonschema", data)
         return self._schemas[name]
+
+
+def _recorded(batch: Batch, topics: _Topics) -> Iterator[Row]:
+    """Yield the MAVLink messages of the dialect, of one sender and type after the other."""
+    is_v2 = np.frombuffer(batch.data, np.uint8)[batch.starts + TIME_SIZE] == START_V2
+    at = batch.starts + TIME_SIZE + np.where(is_v2, SEQUENCE_V2, SEQUENCE_V1)
+    sequences = np.frombuffer(batch.data, np.uint8)[at]
+    for key in np.unique(batch.origins << 24 | batch.message_ids).tolist():
+        origin, message_id = key >> 24, key & 0xFFFFFF
+        kind = DEFINITIONS.get(message_id)
+        if kind is None:
+            continue
+        rows = np.flatnonzero((batch.origins == origin) & (batch.message_ids == message_id))
+        topic = f"/mavlink/{origin >> 8}/{origin & 0xFF}/{kind.msgname}"
+        channel = topics.channel(topic, schema_of_message(kind))
+        values = columns_of(batch, rows, message_id)
+        columns = [_listed(values[name]) for name in values.dtype.names or ()]
+        contents = zip(*columns, strict=True)
+        for time_us, sequence, content in zip(
+            batch.time_us[rows].tolist(), sequences[rows].tolist(), contents, strict=True
+        ):
+            fields = dict(zip(kind.ordered_fieldnames, content, strict=True))
+            yield time_us, channel, msgspec.json.encode(fields), sequence
+
+
+def _listed(column: NDArray[Any]) -> list[Any]:
+    """Return a column of fields as they are in JSON, where NaN becomes null."""
+    if column.dtype.kind == "S":
+        return [text_of(data) for data in column.tolist()]
+    found: list[Any] = column.tolist()
+    return found
 
 
 def write(flight: FlightToWrite) -> Iterator[bytes]:
     """Write a flight, at its civil times."""
-    pieces = Pieces()
-    writer = Writer(pieces)  # type: ignore[arg-type]
-    writer.start(library=f"mavgate {__version__}")
+    writer = McapWriter(f"mavgate {__version__}")
     topics, view, unknown = _Topics(writer), FoxgloveView(), 0
-    records = flight.frames()
+
+    def shown(messages: Iterable[VehicleMessage]) -> Iterator[Row]:
+        for message in messages:
+            for one in view.feed(message):
+                channel = topics.channel(one.topic, SCHEMAS[one.schema])
+                yield message.time_us, channel, msgspec.json.encode(one.content), 0
+
+    def add(rows: Iterable[Row]) -> None:
+        for time_us, channel, data, sequence in sorted(rows, key=itemgetter(0)):
+            writer.add_message(channel, min(time_us, LAST_US) * 1000, data, sequence)
+
+    batches = flight.chosen()
     reader = VehicleReader(flight.senders, (GPS_ID, ESTIMATOR_ID))
-    for record in records:
-        frame, time_us = frame_of(record.frame), record.time_us
-        kind = DEFINITIONS.get(frame.message_id)
-        unknown += kind is None
-        if kind is not None:
-            system, component = frame.origin
-            topic = f"/mavlink/{system}/{component}/{kind.msgname}"
-            fields = {name: plain(value) for name, value in fields_of(record.frame).items()}
-            topics.add(topic, schema_of_message(kind), fields, time_us, frame.sequence)
-        for message in reader.feed(record):
-            topics.add_shown(view.feed(message), message.time_us)
-        if data := pieces.take():
+    for batch in batches:
+        unknown += int(np.sum(~np.isin(batch.message_ids, [*DEFINITIONS])))
+        add([*_recorded(batch, topics), *shown(reader.feed_batch(batch))])
+        if data := writer.take():
             yield data
-    for message in reader.flush():
-        topics.add_shown(view.feed(message), message.time_us)
+    add(shown(reader.flush()))
     if unknown:
         flight.remark(
             f"left out {counted(unknown, 'message')} that no supported MAVLink dialect contains"
@@ -367,5 +387,4 @@ def write(flight: FlightToWrite) -> Iterator[bytes]:
         lat_deg, lon_deg, alt_m = map(str, (zero.lat_deg, zero.lon_deg, zero.alt_amsl_m))
         origin_facts = {"latitude": lat_deg, "longitude": lon_deg, "altitude_amsl_m": alt_m}
         writer.add_metadata("origin of the frame map", origin_facts)
-    writer.finish()  # type: ignore[no-untyped-call]
-    yield pieces.take()
+    yield writer.finish()
