@@ -26,20 +26,27 @@ from urllib.parse import urlsplit
 import websockets
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.hub.systems import HARMLESS
 from gateway.hub.transports.datagram import UNPROVEN_FACTOR
 from gateway.live.control_socket import ControlError, request
 from gateway.panel.logins import hash_password
+from gateway.wire.mavlink_messages import HEARTBEAT_ID
+from gateway.wire.mavlink_splitter import MavFrame, split_datagram
+from gateway.wire.vehicle_inputs import acts
+from tests.kit.mavlink import STATION, every_message, packed, sent_by
 from tests.kit.process import Process
 from tests.ports import free_port
 
 OPERATOR, VIEWER = "operator's", "viewer's"
+DEMO: Final = 1
+"""System id of the demo's aircraft."""
 COMMAND_S: Final = 30.0
 """Timeout of a command that must refuse a hostile file; its start takes some seconds."""
 CONFIG = """
 [recording]
 folder = "{folder}/recordings"
 [hub]
-endpoints = ["udp-listen:127.0.0.1:{port}"]
+endpoints = ["udp-listen:127.0.0.1:{port}", "udp-listen:127.0.0.1:{selecting}?systems=2"]
 [panel]
 port = 0
 map_styles = []
@@ -55,6 +62,8 @@ class Target:
     folder: Path
     port: int
     """Its listening UDP port."""
+    selecting_port: int = 0
+    """Another one, behind which only system 2 passes."""
     link: str = ""
     """Address of the panel."""
 
@@ -94,6 +103,44 @@ def forged_source(target: Target) -> bool:
             with contextlib.suppress(TimeoutError):
                 received += len(silent.recv(65535))
     return 0 < received <= UNPROVEN_FACTOR * len(heartbeat)
+
+
+def past_a_selection(target: Target) -> bool:
+    """Send every message behind `systems=2` to a vehicle with another id; only harmless ones pass.
+
+    The vehicle has sent a heartbeat and no telemetry; the sender uses ids of all three.
+    """
+    vehicle_id, selected_id = 3, 2
+    address = ("127.0.0.1", target.port)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station,
+    ):
+        vehicle.setblocking(False)
+        beat = mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)
+        vehicle.sendto(beat.pack(mavlink.MAVLink(None, vehicle_id, 1)), address)
+        station.connect(("127.0.0.1", target.selecting_port))
+        passed = set()
+        for sender in ((255, STATION), (selected_id, 1), (vehicle_id, STATION)):
+            station.send(packed(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), *sender))
+            for frame in every_message(0, vehicle_id):
+                station.send(sent_by(frame, *sender).data)
+                if frame.message_id % 16 == 0:
+                    passed |= _received(vehicle)
+        passed |= _received(vehicle)
+    return HEARTBEAT_ID in passed and {number for number in passed if acts(number)} <= HARMLESS
+
+
+def _received(sock: socket.socket) -> set[int]:
+    """Return the ids of the messages of others than the demo that have arrived."""
+    found = set()
+    time.sleep(0.02)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            for event in split_datagram(sock.recv(65535)):
+                if isinstance(event, MavFrame) and event.origin[0] != DEMO:
+                    found.add(event.message_id)
+    return found
 
 
 def idle_control_connections(target: Target) -> bool:
@@ -196,6 +243,7 @@ OF_FILES: Final = {
 }
 OF_GATEWAY: Final = {
     "one datagram with a forged source": forged_source,
+    "every message past a selection of systems": past_a_selection,
     "idle control connections": idle_control_connections,
     "devices as serial clients": devices_as_clients,
 }
@@ -210,9 +258,11 @@ OF_PANEL: Final = {
 def started(folder: Path, *, panel: bool) -> Iterator[Target]:
     """Start a demo, with a panel if `panel`."""
     (folder / "recordings").mkdir()
-    target = Target(folder, free_port())
+    target = Target(folder, free_port(), free_port())
     hashes = {"operator": hash_password(OPERATOR), "viewer": hash_password(VIEWER)}
-    config = CONFIG.format(folder=folder, port=target.port, **hashes)
+    config = CONFIG.format(
+        folder=folder, port=target.port, selecting=target.selecting_port, **hashes
+    )
     with contextlib.ExitStack() as opened:
         demo = opened.enter_context(Process(folder, "demo", "--plain", "--no-panel", config=config))
         socket_path = folder / "mavgate" / "run.sock"

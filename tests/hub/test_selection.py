@@ -3,31 +3,22 @@
 import asyncio
 import json
 import socket
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable
 from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
-from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.hub import Hub
 from gateway.hub.systems import HARMLESS, SystemFilter
 from gateway.panel.rest_api import RestApi
-from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_json import template
-from gateway.wire.mavlink_messages import (
-    CRC_EXTRA,
-    DEFINITIONS,
-    MESSAGE_NAMES,
-    NO_TARGET,
-    TARGET_OFFSETS,
-    layout_of,
-)
-from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, SIGNED, MavFrame, frame_of, to_mavlink1
+from gateway.wire.mavlink_messages import MESSAGE_NAMES
+from gateway.wire.mavlink_splitter import MavFrame, frame_of, to_mavlink1
 from gateway.wire.vehicle_inputs import acts
 from tests.kit.hub import Rig, Station
-from tests.kit.mavlink import STATION, packed
+from tests.kit.mavlink import STATION, every_message, packed, sent_by
 from tests.kit.messages import beat
 
 pytestmark = pytest.mark.io
@@ -41,35 +32,7 @@ GCS = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
 Send = Callable[[list[MavFrame]], Awaitable[None]]
 
 
-def _with_target(message_id: int, target: int) -> MavFrame:
-    """Return a frame of a message whose other fields are 0."""
-    size = layout_of(message_id).itemsize
-    head = bytes((0xFD, size, 0, 0, 0, 0, 0)) + message_id.to_bytes(3, "little")
-    blank = frame_of(head + bytes(size) + bytes(2))
-    names = [n for n in ("target", "target_system") if n in (layout_of(message_id).names or ())]
-    fields = dict.fromkeys(names, target)
-    if target and TARGET_OFFSETS[message_id][1] != NO_TARGET:
-        fields["target_component"] = 1
-    edited = edit_frame(blank, fields=fields) if fields else blank
-    assert edited
-    return edited
-
-
-def _messages() -> Iterator[MavFrame]:
-    for message_id in sorted(DEFINITIONS):
-        for target in (0, ALLOWED, EXCLUDED) if message_id in TARGET_OFFSETS else (0,):
-            yield _with_target(message_id, target)
-
-
-MESSAGES = tuple(_messages())
-
-
-def _from(frame: MavFrame, sender: tuple[int, int], *, signed: bool) -> MavFrame:
-    data = bytearray(frame.data)
-    data[2] = SIGNED if signed else 0
-    data[5:7] = sender
-    data[-2:] = mcrf4xx(bytes(data[1:-2]) + CRC_EXTRA[frame.message_id]).to_bytes(2, "little")
-    return frame_of(bytes(data) + bytes(SIGNATURE_SIZE if signed else 0))
+MESSAGES = tuple(every_message(0, ALLOWED, EXCLUDED))
 
 
 class Bench:
@@ -175,7 +138,7 @@ async def test_no_message_acts_on_an_excluded_vehicle(rig: Rig, door: str, state
     await bench.report(EXCLUDED, state)
     sent = set()
     for sender in SENDERS:
-        frames = [_from(each, sender, signed=door == "signed") for each in MESSAGES]
+        frames = [sent_by(each, *sender, signed=door == "signed") for each in MESSAGES]
         if door == "mavlink1":
             frames = [frame_of(data) for f in frames if (data := to_mavlink1(f.data))]
         if door == "rest":

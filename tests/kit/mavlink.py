@@ -3,6 +3,7 @@
 import math
 import random
 import struct
+from collections.abc import Iterator
 from typing import Any
 
 from fastcrc.crc16 import mcrf4xx
@@ -10,9 +11,24 @@ from pymavlink.dialects.v20 import all as every_dialect
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.records import Outgoing
-from gateway.wire.mavlink_messages import CRC_EXTRA
+from gateway.wire.frame_editing import edit_frame
+from gateway.wire.mavlink_messages import (
+    CRC_EXTRA,
+    DEFINITIONS,
+    NO_TARGET,
+    TARGET_OFFSETS,
+    layout_of,
+)
 from gateway.wire.mavlink_signing import EPOCH_2015_US, TICK_US, FrameSigner, SigningClock
-from gateway.wire.mavlink_splitter import Event, MavFrame, frame_of, message_id_of, split_datagram
+from gateway.wire.mavlink_splitter import (
+    SIGNATURE_SIZE,
+    SIGNED,
+    Event,
+    MavFrame,
+    frame_of,
+    message_id_of,
+    split_datagram,
+)
 
 STATION = 190
 """Component id of a ground station."""
@@ -182,3 +198,30 @@ def numbered(system: int, sequence: int, message: Any = None) -> MavFrame:
 def raw_frame(message_id: int, data: bytes) -> MavFrame:
     """Return a frame with arbitrary bytes, for queues that never look into them."""
     return MavFrame(data, b"", message_id, (1, 1), (0, 0), 0, False)
+
+
+def every_message(*targets: int) -> Iterator[MavFrame]:
+    """Yield each message of the dialect with zeros, for each target if it has one."""
+    for message_id in sorted(DEFINITIONS):
+        for target in targets if message_id in TARGET_OFFSETS else (0,):
+            yield _with_target(message_id, target)
+
+
+def _with_target(message_id: int, target: int) -> MavFrame:
+    size = layout_of(message_id).itemsize
+    head = bytes((0xFD, size, 0, 0, 0, 0, 0)) + message_id.to_bytes(3, "little")
+    blank = frame_of(head + bytes(size) + bytes(2))
+    names = {"target", "target_system"} & set(layout_of(message_id).names or ())
+    fields = dict.fromkeys(names, target)
+    if target and TARGET_OFFSETS[message_id][1] != NO_TARGET:
+        fields["target_component"] = 1
+    return edit_frame(blank, fields=fields) or blank
+
+
+def sent_by(frame: MavFrame, system: int, component: int, *, signed: bool = False) -> MavFrame:
+    """Return a frame with another sender, and with a signature of zeros if wanted."""
+    data = bytearray(frame.data)
+    data[2] = SIGNED if signed else 0
+    data[5:7] = system, component
+    data[-2:] = mcrf4xx(bytes(data[1:-2]) + CRC_EXTRA[frame.message_id]).to_bytes(2, "little")
+    return frame_of(bytes(data) + bytes(SIGNATURE_SIZE if signed else 0))
