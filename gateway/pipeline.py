@@ -340,15 +340,15 @@ class Pipeline:
     def _whole_report(self, now_us: int) -> LinkReport:
         """Return the report with the receiver's line and all other sources."""
         report = self._link.report(now_us, connected=self._connected, port=self._port)
-        if not self.sources:
-            return report
-        links = tuple(link for source in self.sources for link in source.links(now_us))
-        sources = tuple(source.report() for source in self.sources)
-        return msgspec.structs.replace(report, nodes=report.nodes + links, sources=sources)
+        sources = tuple(source.report(now_us) for source in self.sources)
+        return msgspec.structs.replace(report, sources=sources) if sources else report
 
     def _report_for(self, vehicle_id: int) -> LinkReport:
-        """Return the report with the state of the source of a vehicle's records."""
+        """Return the report with the state of the source of a vehicle's records, as of nodes."""
         report = self.report
+        links = tuple(each for source in self.sources for each in source.links(report.time_us))
+        if links:
+            report = msgspec.structs.replace(report, nodes=report.nodes + links)
         for source in self.sources:
             if vehicle_id in source.vehicles:
                 known = {"connected": source.connected, "port": source.url.name, "name": "Source"}

@@ -4,8 +4,8 @@ import logging
 import math
 import os
 import re
-from collections.abc import Iterable
-from typing import Final
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
 
 _CONTROL: Final = (*range(0x20), *range(0x7F, 0xA0))
 """C0 and C1 control characters, which can move the cursor, rename the window, or enter input."""
@@ -131,6 +131,20 @@ def receiver_state(port: str, connected: bool, bytes_received: int, frames: int)
     if not connected:
         return f"receiver: not connected (serial.port = {port})"
     return f"receiver: {port} {_reception(bytes_received, frames)}"
+
+
+def source_state(source: Mapping[str, Any], now_us: int) -> str:
+    """Describe a source other than the receiver, from the fields of its `SourceReport`."""
+    if not source["connected"]:
+        state = f"not connected: {source['reason']}"
+    elif source["last_time_us"] is None:
+        state = f"connected, {source['bytes_received']} bytes without a record"
+    else:
+        age_s = max(now_us - source["last_time_us"], 0) * 1e-6
+        rate = f"{source['rate_hz']:.0f} a second"
+        state = f"{source['records']} records, {rate}, the last {age_s:.1f} s ago"
+    faults = "".join(f", {count} {kind}" for kind, count in source["faults"])
+    return f"source {source['url']}: {state}{faults}"
 
 
 def _reception(bytes_received: int, frames: int) -> str:

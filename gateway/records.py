@@ -455,6 +455,8 @@ class SourceReport(msgspec.Struct, frozen=True, gc=False):
     newest_fault: str
     last_time_us: int | None
     """Time of the newest record."""
+    rate_hz: float = 0.0
+    """Records per second, measured over the last second."""
 
 
 class MavFrame(msgspec.Struct, frozen=True, gc=False):

@@ -4,10 +4,12 @@ import math
 from dataclasses import dataclass, field
 from typing import Final
 
+from msgspec.structs import asdict
+
 from gateway.aircraft import Aircraft
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, HubCounters, ListenerStats
-from gateway.printable import UNKNOWN, figure, printable, receiver_state
+from gateway.printable import UNKNOWN, figure, printable, receiver_state, source_state
 from gateway.records import GpsFix, LinkReport, LoggedRequest, NavState, NodeStatus, board_name
 from gateway.units import counted
 from gateway.vehicle.plan import Location, distance_and_bearing
@@ -182,7 +184,8 @@ def summary_line(snapshot: Snapshot) -> str:
     """Summarise a snapshot in one line for the log."""
     report = snapshot.report
     received = report.bytes_received, report.frames
-    parts = [*filter(None, [receiver_state(report.port, report.connected, *received)])]
+    parts = [receiver_state(report.port, report.connected, *received)]
+    parts += [source_state(asdict(source), snapshot.time_us) for source in report.sources]
     sensors = {board.node: board.sensors_present for a in snapshot.aircraft for board in a.boards}
     parts += [
         f"aircraft {board_name(node.node, sensors.get(node.node, 0))} board "
@@ -200,4 +203,4 @@ def summary_line(snapshot: Snapshot) -> str:
     own = {one.vehicle_id for one in snapshot.aircraft}
     parts += [_vehicle_text(row) for row in snapshot.vehicles if row.system_id not in own]
     parts.append(counted(len(snapshot.clients), "client"))
-    return "; ".join(parts)
+    return "; ".join(filter(None, parts))

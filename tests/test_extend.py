@@ -123,7 +123,7 @@ def test_added_source_kind_is_a_vehicle(install: Install) -> None:
     (*_, newest) = [sent.frame for sent in frames if sent.message_id == wanted]
     message = mavlink.MAVLink(None).parse_char(newest)
     assert (message.get_srcSystem(), message.lat, message.alt) == (4, 481000000, 512_000)
-    assert source.report().faults == (("checksum", 1),)
+    assert source.report(0).faults == (("checksum", 1),)
 
 
 async def test_added_endpoint_kind_sends_and_receives(install: Install, tmp_path: Path) -> None:

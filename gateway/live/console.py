@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Final
 
+from msgspec.structs import asdict
 from rich.cells import cell_len
 from rich.columns import Columns
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -19,7 +20,7 @@ from rich.text import Text
 
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, ListenerStats, name_with_remote
-from gateway.printable import UNKNOWN, PrintableFormatter, figure, receiver_state
+from gateway.printable import UNKNOWN, PrintableFormatter, figure, receiver_state, source_state
 from gateway.records import (
     GpsFix,
     LinkReport,
@@ -186,10 +187,8 @@ def _link_line(snapshot: Snapshot) -> Text:
     for kind, count in report.faults:
         line.append(f", {counted(count, f'{kind} fault')}", style="yellow")
     for source in report.sources:
-        state = f"{counted(source.records, 'record')}" if source.connected else source.reason
-        line.append(f"\nsource {source.url}  {state}", style="green" if source.connected else "red")
-        for kind, count in source.faults:
-            line.append(f", {counted(count, f'{kind} fault')}", style="yellow")
+        state = source_state(asdict(source), snapshot.time_us)
+        line.append(f"\n{state}", style="green" if source.connected else "red")
     if report.receiver is not None:
         line.append(f"  radio {sum(node.lost for node in report.nodes)} lost")
         line.append(f", {channel_name(report.receiver.channel)}")

@@ -146,6 +146,10 @@ class _Node:
     signal: RadioSignal | None = None
     arrivals_us: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_ARRIVALS))
 
+    def rate_hz(self, now_us: int) -> float:
+        """Return the number of records in the last second."""
+        return float(sum(us > now_us - US_PER_S for us in self.arrivals_us))
+
 
 class SourceInput:
     """A source: its decoder, and the counts of its records and faults."""
@@ -214,7 +218,7 @@ class SourceInput:
         """Set the state to lost, with the reason."""
         self.connected, self.reason = False, reason
 
-    def report(self) -> SourceReport:
+    def report(self, now_us: int) -> SourceReport:
         """Return the state of the source for display."""
         return SourceReport(
             self.url.name,
@@ -226,21 +230,21 @@ class SourceInput:
             tuple(sorted(self._faults.items())),
             self._newest_fault,
             max((node.last_us for node in self._nodes.values()), default=None),
+            sum(node.rate_hz(now_us) for node in self._nodes.values()),
         )
 
     def links(self, now_us: int) -> list[NodeLink]:
-        """Return the counts as those of nodes, one per vehicle; faults are with the first."""
-        faults = [sum(self._faults.values())]
+        """Return the counts as those of nodes, one per vehicle; without numbers none is lost."""
         return [
             NodeLink(
                 node=key,
                 pipe=0,
                 received=node.received,
-                lost=faults.pop() if faults else 0,
+                lost=0,
                 duplicates=0,
                 reordered=0,
                 restarts=0,
-                rate_hz=float(sum(us > now_us - US_PER_S for us in node.arrivals_us)),
+                rate_hz=node.rate_hz(now_us),
                 last_time_us=node.last_us,
                 clock_skew_ppm=0.0,
                 signal=node.signal,

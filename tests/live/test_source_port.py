@@ -233,7 +233,7 @@ async def test_posted_content_is_taken_with_the_token_and_others_are_counted() -
         for wrong in ("", secret[:-1], "sécret"):
             with pytest.raises(ControlError, match="no source has this token"):
                 verbs["source.push"](wrong, "abc")
-        assert other.source.report().faults == (("token", 3),)
+        assert other.source.report(0).faults == (("token", 3),)
 
 
 async def test_recording_of_other_messages_leaves_the_loop_to_others(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ async def test_all_but_a_post_with_the_token_gets_a_bare_answer_and_is_not_logge
     assert (answer.status_code, answer.text) == (status, text)
     assert gateway.lines == []
     is_wrong = (method, path) == ("POST", "/push/wrong")
-    assert gateway.source.report().faults == ((("token", 1),) if is_wrong else ())
+    assert gateway.source.report(0).faults == ((("token", 1),) if is_wrong else ())
     assert "push" not in caplog.text
 
 
@@ -102,7 +102,7 @@ async def test_wrong_tokens_count_as_wrong_passwords_and_do_not_reach_the_gatewa
     posts = [gateway.phone.post(f"/push/wrong{n}", content=b"x") for n in range(50)]
     answers = await asyncio.gather(*posts)
     assert sorted(each.status_code for each in answers) == [404] * MAX_ATTEMPTS + [429] * 45
-    assert sum(count for _, count in gateway.source.report().faults) <= 1
+    assert sum(count for _, count in gateway.source.report(0).faults) <= 1
     login = await gateway.phone.post("/login", content=b"password=wrong")
     assert login.status_code == 429
     assert (await gateway.phone.post(PUSH, content=b"x")).status_code == 200

@@ -304,7 +304,7 @@ def test_flight_of_a_phone_has_attitude_heading_and_position_of_the_truth() -> N
     for post in takewhile(lambda post: post.time_s < 30.0, posts):
         bench.wait(post.time_s - bench.now_us / US_PER_S)
         bench.feed(post.data)
-    assert bench.source.report().faults == ()
+    assert bench.source.report(0).faults == ()
     attitude, position = bench.newest("ATTITUDE"), bench.newest("GLOBAL_POSITION_INT")
     motion = SimulatedAircraft(SimulatorSettings(), 0, UTC_S * US_PER_S).trajectory
     truth = motion.truth_at(np.array([attitude.time_boot_ms, position.time_boot_ms]) / 1000.0)

@@ -8,11 +8,12 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.hub.stats import HubCounters
 from gateway.records import BatteryReport, GpsFix, NodeId, VehicleReport
 from gateway.sources.kinds import make_sources
 from gateway.sources.sampling import fix_at, imu_raw
 from gateway.sources.settings import SourceSettings, nodes_of, parse_source
-from gateway.status import status_of
+from gateway.status import Snapshot, status_of, summary_line
 from gateway.wire.framing import encode_frame
 from tests.kit.pipeline_bench import PipelineBench
 
@@ -212,12 +213,21 @@ def test_packets_of_radiohead_through_the_receiver_are_lines() -> None:
     assert flight.newest("RADIO_STATUS").rssi - 256 == -104
 
 
-def test_faults_are_counted_with_the_newest_explained(flight: Flight) -> None:
+def test_faults_are_counted_and_explained_and_are_no_loss(flight: Flight) -> None:
+    flight.wait(1.0)
+    flight.line(pressure_hpa=1000)
     flight.feed(b"one\n{\ntwo\n")
     flight.wait(2.0)
-    (report,) = flight.pipeline.report.sources
-    assert report.faults == (("json", 1), ("text", 2))
-    assert "'two'" in report.newest_fault
+    report = flight.pipeline.report
+    (source,) = report.sources
+    assert source.faults == (("json", 1), ("text", 2))
+    assert "'two'" in source.newest_fault
+    status = flight.newest("SYS_STATUS")
+    assert (report.nodes, status.drop_rate_comm, status.errors_comm) == ((), 0, 0)
+    line = summary_line(Snapshot(flight.now_us, report, (), (), (), HubCounters()))
+    assert line == (
+        "source lines:stdin: 1 records, 0 a second, the last 2.0 s ago, 1 json, 2 text; 0 clients"
+    )
 
 
 @pytest.mark.parametrize(

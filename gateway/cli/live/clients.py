@@ -21,7 +21,7 @@ from gateway.cli.support.terminal import (
     table_of,
 )
 from gateway.live.other_gateways import Gateway, other_gateways
-from gateway.printable import UNKNOWN, figure, printable, receiver_state
+from gateway.printable import UNKNOWN, figure, printable, receiver_state, source_state
 from gateway.records import NodeId, RadioState, board_name
 from gateway.status import VEHICLE_HEADS, VehicleRow, vehicle_cells
 from gateway.units import MV_PER_V, US_PER_S, counted
@@ -227,21 +227,12 @@ def _aircraft_lines(snapshot: Record) -> list[str]:
 
 
 def _source_lines(snapshot: Record) -> list[str]:
-    return [_source_line(each, snapshot["time_us"]) for each in snapshot["report"]["sources"]]
-
-
-def _source_line(source: Record, now_us: int) -> str:
-    """Describe a source other than the receiver."""
-    if not source["connected"]:
-        state = f"not connected: {source['reason']}"
-    elif source["last_time_us"] is None:
-        state = f"connected, {source['bytes_received']} bytes without a record"
-    else:
-        age_s = (now_us - source["last_time_us"]) / US_PER_S
-        state = f"{counted(source['records'], 'record')}, the last {max(age_s, 0.0):.1f} s ago"
-    faults = "".join(f", {count} {kind}" for kind, count in source["faults"])
-    newest = f" (last: {printable(source['newest_fault'])})" if source["newest_fault"] else ""
-    return f"source {source['url']}: {state}{faults}{newest}"
+    """Describe the sources other than the receiver, with the newest fault of each."""
+    lines = []
+    for source in snapshot["report"]["sources"]:
+        newest = f" (last: {printable(source['newest_fault'])})" if source["newest_fault"] else ""
+        lines.append(source_state(source, snapshot["time_us"]) + newest)
+    return lines
 
 
 def _requests(found: Sequence[Record], now_us: int) -> Table:

@@ -9,6 +9,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.state.vehicle import VehicleState
+from gateway.printable import receiver_state
 from gateway.records import node_role
 from gateway.units import US_PER_S
 
@@ -29,6 +30,7 @@ SENSORS: Final = {
 _BEGINS: Final = (
     (re.compile(r"^(.+) silent$"), "node {0}", "{0} silent", "no radio packets"),
     (re.compile(r"^Receiver lost: (.+)$"), "receiver", "Receiver lost", "{0}"),
+    (re.compile(r"^Source lost: (.+)$"), "source {0}", "Source lost", "{0}"),
     (re.compile(r"^(?:Recording (?:not started|stopped)|Cannot record): (.+)$"), "recording",
      "Recording failed", "{0}"),
 )  # fmt: skip
@@ -37,12 +39,13 @@ _ENDS: Final = (
     (re.compile(r"^(.+) is back$"), "node {0}"),
     # Also the first text of a restarted gateway, which has not detected any node timeout.
     (re.compile(r"^(Receiver connected\b)"), "receiver|node .+"),
+    (re.compile(r"^Source connected: (.+)$"), "source {0}"),
     (re.compile(r"^(Recording (?!stopped:).+)$"), "recording"),
 )
 """Texts that end alerts, with a regular expression of their keys."""
 NODE_SILENT_US: Final = 3 * US_PER_S
 BLOCKED: Final = "blocked"
-OWN_KEYS: Final = ("node ", "receiver", "recording")
+OWN_KEYS: Final = ("node ", "receiver", "source ", "recording")
 """Key prefixes of the alerts that come from the status, or from texts if there is no status."""
 
 
@@ -143,10 +146,12 @@ def with_status(
 
 
 def _link(report: Mapping[str, Any], vehicle_id: int, roles: Mapping[int, str]) -> list[Alert]:
+    found = _sources(report, vehicle_id)
     if not report["connected"]:
         # Without the receiver all nodes time out, which needs no alert.
-        return [Alert("receiver", AlertLevel.CRITICAL, "Receiver lost", report["port"])]
-    found = []
+        if receiver_state(report["port"], False, 0, 0):
+            found.append(Alert("receiver", AlertLevel.CRITICAL, "Receiver lost", report["port"]))
+        return found
     for link in report["nodes"]:
         silent_us = report["time_us"] - link["last_time_us"]
         node = link["node"]
@@ -154,6 +159,22 @@ def _link(report: Mapping[str, Any], vehicle_id: int, roles: Mapping[int, str]) 
             name = f"{roles.get(node['node_id'], 'Node')} {node['node_id']}"
             since = f"no radio packets for {silent_us // US_PER_S} s"
             found.append(Alert(f"node {name}", AlertLevel.CRITICAL, f"{name} silent", since))
+    return found
+
+
+def _sources(report: Mapping[str, Any], vehicle_id: int) -> list[Alert]:
+    """Return the alerts of the sources of a vehicle other than the receiver."""
+    found = []
+    for source in report["sources"]:
+        last_us, url = source["last_time_us"], source["url"]
+        if source["node"]["vehicle_id"] != vehicle_id:
+            continue
+        if not source["connected"]:
+            alert = Alert(f"source {url}", AlertLevel.CRITICAL, "Source lost", source["reason"])
+            found.append(alert)
+        elif last_us is not None and report["time_us"] - last_us > NODE_SILENT_US:
+            since = f"{url}: no records for {(report['time_us'] - last_us) // US_PER_S} s"
+            found.append(Alert(f"source {url}", AlertLevel.CRITICAL, "Source silent", since))
     return found
 
 

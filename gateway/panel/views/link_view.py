@@ -19,12 +19,13 @@ from gateway.panel.widgets import (
     heading,
     notify_failure,
 )
-from gateway.printable import UNKNOWN, figure, printable
+from gateway.printable import UNKNOWN, figure, printable, receiver_state, source_state
 from gateway.records import RadioState, channel_name
 from gateway.units import US_PER_S, counted
 
 REFRESH_S: Final = 1.0
 SERIAL_S: Final = 2.0
+NOT_CONFIGURED: Final = "No receiver is configured."
 AUTO: Final = "find the receiver by its frames"
 OPEN_BY_ADDRESS: Final = (
     "A phone cannot reach these URLs: open this page by this computer's address in the network"
@@ -56,6 +57,8 @@ class LinkView:
             with ui.element("div").classes("card padded wide"):
                 heading("Receiver")
                 self._receiver = ui.label(UNKNOWN).classes("figure").props("data-role=receiver")
+                self._sources = ui.label().classes("figure").props("data-role=sources")
+                self._sources.style("white-space: pre-line")
                 if context.may_change:
                     self._build_serial()
                 self._nodes = DataTable(
@@ -197,6 +200,8 @@ class LinkView:
                 table.show({})
             return
         self._receiver.set_text(_receiver_line(status))
+        found = [source_state(each, status["time_us"]) for each in status["report"]["sources"]]
+        self._sources.set_text("\n".join(found))
         now_us = status["report"]["time_us"]
         boards = {_name_of(b): b for one in status["aircraft"] for b in one["boards"]}
         self._nodes.show(
@@ -250,6 +255,9 @@ def _serial_line(status: Record) -> str:
 
 def _receiver_line(status: Record) -> str:
     report = status["report"]
+    received = report["bytes_received"], report["frames"]
+    if not receiver_state(report["port"], report["connected"], *received):
+        return NOT_CONFIGURED
     parts = [
         f"{report['port']} {'connected' if report['connected'] else 'NOT CONNECTED'}",
         f"{counted(report['frames'], 'frame')}, {report['frames_lost']} lost on the line",

@@ -98,6 +98,7 @@ def status(silent_s: float = 0.0, **changed: Any) -> dict[str, Any]:
         "connected": True,
         "port": "/dev/ttyUSB0",
         "nodes": [{"node": node, "received": 9, "last_time_us": last_us}],
+        "sources": [],
     }
     boards = [{"node": node, "sensors_present": 8}]
     return {
@@ -131,6 +132,30 @@ def test_status_replaces_alerts_of_status_texts() -> None:
 
 def test_lost_receiver_replaces_the_alerts_of_its_nodes() -> None:
     assert titles(status(silent_s=30.0, connected=False)) == ["Receiver lost"]
+
+
+@pytest.mark.parametrize(
+    ("connected", "silent_s", "vehicle_id", "found"),
+    [
+        (True, 1, 1, []),
+        (True, 9, 1, ["Source silent"]),
+        (False, 9, 1, ["Source lost"]),
+        (False, 9, 2, []),
+    ],
+)
+def test_sources_of_a_gateway_without_a_receiver_are_alerts(
+    connected: bool, silent_s: int, vehicle_id: int, found: list[str]
+) -> None:
+    source = {
+        "url": "crsf:/dev/ttyACM0",
+        "node": {"vehicle_id": 1, "node_id": 8},
+        "connected": connected,
+        "reason": "unplugged",
+        "last_time_us": NOW_US - silent_s * US_PER_S,
+    }
+    reported = status(connected=False, port="none", sources=[source])
+    text = Alert("source crsf:/dev/ttyACM0", AlertLevel.CRITICAL, "Source lost")
+    assert titles(reported, text, vehicle_id=vehicle_id) == found
 
 
 @pytest.mark.parametrize(("state", "found"), [("blocked", ["Recording failed"]), ("idle", [])])
