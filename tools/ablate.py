@@ -72,8 +72,8 @@ SENSORS: Final = ("faults.check_sensor", "faults.check_sensors", "faults.is_hang
 MECHANISMS: Final = (
     Mechanism("noise by vibration", "filter", "add_vibration", NOTHING, ("predict.add_vibration",)),
     Mechanism(
-        "steps of the gyroscope bias", "predict", "unexpected_bias_density", NO_NUMBER,
-        ("predict.unexpected_bias_density", "predict.follow_bias_steps"),
+        "changes of bias and barometer", "predict", "unexpected_density", NO_NUMBER,
+        ("predict.unexpected_density", "predict.follow_bias_steps"),
     ),
     Mechanism("rest", "rest", "keeps_means", FALSE, ("rest",)),
     Mechanism(

@@ -33,6 +33,8 @@ from tools.simulated_flight import fly
 
 IMU_NAMES = ["ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz"]
 QUAT_NAMES = ["ref_qw", "ref_qx", "ref_qy", "ref_qz"]
+OFFSET_S = 60.0
+"""Time over which the offset of a barometer from GPS is a median."""
 SETTLED_S = 20.0
 """Time from which a simulated flight is scored: the estimators have used their first fixes."""
 GPS_NAMES = ["gps_lat", "gps_lon", "gps_alt_m", "gps_vn", "gps_ve", "gps_vd"]
@@ -50,6 +52,8 @@ class Flight:
     pos_ne_m: np.ndarray
     """(n, 2) north and east of `origin_deg`, NaN where there is no reference."""
     origin_deg: tuple[float, float]
+    alt_m: np.ndarray
+    """(n,) height above sea level, NaN where there is no reference."""
     counts: np.ndarray
     """(n,) whether the sample is scored."""
     free_heading: bool = False
@@ -91,6 +95,7 @@ def as_increments(flight: Flight, rate_hz: float) -> Flight:
         log=replace(log, imu_time_us=log.imu_time_us[ends], imu=imu),
         q_nb=flight.q_nb[ends],
         pos_ne_m=flight.pos_ne_m[ends],
+        alt_m=flight.alt_m[ends],
         counts=flight.counts[ends],
     )
 
@@ -123,9 +128,26 @@ def read_flight(path: Path) -> Flight:
         q_nb=table[QUAT_NAMES].to_numpy(),
         pos_ne_m=table[["ref_n", "ref_e"]].to_numpy() if len(log.gps) else np.full((n, 2), np.nan),
         origin_deg=(float(origin[0]), float(origin[1])),
+        alt_m=_reference_height(log, settings.gps_latency_s),
         counts=counts,
         free_heading="mocap" in path.name,
     )
+
+
+def _reference_height(log: SampleLog, latency_s: float) -> np.ndarray:
+    """Return the height of the fixes, between them that of the barometer plus its slow offset."""
+    time_s, fix_s = log.imu_time_us * 1e-6, log.gps_time_us * 1e-6 - latency_s
+    alt_m = log.gps[:, GPS_ALT]
+    if not len(fix_s):
+        return np.full(len(time_s), np.nan)
+    if not len(log.baro_alt_m):
+        return np.interp(time_s, fix_s, alt_m)
+    baro_s = log.baro_time_us * 1e-6
+    off_m = pd.Series(
+        alt_m - np.interp(fix_s, baro_s, log.baro_alt_m), pd.to_datetime(fix_s, unit="s")
+    )
+    slow_m = off_m.rolling(f"{OFFSET_S:.0f}s", center=True).median()
+    return np.interp(time_s, baro_s, log.baro_alt_m) + np.interp(time_s, fix_s, slow_m)
 
 
 def _samples(table: pd.DataFrame, settings: ReferenceSettings) -> SampleLog:
@@ -195,6 +217,7 @@ def simulated_flight(seed: int, *, calibrated: bool) -> Flight:
         q_nb=truth.q_nb,
         pos_ne_m=np.empty((0, 2)),
         origin_deg=origin,
+        alt_m=truth.alt_amsl_m,
         counts=log.imu_time_us > SETTLED_S * 1e6,
     )
     return replace(flight, pos_ne_m=north_east_m(flight, truth.lat_deg, truth.lon_deg))

@@ -1,12 +1,15 @@
 """Score the estimators on recorded and simulated flights, one set of default settings for all.
 
-    python -m tools.score_estimators --data DIR [--only FLIGHT] [--json FILE] [--no-peers]
+    python -m tools.score_estimators --data DIR [--only FLIGHT] [--json FILE] [--estimator NAME]
 
 There is one row for each flight and estimator. Attitude is compared with the reference in flight or
-motion, in degrees RMS; position in metres RMS at the native fix rate, with one fix a second, and in
-repeated artificial outages of 10 and 30 s. The other columns are the share of the time within two
-standard deviations, millions of samples processed in a second, and the largest error 20 s after
-each disturbance of `tools.spoil_flight` (--spoilt).
+motion, in degrees RMS; `turns` is the heading without a reference: changes of the GPS velocity
+within 20 s against the specific force in NED. Position is in metres RMS at the native fix rate,
+with one fix a second, and in repeated artificial outages of 10 and 30 s. The height is compared
+with the barometer plus its slow offset from GPS, its RMS and largest error and the RMS of the
+climb. The other columns are the share of the time within two standard deviations, millions of
+samples processed in a second, and the largest error 20 s after each disturbance of
+`tools.spoil_flight` (--spoilt).
 """
 
 import argparse
@@ -25,7 +28,18 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from gateway.estimation.columns import NAV_ATTITUDE_STD, NAV_LAT, NAV_LON, NAV_POS_STD
+from gateway.estimation.columns import (
+    ACCEL,
+    GPS_LAT,
+    GPS_LON,
+    GPS_VEL,
+    NAV_ALT,
+    NAV_ATTITUDE_STD,
+    NAV_LAT,
+    NAV_LON,
+    NAV_POS_STD,
+    NAV_VEL,
+)
 from gateway.estimation.kernel import KernelEstimator
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.estimation.smoother import smooth
@@ -40,9 +54,18 @@ Scores = dict[str, float]
 SEEDS = (11, 12, 21)
 OUTAGE_REST_S = 20.0
 THIN_S = 0.95
-ATTITUDE = ("roll", "pitch", "yaw", "total", "inclination", "heading")
-POSITION = ("pos", "pos_1hz", "out10", "out30")
-SHARES = ("tilt_2s", "heading_2s", "pos_2s")
+CLIMB_S = 1.0
+"""Time over which climbs are averaged."""
+TURN_S = 20.0
+"""Time in which changes of velocity give one heading."""
+PAIR_S = 0.9
+"""Least interval of the fixes of such a change."""
+LEAST_PAIRS = 8
+TURN_STD_RAD = math.radians(2.0)
+"""Least number of pairs, and largest standard deviation, of such a heading."""
+ATTITUDE = ("roll", "pitch", "yaw", "total", "inclination", "heading", "turns")
+POSITION = ("pos", "pos_1hz", "out10", "out30", "alt", "alt_max", "climb")
+SHARES = ("tilt_2s", "heading_2s", "pos_2s", "alt_2s")
 SPEED = "million_per_s"
 
 
@@ -166,8 +189,72 @@ def position_scores(flight: Flight, run: Run, out: np.ndarray) -> Scores:
     }
 
 
+def height_scores(flight: Flight, out: np.ndarray) -> Scores:
+    """Compare the height in metres, and its change over `CLIMB_S` in m/s."""
+    use = flight.counts & np.isfinite(flight.alt_m)
+    off_m = np.where(use, out[:, NAV_ALT] - flight.alt_m, math.nan)
+    if not np.isfinite(off_m).any():
+        return {}
+    time_s = flight.log.imu_time_us * 1e-6
+    before, after = time_s - 0.5 * CLIMB_S, time_s + 0.5 * CLIMB_S
+    climbed_m = np.cumsum(np.nan_to_num(-out[:, NAV_VEL + 2]) * np.gradient(time_s))
+    found, true = (
+        (np.interp(after, time_s, line) - np.interp(before, time_s, line)) / CLIMB_S
+        for line in (climbed_m, flight.alt_m)
+    )
+    climb_off = np.where(use & np.isfinite(out[:, NAV_VEL + 2]), found - true, math.nan)
+    worst_m = float(np.nanmax(np.abs(off_m)))
+    return {"alt": rms(off_m), "alt_max": worst_m, "climb": rms(climb_off)}
+
+
+def turned_rad(time_s: np.ndarray, true: np.ndarray, found: np.ndarray) -> float:
+    """Return the rotation of horizontal changes of velocity (north + i east), NaN if unknown.
+
+    Their means and ramps, which errors of the level cause, are removed.
+    """
+    count = len(time_s)
+    if count < LEAST_PAIRS:
+        return math.nan
+    basis = np.column_stack([np.ones(count), time_s - time_s[0]])
+    true, found = (
+        line - basis @ np.linalg.lstsq(basis, line, rcond=None)[0] for line in (true, found)
+    )
+    product = np.vdot(true, found)
+    residual = found - product / abs(product) * true
+    # Pairs overlap, so that only one in `PAIR_S` is independent.
+    independent = min(count, TURN_S / PAIR_S)
+    variance = np.vdot(residual, residual).real / (2.0 * abs(product) * independent)
+    return float(np.angle(product)) if variance < TURN_STD_RAD**2 else math.nan
+
+
+def turn_score(flight: Flight, q_nb: np.ndarray) -> Scores:
+    """Compare the heading with that of changes of the GPS velocity, in degrees RMS."""
+    log, time_s = flight.log, flight.log.imu_time_us * 1e-6
+    use = np.isfinite(q_nb[:, 0]) & np.isfinite(log.imu[:, ACCEL])
+    fix_s = log.gps_time_us * 1e-6 - flight.reference.gps_latency_s
+    if not use.any() or not len(fix_s):
+        return {}
+    force = Rotation.from_quat(q_nb[use], scalar_first=True).apply(log.imu[use, ACCEL : ACCEL + 3])
+    gained = np.cumsum(force[:, :2] * np.gradient(time_s[use])[:, None], axis=0) @ (1.0, 1.0j)
+    counted = np.interp(fix_s, time_s, flight.counts) > 0.5
+    kept = counted & np.isfinite(log.gps[:, GPS_VEL : GPS_VEL + 2]).all(axis=1)
+    kept &= np.diff(log.gps[:, GPS_LAT : GPS_LON + 1], axis=0, prepend=0.0).any(axis=1)
+    fix_s, velocity = fix_s[kept], log.gps[kept, GPS_VEL : GPS_VEL + 2] @ (1.0, 1.0j)
+    after = np.searchsorted(fix_s, fix_s + PAIR_S)
+    pairs = np.flatnonzero(after < len(fix_s))
+    pairs = pairs[fix_s[after[pairs]] - fix_s[pairs] < 2.0 * PAIR_S]
+    ends = after[pairs]
+    change = velocity[ends] - velocity[pairs]
+    begins_s, ends_s = fix_s[pairs], fix_s[ends]
+    found = np.interp(ends_s, time_s[use], gained) - np.interp(begins_s, time_s[use], gained)
+    slots = begins_s // TURN_S
+    windows = [slots == slot for slot in np.unique(slots)]
+    headings = [turned_rad(begins_s[each], change[each], found[each]) for each in windows]
+    return {"turns": rms(np.degrees(np.array(headings)))}
+
+
 def share_scores(flight: Flight, out: np.ndarray, since_s: float = -math.inf) -> Scores:
-    """Return the shares of tilt, heading and position within two standard deviations."""
+    """Return the shares of tilt, heading, position and height within two standard deviations."""
     late = flight.counts & (flight.log.imu_time_us * 1e-6 >= since_s)
     scores = dict.fromkeys(SHARES, math.nan)
     use = late & np.isfinite(flight.q_nb[:, 0]) & np.isfinite(out[:, NAV_ATTITUDE_STD])
@@ -183,6 +270,10 @@ def share_scores(flight: Flight, out: np.ndarray, since_s: float = -math.inf) ->
         use = late & np.isfinite(off[:, 0]) & np.isfinite(std[:, 0])
         if use.any():
             scores["pos_2s"] = (np.abs(off[use]) < 2.0 * std[use]).mean()
+    off_m, std_m = np.abs(out[:, NAV_ALT] - flight.alt_m), out[:, NAV_POS_STD + 2]
+    use = late & np.isfinite(off_m) & np.isfinite(std_m)
+    if use.any():
+        scores["alt_2s"] = (off_m[use] < 2.0 * std_m[use]).mean()
     return scores
 
 
@@ -213,6 +304,9 @@ def score(flight: Flight, run: Run, *, whole: bool = True) -> Scores:
     out = run(flight)
     elapsed_s = time.perf_counter() - begin
     scores = attitude_scores(flight, out[:, :4]) | {SPEED: 1e-6 * len(out) / elapsed_s}
+    scores |= turn_score(flight, out[:, :4])
+    if out.shape[1] > NAV_VEL:
+        scores |= height_scores(flight, out)
     if out.shape[1] > NAV_LON:
         if whole:
             scores |= position_scores(flight, run, out)
@@ -274,7 +368,7 @@ def show(board: dict[str, dict[str, Scores]], base: str) -> None:
             add(flight, name, found)
     for name, found in geometric_means(board, base).items():
         add(f"geometric mean, {base} = 1", name, found)
-    Console(width=200).print(table)
+    Console(width=250).print(table)
 
 
 def main() -> None:
@@ -283,11 +377,17 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of *.csv.gz flights")
     parser.add_argument("--only", action="append", help="flights whose names contain this")
     parser.add_argument("--json", type=Path, help="write all numbers here too")
-    parser.add_argument("--no-peers", action="store_true", help="run only our own estimators")
+    parser.add_argument(
+        "--estimator", action="append", choices=OWN | PEERS, help="run only this one"
+    )
     parser.add_argument("--spoilt", action="store_true", help="score the disturbed flights too")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    runs = OWN | ({} if options.no_peers else PEERS)
+    runs = {
+        name: run
+        for name, run in (OWN | PEERS).items()
+        if name in (options.estimator or OWN | PEERS)
+    }
     board: dict[str, dict[str, Scores]] = {}
     spoilt: dict[str, dict[str, Scores]] = {}
     flights = list(flights_to_score(options.data, options.only))
@@ -299,7 +399,7 @@ def main() -> None:
         }
         if options.spoilt:
             spoilt[flight.name] = spoilt_scores(flight, run_eskf)
-    show(board, "eskf")
+    show(board, next(iter(runs)))
     for name, ways in spoilt.items():
         show({f"{name} {how}": {"eskf": scores} for how, scores in ways.items()}, "eskf")
     if options.json:

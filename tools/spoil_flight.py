@@ -145,6 +145,7 @@ def cut(flight: Flight, keep: np.ndarray) -> Flight:
         log=log,
         q_nb=flight.q_nb[keep],
         pos_ne_m=flight.pos_ne_m[keep],
+        alt_m=flight.alt_m[keep],
         counts=flight.counts[keep],
     )
 

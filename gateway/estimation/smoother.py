@@ -59,6 +59,7 @@ from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
     ATT,
     BARO_OFFSET,
+    GPS_CLIMB,
     GPS_ERROR,
     GYRO_BIAS,
     GYRO_SCALE,
@@ -88,6 +89,9 @@ AXES_RAD: Final = 0.005
 LEAST_VAR: Final = 1e-24
 RIDGE: Final = 1e-9
 """Added to the correlation matrix so that it can be inverted."""
+RESET: Final = 1
+AIDED: Final = 2
+"""Bits of a sample: the filter was reset since the last node; position and velocity are states."""
 BLOCK: Final = 256
 """Number of nodes whose gains are computed at once."""
 
@@ -101,9 +105,11 @@ def predict_copy(s: State, p: Gains, F: FloatArray) -> None:
     """Propagate the copy's covariance and the transition."""
     apply_transition(s, F, STATES)
     kept = math.exp(-s.pending_s / p.gps_error_s)
+    climb_kept = math.exp(-s.pending_s / p.gps_climb_error_s)
     for j in range(STATES):
         for k in range(3):
             F[GPS_ERROR + k, j] *= kept
+        F[GPS_CLIMB, j] *= climb_kept
     propagate(s, p)
 
 
@@ -128,6 +134,7 @@ def correction(s: State, copy: State, d: FloatArray) -> None:
         d[GYRO_SCALE + k] = s.gyro_scale_b[k] - copy.gyro_scale_b[k]
     d[BARO_OFFSET] = s.baro_offset_m - copy.baro_offset_m
     d[MAG_LATENCY] = s.mag_latency_s - copy.mag_latency_s
+    d[GPS_CLIMB] = s.gps_climb_error_mps - copy.gps_climb_error_mps
 
 
 @compiled
@@ -185,7 +192,7 @@ def write_row(s: State, copy: State, p: Gains, reset: bool, row: FloatArray) -> 
     chosen = s if reset else copy
     write_output(chosen, p, row)
     if s.aided == 0:
-        write_position(s, row)
+        write_position(s, p, row)
     flags = int(row[NAV_FLAGS]) | (FLAG.ATTITUDE_VALID if chosen.started == 1 else 0)
     if chosen.heading_known == 1 and chosen.heading_true == 1:
         flags |= FLAG.HEADING_VALID
@@ -194,6 +201,9 @@ def write_row(s: State, copy: State, p: Gains, reset: bool, row: FloatArray) -> 
         return
     for k in range(3):
         row[NAV_ATTITUDE_STD + k] = beyond(row[NAV_ATTITUDE_STD + k], copy.P[ATT + k, ATT + k])
+    if s.aided == 0:
+        return
+    for k in range(3):
         row[NAV_VEL_STD + k] = beyond(row[NAV_VEL_STD + k], copy.P[VEL + k, VEL + k])
         row[NAV_POS_STD + k] = beyond(row[NAV_POS_STD + k], copy.P[POS + k, POS + k])
 
@@ -217,13 +227,13 @@ def run_forward(
     transitions: int,
     predictions: int,
     corrections: int,
-    resets: int,
+    marks_at: int,
 ) -> None:
     """Run the filter, and a copy of it from each node to the next; all arguments are addresses.
 
     `states` are two records, `nodes` the index of the first sample of each interval and the end.
     Outputs are the rows; for each interval the covariance at its begin, the transition, the
-    predicted covariance and the correction; for each sample whether the filter was reset.
+    predicted covariance and the correction; for each sample the bits `RESET` and `AIDED`.
     """
     s = record_at(states, STATE_LAYOUT)
     copy = record_at(states + STATE_SIZE, STATE_LAYOUT)
@@ -232,7 +242,7 @@ def run_forward(
     log = record_at(log_at, LOG_LAYOUT)
     nodes = array_at(nodes_at, (node_count,), INT)
     imu_time_us = array_at(log.imu_time_us, (log.imu_count,), INT)
-    was_reset = array_at(resets, (log.imu_count,), BYTE)
+    marks = array_at(marks_at, (log.imu_count,), BYTE)
     baros = fixes = 0
     for k in range(node_count - 1):
         P = array_at(covariances + 8 * k * MATRIX, (STATES, STATES), FLOAT)
@@ -251,7 +261,7 @@ def run_forward(
             update_imu(s, p, now_us, row)
             move_copy(copy, p, now_us, row, s.imu_s == s.time_s, F)
             reset = share_raised(s, copy)
-            was_reset[i] = 1 if reset else 0
+            marks[i] = (RESET if reset else 0) | (AIDED if s.aided == 1 else 0)
             write_row(s, copy, p, reset, row_at(outputs, i, NAV_COLUMNS))
         propagate(s, p)
         predict_copy(copy, p, F)
@@ -291,17 +301,17 @@ def smooth(estimator: KernelEstimator, log: SampleLog) -> tuple[FloatArray, floa
     count = len(nodes) - 1
     out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
     P, F, predicted = (np.empty((count, STATES, STATES)) for _ in range(3))
-    d, reset = np.empty((count, STATES)), np.zeros(len(out), np.uint8)
+    d, marks = np.empty((count, STATES)), np.zeros(len(out), np.uint8)
     log, arrays = log_arrays(log)
     run_forward(
         address_of(states),
         address_of(gains),
         address_of(arrays),
         len(nodes),
-        *map(address_of, (nodes, out, P, F, predicted, d, reset)),
+        *map(address_of, (nodes, out, P, F, predicted, d, marks)),
     )
     begins, ends, variances = _backward(P, F, predicted, d, states[0]["P"])
-    _correct(out, log.imu_time_us, nodes, begins, ends, variances, reset != 0)
+    _correct(out, log.imu_time_us, nodes, begins, ends, variances, marks)
     return out, latency_s
 
 
@@ -354,7 +364,7 @@ def _correct(
     begins: FloatArray,
     ends: FloatArray,
     variances: FloatArray,
-    reset: np.ndarray,
+    marks: np.ndarray,
 ) -> None:
     """Apply the corrections between the nodes, and write the smoothed standard deviations."""
     stretch = np.repeat(np.arange(len(nodes) - 1), np.diff(nodes))
@@ -364,6 +374,7 @@ def _correct(
     start_us = time_us[np.maximum(nodes[:-1] - 1, 0)]
     length = np.maximum(time_us[nodes[1:] - 1] - start_us, 1)
     share = ((time_us - start_us[stretch]) / length[stretch])[:, None]
+    reset, aided = (marks & RESET) != 0, (marks & AIDED) != 0
     # A reset cannot be interpolated: the filter's output gets the correction of the next node.
     cut = np.add.reduceat(reset, nodes[:-1])[stretch] > 0
     share[cut, 0] = reset[cut]
@@ -372,7 +383,6 @@ def _correct(
     quat = slice(NAV_QUAT, NAV_QUAT + 4)
     out[:, quat] = _rotated(off[:, ATT : ATT + 3], out[:, quat])
     # Without GPS, position and velocity are those of the newest fix, and not states.
-    aided = np.isfinite(out[:, NAV_POS_STD])
     out[aided, NAV_VEL : NAV_VEL + 3] += off[aided, VEL : VEL + 3]
     if aided.any():
         lat_deg = float(out[np.argmax(aided), NAV_LAT])
@@ -384,11 +394,12 @@ def _correct(
     variance = ((1.0 - share) * variances[stretch] + share * variances[stretch + 1])[
         :, :MOVING_STATES
     ]
-    variance[reset] = 0.0
+    variance = np.where(reset[:, None], 0.0, np.maximum(variance, 0.0))
     variance[:, ATT : ATT + 3] += AXES_RAD**2
     for column, first in ((NAV_ATTITUDE_STD, ATT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
-        std = out[:, column : column + 3]
-        std[:] = np.sqrt(std**2 + np.maximum(variance[:, first : first + 3], 0.0))
+        use = slice(None) if first == ATT else aided
+        std = np.hypot(out[use, column : column + 3], np.sqrt(variance[use, first : first + 3]))
+        out[use, column : column + 3] = std
     attitude_std = out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3]
     flags = out[:, NAV_FLAGS].astype(np.int64)
     # NaN, before the start of the filter, compares false.

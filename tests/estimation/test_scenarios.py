@@ -14,7 +14,14 @@ from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.geometry.geodesy import radii_m
 from tests.estimation.samples import ACCELS, GPS_VELS, GYROS, MAGS, G, log_of
 from tools.flights import Flight
-from tools.score_estimators import attitude_scores, position_errors_m, rms, run_eskf, share_scores
+from tools.score_estimators import (
+    attitude_scores,
+    height_scores,
+    position_errors_m,
+    rms,
+    run_eskf,
+    share_scores,
+)
 from tools.spoil_flight import RECOVERY_S, SPOILS, Spoilt, gps_jump, wrong_latency
 
 
@@ -43,6 +50,30 @@ def clipped_gyro(flight: Flight) -> None:
     imu[:, GYROS] = imu[:, GYROS].clip(-limit, limit)
 
 
+def scaled_accelerometer(flight: Flight) -> None:
+    """Reduce the vertical force by a fifth in flight."""
+    flight.log.imu[flight.log.imu_time_us > 70e6, col.ACCEL + 2] *= 0.8
+
+
+def clipped_accelerometer(flight: Flight) -> None:
+    """Clip the force by strong vibration."""
+    imu = flight.log.imu
+    imu[:, ACCELS] += np.random.default_rng(7).normal(0.0, 16.0, (len(imu), 3))
+    imu[:, ACCELS] = imu[:, ACCELS].clip(-16.0, 16.0)
+
+
+def stuck_barometer(flight: Flight) -> None:
+    """Repeat one height in climbs and descents."""
+    late = flight.log.baro_time_us > 50e6
+    flight.log.baro_alt_m[late] = flight.log.baro_alt_m[late][0]
+
+
+def no_compass_and_low_pressure(flight: Flight) -> None:
+    """Let the barometer measure 65 m too much, without a compass that starts the filter."""
+    flight.log.imu[:, MAGS] = math.nan
+    flight.log.baro_alt_m[:] += 65.0
+
+
 def relocated(flight: Flight) -> None:
     """Move all later fixes by 1 km: the filter relocks on them."""
     north_deg = math.degrees(1000.0 / radii_m(flight.origin_deg[0], 0.0)[0])
@@ -57,7 +88,8 @@ def zero_velocities(flight: Flight) -> None:
 
 def changed(flight: Flight, change: Callable[[Flight], None], ends_s: float) -> Spoilt:
     """Change a copy of a flight up to a time."""
-    log = replace(flight.log, imu=flight.log.imu.copy(), gps=flight.log.gps.copy())
+    arrays = ("imu", "gps", "baro_alt_m")
+    log = replace(flight.log, **{name: getattr(flight.log, name).copy() for name in arrays})
     flight = replace(flight, log=log, pos_ne_m=flight.pos_ne_m.copy())
     change(flight)
     return Spoilt(flight, ends_s)
@@ -76,6 +108,10 @@ OWN: dict[str, Callable[[Flight], Spoilt]] = {
     "vibration": partial(changed, change=vibration, ends_s=30.0),
     "swapped_compass": partial(changed, change=swapped_compass, ends_s=90.0),
     "clipped_gyro": partial(changed, change=clipped_gyro, ends_s=60.0),
+    "scaled_accelerometer": partial(changed, change=scaled_accelerometer, ends_s=70.0),
+    "clipped_accelerometer": partial(changed, change=clipped_accelerometer, ends_s=30.0),
+    "stuck_barometer": partial(changed, change=stuck_barometer, ends_s=50.0),
+    "low_pressure": partial(changed, change=no_compass_and_low_pressure, ends_s=10.0),
     "relocated": partial(changed, change=relocated, ends_s=95.0),
     "held_fixes": held_fixes,
     "zero_velocities": partial(changed, change=zero_velocities, ends_s=60.0),
@@ -89,6 +125,9 @@ LIMITS: dict[str, tuple[float, float, float]] = {
     "vibration": (5.5, 4.0, 8.0),
     "swapped_compass": (1.5, 3.0, 2.0),
     "clipped_gyro": (3.0, 5.0, 3.0),
+    "scaled_accelerometer": (1.5, 1.5, 2.5),
+    "clipped_accelerometer": (5.5, 4.0, 4.0),
+    "low_pressure": (1.2, 2.5, 2.5),
     "gps_jump": (1.5, 2.0, 3.0),
     "relocated": (1.5, 2.0, 3.0),
     "held_fixes": (1.0, 1.5, 2.5),
@@ -104,9 +143,20 @@ LIMITS: dict[str, tuple[float, float, float]] = {
 """RMS of inclination and heading in deg and position in m, 20 s after the disturbance; those of
 `SPOILS` that are not listed have the limits of `USUAL`."""
 USUAL = (1.0, 1.2, 2.5)
+HEIGHT_M = {"no_height": 60.0}
+USUAL_HEIGHT_M = 3.0
+"""RMS of the height in m, where there is a barometer."""
 LEAST_SHARE = {"bias_step": 0.55, "wrong_latency": 0.55}
 """Share within two standard deviations, where the model lags behind what has changed."""
 USUAL_SHARE = 0.75
+DEGRADED = ("scaled_accelerometer", "clipped_accelerometer", "swapped_compass")
+VALID = (
+    (col.FLAG.ATTITUDE_VALID, (*range(4), col.NAV_ATTITUDE_STD)),
+    (col.FLAG.POSITION_VALID, (col.NAV_LAT, col.NAV_LON, col.NAV_POS_STD)),
+    (col.FLAG.VELOCITY_VALID, (*range(col.NAV_VEL, col.NAV_VEL + 3), col.NAV_VEL_STD)),
+    (col.FLAG.ALTITUDE_VALID, (col.NAV_ALT, col.NAV_POS_STD + 2)),
+)
+"""Flags of validity, and the columns that must be known with each."""
 
 
 @pytest.mark.slow
@@ -120,9 +170,16 @@ def test_errors_are_small_again_after_a_disturbance(flight: Flight, name: str) -
     errors = (found["inclination"], found["heading"], rms(position_errors_m(late, out)[counts]))
     limits = LIMITS.get(name, USUAL)
     assert all(error < limit for error, limit in zip(errors, limits, strict=True)), errors
+    height_m = height_scores(late, out).get("alt", 0.0)
+    assert height_m < HEIGHT_M.get(name, USUAL_HEIGHT_M)
     shares = share_scores(late, out)
     least = LEAST_SHARE.get(name, USUAL_SHARE)
-    assert min(shares["tilt_2s"], shares["heading_2s"]) > least
+    assert min(shares["tilt_2s"], shares["heading_2s"], shares["alt_2s"]) > least
+    flags = out[:, col.NAV_FLAGS].astype(int)
+    for flag, columns in VALID:
+        assert np.isfinite(out[flags & flag != 0][:, columns]).all()
+    degraded = (flags[counts] & col.FLAG.DEGRADED != 0).mean()
+    assert (degraded > 0.5) == (name in DEGRADED), degraded
 
 
 def test_swapped_compass_axes_are_reported(flight: Flight) -> None:

@@ -41,6 +41,7 @@ from gateway.estimation.eskf.faults import (
     GAP_S,
     GYRO_LIMIT_RADPS,
     UNKNOWN_REPEAT_S,
+    UNSEEN_MPS2,
     bridge_gap,
     check_sensors,
     close_gap,
@@ -75,6 +76,7 @@ from gateway.estimation.eskf.predict import (
     NO_HEADING_VAR,
     add_vibration,
     integrate,
+    is_accel_degraded,
     propagate,
     store_integrals,
 )
@@ -83,6 +85,7 @@ from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
     ATT,
+    GPS_CLIMB,
     GPS_ERROR,
     GYRO_BIAS,
     GYRO_SCALE,
@@ -116,6 +119,8 @@ COMPASS_RAD: Final = 2.0 * RAD_PER_DEG
 """Error of the heading by the declination, the compass axes on their board, and soft iron. It is
 only added in the output: it is constant, so averages over a flight, as in the smoother, do not
 reduce it."""
+PRESSURE_STD_M: Final = 100.0
+"""Standard deviation of the pressure altitude by the weather: 12 hPa."""
 UNAIDED_VALID_S: Final = 1.0
 """Time after its fix for which a position that is not estimated is valid."""
 
@@ -138,7 +143,9 @@ def start(s: State, p: Gains) -> None:
         s.P[GYRO_SCALE + k, GYRO_SCALE + k] = UNAIDED_SCALE * UNAIDED_SCALE
         s.gps_error_var[k] = p.gps_error_var if k < 2 else p.gps_height_error_var
         s.P[GPS_ERROR + k, GPS_ERROR + k] = s.gps_error_var[k]
-        s.rate_b[k] = NAN
+        s.rate_b[k] = s.fix_vel[k] = NAN
+    s.gps_climb_error_var = p.gps_climb_error_var
+    s.P[GPS_CLIMB, GPS_CLIMB] = s.gps_climb_error_var
     s.mag_latency_s = p.mag_latency_s
     s.P[MAG_LATENCY, MAG_LATENCY] = p.mag_latency_var
     s.declination_rad = p.declination_rad
@@ -322,7 +329,7 @@ def write_output(s: State, p: Gains, row: FloatArray) -> None:
     if s.started == 1:
         write_std(row, NAV_ATTITUDE_STD, s, ATT)
         row[NAV_ATTITUDE_STD + 2] = heading_std_rad(s)
-    write_position(s, row)
+    write_position(s, p, row)
 
 
 @compiled
@@ -344,12 +351,16 @@ def heading_std_rad(s: State) -> float:
 
 
 @compiled
-def write_position(s: State, row: FloatArray) -> None:
+def write_position(s: State, p: Gains, row: FloatArray) -> None:
     """Write position, velocity and their standard deviations; unknown ones are NaN."""
     write_vec(row[NAV_VEL : NAV_VEL + 3], UNKNOWN_VEC3)
     row[NAV_VEL_STD : NAV_POS_STD + 3] = NAN
     row[NAV_LAT] = row[NAV_LON] = NAN
-    row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 or s.baro_s != NEVER_S else NAN
+    if s.has_height == 1 or s.baro_s != NEVER_S:
+        height_std_m = math.sqrt(s.P[POS + 2, POS + 2]) if s.has_height == 1 else PRESSURE_STD_M
+        row[NAV_ALT], row[NAV_POS_STD + 2] = -s.pos_n[2], height_std_m
+    else:
+        row[NAV_ALT] = NAN
     if s.has_origin == 0:
         return
     north, east = s.pos_n[0] + s.blend_n[0], s.pos_n[1] + s.blend_n[1]
@@ -357,11 +368,17 @@ def write_position(s: State, row: FloatArray) -> None:
     if s.aided == 1:
         write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
         write_std(row, NAV_VEL_STD, s, VEL)
-        write_std(row, NAV_POS_STD, s, POS)
         for k in range(2):
-            row[NAV_POS_STD + k] = math.hypot(row[NAV_POS_STD + k], s.blend_n[k])
+            row[NAV_POS_STD + k] = math.hypot(math.sqrt(s.P[POS + k, POS + k]), s.blend_n[k])
     elif s.time_s - s.fix_s < FRESH_GPS_S:
         write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.fix_vel))
+        for k in range(3):
+            unseen_mps = UNSEEN_MPS2 * (s.time_s - s.fix_s + s.gps_latency_s)
+            usual = p.gps_velocity_var if k < 2 else p.gps_climb_var + s.gps_climb_error_var
+            row[NAV_VEL_STD + k] = math.sqrt(usual + unseen_mps * unseen_mps)
+            if k < 2:
+                fix_std_m = math.sqrt(s.gps_error_var[k] + p.gps_position_var)
+                row[NAV_POS_STD + k] = math.hypot(fix_std_m, s.blend_n[k])
 
 
 @compiled
@@ -375,17 +392,26 @@ def flags_of(s: State, p: Gains) -> int:
     if s.time_s - s.baro_s < BARO_STALE_S:
         flags |= FLAG.USING_BARO
     if s.fault == 1:
-        flags |= FLAG.SENSOR_FAULT | FLAG.DEGRADED
+        flags |= FLAG.SENSOR_FAULT
+    if s.fault == 1 or is_accel_degraded(s):
+        flags |= FLAG.DEGRADED
     if s.started == 1 and max(s.P[ATT, ATT], s.P[ATT + 1, ATT + 1]) < LEVEL_VALID_RAD**2:
         flags |= FLAG.ATTITUDE_VALID
     if s.heading_known == 1 and s.heading_true == 1 and heading_std_rad(s) < HEADING_VALID_RAD:
         flags |= FLAG.HEADING_VALID
     if s.has_height == 1 or s.baro_s != NEVER_S:
         flags |= FLAG.ALTITUDE_VALID
-    if s.fix_s == NEVER_S:
-        return flags
+    return flags if s.fix_s == NEVER_S else flags | aiding_flags(s, p)
+
+
+@compiled
+def aiding_flags(s: State, p: Gains) -> int:
+    """Return the flags of position and velocity."""
     hold_s = p.dead_reckoning_s if s.aided == 1 else UNAIDED_VALID_S
-    return flags | gps_flags(s.time_s - s.fix_s, s.time_s - s.rejected_s, hold_s)
+    flags: int = gps_flags(s.time_s - s.fix_s, s.time_s - s.rejected_s, hold_s)
+    if s.aided == 0 and not math.isfinite(s.fix_vel[0] + s.fix_vel[1] + s.fix_vel[2]):
+        flags &= ~FLAG.VELOCITY_VALID
+    return flags
 
 
 @compiled

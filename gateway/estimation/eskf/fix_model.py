@@ -17,9 +17,9 @@ from gateway.compiled import compiled
 from gateway.estimation.columns import GPS_H_ACC, GPS_SPEED_ACC, GPS_V_ACC
 from gateway.estimation.eskf.alignment import NOISE_MPS
 from gateway.estimation.eskf.magnetometer import STALE_MAG_S
-from gateway.estimation.eskf.predict import look_back
+from gateway.estimation.eskf.predict import is_accel_degraded, look_back
 from gateway.estimation.eskf.settings import Gains
-from gateway.estimation.eskf.state import ATT, GAINED, GPS_ERROR, MOVED, POS, VEL, State
+from gateway.estimation.eskf.state import ATT, GAINED, GPS_CLIMB, GPS_ERROR, MOVED, POS, VEL, State
 from gateway.estimation.eskf.update import (
     clear_row,
     inject,
@@ -38,6 +38,8 @@ ERROR_SHARES: Final = (0.7, 0.7, 0.9)
 """Shares of the reported accuracy that are slow error: north, east (of a radial accuracy), down."""
 SPEED_SHARES: Final = (0.4, 0.4, 0.8)
 """Shares of the reported speed accuracy that are noise of one axis."""
+CLIMB_ERROR_SHARE: Final = 0.6
+"""Share of the reported speed accuracy that is slow error of the climb."""
 SLOW_ERROR_MPS: Final = 0.05
 SLOW_ERROR_S: Final = 4.0
 """Slow error of GPS velocities without a reported accuracy, and its correlation time."""
@@ -101,6 +103,8 @@ def set_error_variances(s: State, p: Gains, row: FloatArray) -> None:
         usual = SLOW_ERROR_MPS * SLOW_ERROR_MPS
         slow = reported_variance(usual, row[GPS_SPEED_ACC], SPEED_SHARES[k])
         s.pos_density[k] = 2.0 * SLOW_ERROR_S * slow
+    usual = p.gps_climb_error_var
+    s.gps_climb_error_var = reported_variance(usual, row[GPS_SPEED_ACC], CLIMB_ERROR_SHARE)
 
 
 @compiled
@@ -156,6 +160,8 @@ def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
     clear_row(s)
     set_attitude(s, k, scaled(once, -1.0))
     s.h[VEL + k] = 1.0
+    if k == 2:
+        s.h[GPS_CLIMB] = 1.0
     set_accel_bias(s, k, lag)
 
 
@@ -217,7 +223,7 @@ def update_fix(
     s.hard_accel_sq = max(norm_sq(accel_n), s.hard_accel_sq * faded)
     late_var = RECEIVER_LAG_S * RECEIVER_LAG_S * s.hard_accel_sq
     # All components are checked before any is used, because a glitch affects all of them.
-    for k in range(3):
+    for k in range(2 if is_accel_degraded(s) else 3):
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
             variance = velocity_variance(s, p, row, accel_n, k, since_s)

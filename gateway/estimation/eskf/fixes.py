@@ -24,8 +24,11 @@ from gateway.estimation.eskf.alignment import (
 )
 from gateway.estimation.eskf.faults import gap_limit_s
 from gateway.estimation.eskf.fix_model import (
+    LEAST_FIX_INTERVAL_S,
     is_unlikely,
     past_state,
+    position_row,
+    position_variance,
     set_error_variances,
     update_fix,
 )
@@ -44,7 +47,7 @@ from gateway.estimation.eskf.state import (
     reset_state,
     reset_states,
 )
-from gateway.estimation.eskf.update import restart_baro
+from gateway.estimation.eskf.update import inject, restart_baro, update_scalar
 from gateway.estimation.record import FloatArray, as_vec, write_vec
 from gateway.geometry.geodesy import displacement_m, offset_deg
 from gateway.geometry.quaternion import difference, is_below, norm_sq
@@ -98,6 +101,7 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
     if arrival_s - s.imu_s > gap_limit_s(s):
         # Without an IMU, the state is that of the fix.
         if s.aided == 1:
+            s.aided = s.has_height = 0
             restart_at(s, p, pos, vel, arrival_s - wanted_s)
             s.fix_s = arrival_s
         return
@@ -121,7 +125,7 @@ def use_fix(
 ) -> None:
     """Copy, restart at or fuse a fix that is `lag` seconds old."""
     if s.heading_known == 0:
-        follow_fix(s, pos, lag)
+        follow_fix(s, p, row, pos, lag)
     elif s.aided == 0:
         restart_at(s, p, pos, vel, lag)
         accept_fix(s)
@@ -257,6 +261,7 @@ def fuse_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, lag: flo
     start_height(s, p, pos[2] + s.vel_n[2] * lag)
     past_pos, past_vel = past_state(s, lag)
     off_pos = difference(difference(pos, past_pos), as_vec(s.gps_error_n))
+    past_vel = (past_vel[0], past_vel[1], past_vel[2] + s.gps_climb_error_mps)
     off_vel = difference(vel, past_vel)
     far = math.hypot(off_pos[0], off_pos[1]) >= p.gate_m and is_unlikely(s, p, row, off_pos, lag)
     agreed = far and have_agreed(s, p, pos, vel)
@@ -280,22 +285,37 @@ def have_agreed(s: State, p: Gains, pos: Vec3, vel: Vec3) -> bool:
 
 
 @compiled
-def follow_fix(s: State, pos: Vec3, lag: float) -> None:
-    """Set the position to an extrapolated fix, which cannot be fused without a heading."""
+def follow_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, lag: float) -> None:
+    """Set the position to an extrapolated fix, which cannot be fused without a heading.
+
+    Its height moves the height and the offset of the barometer as one of many.
+    """
+    since_s = max(s.time_s - s.fix_s, LEAST_FIX_INTERVAL_S)
     s.fix_s = s.time_s
-    for k in range(3):
-        moved = s.fix_vel[k] * lag
-        if k < 2 or (s.baro_s == NEVER_S and math.isfinite(pos[2])):
-            s.pos_n[k] = pos[k] + (moved if math.isfinite(moved) else 0.0)
+    for k in range(2):
+        s.pos_n[k] = pos[k] + (s.fix_vel[k] * lag if math.isfinite(s.fix_vel[k]) else 0.0)
+    down_m = pos[2] + (s.fix_vel[2] * lag if math.isfinite(s.fix_vel[2]) else 0.0)
+    if s.has_height == 0:
+        start_height(s, p, down_m)
+    elif math.isfinite(down_m):
+        propagate(s, p)
+        position_row(s, 2, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+        off_m = down_m - s.pos_n[2] - s.gps_error_n[2]
+        update_scalar(s, off_m, position_variance(s, p, row, 2, since_s), p.gate_sq)
+        inject(s)
 
 
 @compiled
 def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
-    """Set position and velocity from one fix, `lag` seconds old; NaN for missing components."""
+    """Set position and velocity from one fix, `lag` seconds old; NaN for missing components.
+
+    A climb that is estimated already is kept.
+    """
     propagate(s, p)
     sound = is_below(vel, FASTEST_MPS)
-    reset_states(s, VEL, FIRST_VELOCITY_VAR if sound else NO_VELOCITY_VAR)
-    write_vec(s.vel_n, vel if sound else (0.0, 0.0, 0.0))
+    for k in range(3 - s.aided):
+        reset_state(s, VEL + k, FIRST_VELOCITY_VAR if sound else NO_VELOCITY_VAR)
+        s.vel_n[k] = vel[k] if sound else 0.0
     for k in range(2):
         start_position(s, k, pos[k] + s.vel_n[k] * lag, p.gps_position_var)
     start_height(s, p, pos[2] + s.vel_n[2] * lag)

@@ -7,9 +7,9 @@ and `dt` the time, the error state obeys [1]_
     vel' = vel + att x f - R accel_bias
     pos' = pos + vel dt
 
-Corrections of the gyroscope bias are white if the model is correct. A bias that steps or drifts is
-repeatedly corrected in one direction: the significant part of the recent corrections becomes
-process noise of the bias [2]_.
+Corrections of the watched states, the biases and the barometer's offset, are white if the model is
+correct. A bias that steps or drifts, or a barometer that is stuck, is repeatedly corrected in one
+direction: the significant part of the recent corrections becomes process noise [2]_.
 
 References
 ----------
@@ -31,6 +31,7 @@ from gateway.estimation.eskf.state import (
     ATT,
     BARO_OFFSET,
     GAINED,
+    GPS_CLIMB,
     GPS_ERROR,
     GYRO_BIAS,
     GYRO_SCALE,
@@ -42,10 +43,12 @@ from gateway.estimation.eskf.state import (
     POS,
     STATES,
     VEL,
+    WATCHED,
     State,
     limit_variance,
     raise_variance,
     scale_state,
+    watched_state,
 )
 from gateway.estimation.record import FloatArray, as_quat, as_vec, write_quat, write_vec
 from gateway.geometry.quaternion import (
@@ -71,8 +74,20 @@ BIAS_MEMORY_S: Final = 20.0
 """Time constant of the sum of corrections of the gyroscope bias."""
 BIAS_CHANCE_SQ: Final = 6.0
 """Squared sum, in variances, above which it is significant: chi-squared with 1 degree, 98.6 %."""
+ACCEL_CHANCE_SQ: Final = 25.0
+"""The same for the accelerometer, whose vertical corrections are also due to GPS and barometer."""
+LIMIT_VARS: Final = (1.0, 25.0)
+"""Largest raised variances of the accelerometer bias, m2/s4: a scale error of a tenth, and of the
+barometer's offset, m2."""
 BIAS_RAISE_S: Final = 0.3
-"""Time in which the significant part is added to the variance of the bias."""
+ACCEL_RAISE_S: Final = 0.5
+BARO_RAISE_S: Final = 6.0
+"""Times in which the significant part is added to the variances. The barometer's offset is slow,
+because height corrections in one direction may also be due to a bad accelerometer."""
+BAD_ACCEL_SQ: Final = 36.0
+"""Squared sum, in variances, above which the accelerometer is degraded."""
+USUAL_BIAS_MPS2: Final = 0.8
+"""Largest bias of a sound accelerometer: 80 mg, the tolerance of an MPU6050."""
 BLEND_S: Final = 1.0
 """Time constant with which a corrected position is blended in after a gap."""
 STEP_LIMIT: Final = 1e4
@@ -128,7 +143,7 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
         if s.aided == 1:
             s.pos_n[k] += (s.vel_n[k] + 0.5 * a * dt) * dt
             s.vel_n[k] += a * dt
-        elif k < 2 and s.time_s - s.fix_s < FRESH_GPS_S:
+        elif k < 2 and s.time_s - s.fix_s < FRESH_GPS_S and math.isfinite(s.fix_vel[k]):
             # Without a heading, fixes cannot be fused: extrapolate the position by its velocity.
             s.pos_n[k] += s.fix_vel[k] * dt
     for k in range(2):
@@ -236,8 +251,6 @@ def propagate(s: State, p: Gains) -> None:
     for k in range(3):
         s.P[ATT + k, ATT + k] += angle_var + p.gyro_density * dt
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_density * dt
-        limit = max(p.gyro_bias_var - s.P[GYRO_BIAS + k, GYRO_BIAS + k], 0.0)
-        raise_variance(s, GYRO_BIAS + k, min(unexpected_bias_density(s, k) * dt, limit))
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_density * dt
         s.P[HARD_IRON + k, HARD_IRON + k] += p.hard_iron_density * dt
         if s.aided == 1:
@@ -248,9 +261,16 @@ def propagate(s: State, p: Gains) -> None:
         s.gps_error_n[k] *= kept
     if s.aided == 0:
         s.P[POS + 2, POS + 2] += CLIMB_DENSITY * dt
-    s.P[BARO_OFFSET, BARO_OFFSET] += p.baro_density * dt
+    speed_sq = norm_sq(as_vec(s.vel_n))
+    s.P[BARO_OFFSET, BARO_OFFSET] += (
+        p.baro_density + p.baro_dynamic_density * speed_sq * speed_sq
+    ) * dt
+    kept = math.exp(-dt / p.gps_climb_error_s)
+    scale_state(s.P, GPS_CLIMB, kept)
+    s.P[GPS_CLIMB, GPS_CLIMB] += s.gps_climb_error_var * (1.0 - kept * kept)
+    s.gps_climb_error_mps *= kept
     limit_variance(s.P, ATT + 2, NO_HEADING_VAR)
-    follow_bias_steps(s, dt)
+    follow_bias_steps(s, p, dt)
     s.pending_s = 0.0
     s.pending_noise[:] = 0.0
     s.pending_force_n[:] = 0.0
@@ -311,14 +331,43 @@ def symmetrise(P: FloatArray) -> None:
 
 
 @compiled
-def unexpected_bias_density(s: State, k: int) -> float:
-    """Return the process noise of one axis of the bias beyond the model, (rad/s)2/s."""
-    return float(max(s.bias_sum[k] ** 2 / BIAS_CHANCE_SQ - s.bias_sum_var[k], 0.0) / BIAS_RAISE_S)
+def unexpected_density(s: State, k: int) -> float:
+    """Return the process noise of a watched state beyond the model, its unit squared per s.
+
+    That of the accelerometer grows with its variance, since a new error of its scale moves the
+    height by metres within seconds.
+    """
+    chance_sq = ACCEL_CHANCE_SQ if 3 <= k < 6 else BIAS_CHANCE_SQ
+    excess = max(s.bias_sum[k] ** 2 / chance_sq - s.bias_sum_var[k], 0.0)
+    if k < 3:
+        return float(excess / BIAS_RAISE_S)
+    if k == WATCHED - 1 or excess == 0.0:
+        return float(excess / BARO_RAISE_S)
+    bias_var = s.P[GYRO_BIAS + k, GYRO_BIAS + k]
+    return float(excess / s.bias_sum_var[k] * bias_var / ACCEL_RAISE_S)
 
 
 @compiled
-def follow_bias_steps(s: State, dt: float) -> None:
-    """Fade the sums, which start once a known attitude was corrected for `BIAS_MEMORY_S`."""
+def is_accel_degraded(s: State) -> bool:
+    """Return whether the accelerometer bias is unusual, or was corrected in one direction."""
+    unusual = False
+    for k in range(3):
+        unusual = unusual or abs(s.accel_bias_b[k]) > USUAL_BIAS_MPS2
+        unusual = unusual or s.bias_sum[3 + k] ** 2 > BAD_ACCEL_SQ * s.bias_sum_var[3 + k]
+    return unusual
+
+
+@compiled
+def follow_bias_steps(s: State, p: Gains, dt: float) -> None:
+    """Raise the variances of the watched states by the significant part of their sums.
+
+    The sums fade; they start once a known attitude was corrected for `BIAS_MEMORY_S`.
+    """
+    for k in range(WATCHED):
+        i = watched_state(k)
+        most = p.gyro_bias_var if k < 3 else LIMIT_VARS[k // 3 - 1]
+        limit = max(most - s.P[i, i], 0.0)
+        raise_variance(s, i, min(unexpected_density(s, k) * dt, limit))
     known = s.lost == 0 and s.heading_known == 1
     s.bias_watch_s = min(s.bias_watch_s + dt, BIAS_MEMORY_S) if known else 0.0
     if min(s.bias_watch_s, s.sound_s) < BIAS_MEMORY_S:
@@ -326,6 +375,6 @@ def follow_bias_steps(s: State, dt: float) -> None:
         s.bias_sum_var[:] = 0.0
         return
     kept = math.exp(-dt / BIAS_MEMORY_S)
-    for k in range(3):
+    for k in range(WATCHED):
         s.bias_sum[k] *= kept
         s.bias_sum_var[k] *= kept * kept

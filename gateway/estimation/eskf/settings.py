@@ -1,14 +1,17 @@
 """Settings of the filter, also as variances and densities in SI units."""
 
 import math
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 
 from gateway.estimation.record import filled_record
 from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.settings import Settings, setting
-from gateway.units import RAD_PER_DEG
+from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
+
+DYNAMIC_S: Final = 30.0
+"""Correlation time of the barometer's error by dynamic pressure: wind and sideslip change."""
 
 
 class EskfSettings(Settings, frozen=True):
@@ -128,6 +131,12 @@ class EskfSettings(Settings, frozen=True):
     gps_climb_mps: Annotated[
         float, setting("Noise of the GPS velocity, vertical.", "m/s", ge=0.01, le=10.0)
     ] = 0.25
+    gps_climb_error_mps: Annotated[
+        float, setting("Slow error of the vertical GPS velocity.", "m/s", ge=0.0, le=10.0)
+    ] = 0.3
+    gps_climb_error_s: Annotated[
+        float, setting("Correlation time of that error.", "s", ge=1.0, le=3600.0)
+    ] = 50.0
     gps_correlation_s: Annotated[
         float,
         setting(
@@ -170,7 +179,11 @@ class EskfSettings(Settings, frozen=True):
     ] = 0.26
     baro_walk_mprs: Annotated[
         float, setting("Random walk of the barometer's offset.", "m/sqrt(s)", ge=0.0, le=5.0)
-    ] = 1.2
+    ] = 0.5
+    baro_dynamic: Annotated[
+        float,
+        setting("Share of the dynamic pressure that acts on the barometer.", ge=0.0, le=1.0),
+    ] = 0.2
     dead_reckoning_s: Annotated[
         float,
         setting("Longest dead reckoning without GPS.", "s", ge=1.0, le=600.0),
@@ -235,6 +248,8 @@ class Gains:
     gps_error_s: float
     gps_velocity_var: float
     gps_climb_var: float
+    gps_climb_error_var: float
+    gps_climb_error_s: float
     gps_jitter_sq: float
     gps_correlation_s: float
     gps_latency_s: float
@@ -251,6 +266,7 @@ class Gains:
     """NaN if it is looked up at the position of a fix."""
     baro_var: float
     baro_density: float
+    baro_dynamic_density: float
     dead_reckoning_s: float
     gate_sq: float
     gate_m: float
@@ -264,10 +280,11 @@ class Gains:
 def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
     """Convert the settings to SI units; those with the same name are already in SI units."""
     same = msgspec.structs.asdict(reference) | msgspec.structs.asdict(settings)
-    return filled_record(Gains, same | _variances(settings, reference))
+    same["declination_rad"] = EarthField(reference).declination_rad
+    return filled_record(Gains, same | _variances(settings))
 
 
-def _variances(s: EskfSettings, reference: ReferenceSettings) -> dict[str, float]:
+def _variances(s: EskfSettings) -> dict[str, float]:
     return {
         "gyro_density": (s.gyro_noise_degprs * RAD_PER_DEG) ** 2,
         "gyro_vibration_sq": s.gyro_vibration**2,
@@ -293,6 +310,7 @@ def _variances(s: EskfSettings, reference: ReferenceSettings) -> dict[str, float
         "gps_height_error_var": s.gps_height_error_m**2,
         "gps_velocity_var": s.gps_velocity_mps**2,
         "gps_climb_var": s.gps_climb_mps**2,
+        "gps_climb_error_var": s.gps_climb_error_mps**2,
         "gps_jitter_sq": s.gps_jitter_s**2,
         "mag_var": (s.mag_noise_deg * RAD_PER_DEG) ** 2,
         "mag_latency_var": s.mag_latency_std_s**2,
@@ -300,8 +318,10 @@ def _variances(s: EskfSettings, reference: ReferenceSettings) -> dict[str, float
         "hard_iron_uncalibrated_var": s.hard_iron_uncalibrated_ut**2,
         "hard_iron_density": s.hard_iron_walk_utprs**2,
         "field_dip_tolerance_rad": math.radians(s.field_dip_tolerance_deg),
-        "declination_rad": EarthField(reference).declination_rad,
         "baro_var": s.baro_noise_m**2,
         "baro_density": s.baro_walk_mprs**2,
+        "baro_dynamic_density": 2.0
+        / DYNAMIC_S
+        * (s.baro_dynamic * 0.5 / STANDARD_GRAVITY_MPS2) ** 2,
         "gate_sq": s.gate_sigma**2,
     }

@@ -16,6 +16,7 @@ The error state, in the order of the covariance's rows:
 | GYRO_SCALE | relative scale error of each gyroscope axis | body |
 | BARO_OFFSET | offset added to the barometer's depth | m |
 | MAG_LATENCY | age of the field in a magnetometer sample | s |
+| GPS_CLIMB | slow (Gauss-Markov) error of the vertical GPS velocity | down, m/s |
 """
 
 import math
@@ -34,7 +35,10 @@ HARD_IRON: Final = 18
 GYRO_SCALE: Final = 21
 BARO_OFFSET: Final = 24
 MAG_LATENCY: Final = 25
-STATES: Final = 26
+GPS_CLIMB: Final = 26
+STATES: Final = 27
+WATCHED: Final = 7
+"""Number of states whose corrections are tested: both biases, and the barometer's offset."""
 MOVING_STATES: Final = 9
 """Attitude, velocity and position: the states that the transition changes."""
 
@@ -69,6 +73,7 @@ class State:
     gyro_scale_b: Annotated[FloatArray, (3,)]
     baro_offset_m: float
     mag_latency_s: float
+    gps_climb_error_mps: float
     P: Annotated[FloatArray, (STATES, STATES)]
 
     # Working memory of a measurement update.
@@ -162,6 +167,7 @@ class State:
     zero_velocity_wrong: int
     """1 while positions contradict a velocity of exactly zero."""
     gps_error_var: Annotated[FloatArray, (3,)]
+    gps_climb_error_var: float
     pos_density: Annotated[FloatArray, (3,)]
     """Position noise due to slow errors of GPS velocities, m2/s."""
     reject_s: float
@@ -292,9 +298,9 @@ class State:
     """Bits of uncalibrated sensors: 1 gyroscope, 2 accelerometer, 4 magnetometer."""
 
     # Bias steps, see `integrity`.
-    bias_sum: Annotated[FloatArray, (3,)]
-    bias_sum_var: Annotated[FloatArray, (3,)]
-    """Sums of recent corrections of the gyroscope bias, and their expected variances."""
+    bias_sum: Annotated[FloatArray, (WATCHED,)]
+    bias_sum_var: Annotated[FloatArray, (WATCHED,)]
+    """Sums of recent corrections of the watched states, and their expected variances."""
     bias_watch_s: float
 
     # For the smoother: discontinuities of the covariance since the start.
@@ -302,6 +308,12 @@ class State:
     """Number of resets of each state."""
     raised: Annotated[FloatArray, (STATES,)]
     """Variance added to each state outside the process model."""
+
+
+@compiled
+def watched_state(k: int) -> int:
+    """Return the state of one of the watched numbers."""
+    return GYRO_BIAS + k if k < WATCHED - 1 else BARO_OFFSET
 
 
 @compiled

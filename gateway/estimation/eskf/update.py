@@ -29,6 +29,7 @@ from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
     ATT,
     BARO_OFFSET,
+    GPS_CLIMB,
     GPS_ERROR,
     GYRO_BIAS,
     GYRO_SCALE,
@@ -37,7 +38,9 @@ from gateway.estimation.eskf.state import (
     POS,
     STATES,
     VEL,
+    WATCHED,
     State,
+    watched_state,
 )
 from gateway.estimation.record import as_quat, as_vec, write_quat
 from gateway.geometry.quaternion import (
@@ -117,9 +120,13 @@ def update_scalar(s: State, innovation: float, variance: float, gate_sq: float) 
     for j in range(STATES):
         innovation -= s.h[j] * s.dx[j]
     total = max(innovation_variance(s, variance), innovation * innovation / gate_sq)
-    for k in range(3):
-        if s.considered[GYRO_BIAS + k] == 0.0:
-            column = s.Ph[GYRO_BIAS + k]
+    # The other rows cannot distinguish the accelerometer bias from tilt.
+    vertical = s.h[VEL + 2] != 0.0 or s.h[POS + 2] != 0.0
+    for k in range(WATCHED):
+        i = watched_state(k)
+        tests = k < 3 or (vertical if i != BARO_OFFSET else s.h[i] != 0.0)
+        if tests and s.considered[i] == 0.0:
+            column = s.Ph[i]
             s.bias_sum[k] += column * innovation / total
             s.bias_sum_var[k] += column * column / total
     P, u, considered, std = s.P, s.Ph, s.considered, math.sqrt(total)
@@ -152,6 +159,7 @@ def inject(s: State) -> None:
         s.gyro_scale_b[k] += d[GYRO_SCALE + k]
     s.baro_offset_m += d[BARO_OFFSET]
     s.mag_latency_s += d[MAG_LATENCY]
+    s.gps_climb_error_mps += d[GPS_CLIMB]
     d[:] = 0.0
 
 
