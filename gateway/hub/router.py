@@ -219,7 +219,9 @@ class Router:
         there = self._table.systems(other_id)
         match reach:
             case Reach.STATIONS:
-                return there.has_station and there.has_only_stations
+                only = self._clients[other_id].endpoint.systems.only
+                is_for_same = bool(only) and only <= client.endpoint.systems.only
+                return is_for_same or (there.has_station and there.has_only_stations)
             case Reach.DISPLAYS:
                 return not there.are_only_others(frame.origin[0])
             case Reach.SELECTED:

@@ -45,8 +45,8 @@ class Reach(Enum):
 
     NOWHERE = auto()
     STATIONS = auto()
-    """Those on which only ground stations are received; an addressed frame also goes to a program
-    that has addressed a selected system."""
+    """Those on which only ground stations are received, and those that select no other systems; an
+    addressed frame also goes to a program that has addressed a selected system."""
     DISPLAYS = auto()
     """All but those on which only other vehicles are received."""
     SELECTED = auto()

@@ -278,6 +278,22 @@ class TestHub:
         await self.say(rig, (second, command(1), 2, 1), (first, command(2), 1, 1))
         assert (1, 76) not in self.origins(second)
 
+    @pytest.mark.parametrize(
+        ("companion", "drone", "passes"),
+        [("systems=3", "systems=3", True), ("systems=3", "", False), ("", "", True)],
+    )
+    async def test_pose_of_a_companion_reaches_the_endpoint_of_its_vehicle(
+        self, rig: Any, companion: str, drone: str, passes: bool
+    ) -> None:
+        _, first, second, seat = await self.open(rig, companion, drone)
+        await self.say(rig, (first, heartbeat(18, 8), 3, 191), (second, heartbeat(), 3, 1))
+        await self.say(rig, (seat, heartbeat(), 2, 1))
+        for each in (first, second, seat):
+            each.received()
+        await self.say(rig, (first, ODOMETRY, 3, 191))
+        assert self.origins(second) == ([(3, 102)] if passes else [])
+        assert self.origins(seat) == ([] if companion else [(3, 102)])
+
     async def test_heartbeat_of_a_station_with_the_id_of_a_vehicle_changes_nothing(
         self, rig: Any
     ) -> None:
