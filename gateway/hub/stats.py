@@ -81,6 +81,8 @@ class ClientStats:
     """Frames sent to a port without a listener; they do not count as loss."""
     refused: int = 0
     """Frames that could not be renumbered."""
+    receives: bool = True
+    """Whether it can send anything; an output of another format cannot."""
     cached: tuple[str, ...] = ()
     """The kept answers of the systems behind it, with their ages; see `AnswerCache.describe`."""
     note: str = ""

@@ -82,7 +82,8 @@ def other_gateways() -> list[Gateway]:
 def log_other_gateways() -> None:
     """Log the other gateways that run."""
     for other in other_gateways():
-        log.warning("another gateway runs here: %s", other)
+        # No fault: a fleet on one machine is two gateways. `conflicts` are warned of.
+        log.info("another gateway runs here: %s", other)
 
 
 def conflicts(systems: Collection[int], endpoints: Iterable[str]) -> list[str]:

@@ -89,7 +89,8 @@ class Output(Client):
     def stats(self, *args: Any, **kwargs: Any) -> ClientStats:
         """Return the present figures, with the state of the carrier."""
         found = super().stats(*args, **kwargs)
-        return replace(found, state=self.carrier.state, reason=self.carrier.reason)
+        carrier = self.carrier
+        return replace(found, state=carrier.state, reason=carrier.reason, receives=False)
 
     def heard(self, now_us: int) -> dict[int, NewestState]:
         """Return the selected vehicle, or all recently received ones, by system id."""

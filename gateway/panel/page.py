@@ -4,6 +4,8 @@ A view is one entry of `VIEWS`; see `view_context.py` for the interface of its f
 """
 
 import math
+from collections.abc import Mapping
+from functools import partial
 from typing import Any, Final
 
 from nicegui import ui
@@ -22,9 +24,12 @@ from gateway.panel.views.plots_view import PlotsView
 from gateway.panel.views.recordings_view import RecordingsView
 from gateway.panel.views.tuning_view import TuningView
 from gateway.panel.widgets import notify_failure
-from gateway.printable import printable
+from gateway.printable import NO_RECEIVER, printable, receiver_state
+from gateway.units import counted
 
 STATE_S: Final = 0.5
+PANEL_CLIENT: Final = "panel"
+"""Name of the panel's own port and client at the gateway."""
 SILENT_S: Final = 3.0
 THEMES: Final = {None: "brightness_auto", False: "light_mode", True: "dark_mode"}
 
@@ -68,10 +73,12 @@ class _Page:
         self._dark = ui.dark_mode(None)
         self._names: dict[int, str] = {}
         self._chips: list[tuple[str, str]] = []
+        self._shown_lines: list[str] = []
         with ui.element("div").classes("shell") as self._shell:
             self._build_head()
             with ui.element("div").classes("banners"):
                 self._build_playback_bar()
+                self._build_waiting()
                 build_banner(self._context)
             self._build_rail()
             with ui.element("div").classes("stage"):
@@ -124,6 +131,28 @@ class _Page:
             back.props("no-caps dense unelevated color=white text-color=black")
         self._bar.set_visibility(False)
 
+    def _build_waiting(self) -> None:
+        """Build the card that is shown before the first aircraft, with the ways to add one."""
+        with ui.element("div").classes("card padded waiting").props("data-role=waiting") as card:
+            self._waiting, self._waiting_lines = card, ui.element("div")
+            if self._context.may_change:
+                link = ui.button("Add a source by its URL, or a phone by its QR code")
+                link.on_click(partial(self._go, "link")).props("no-caps dense")
+
+    def _go(self, key: str) -> None:
+        self._rail.run_method("show", key)
+
+    def _show_waiting(self) -> None:
+        is_waiting = not self._context.vehicles
+        self._waiting.set_visibility(is_waiting)
+        lines = waiting_lines(self._context.parts.watch.status) if is_waiting else []
+        if lines != self._shown_lines:
+            self._shown_lines = lines
+            self._waiting_lines.clear()
+            with self._waiting_lines:
+                for line in lines:
+                    ui.label(printable(line))
+
     def _on_back(self) -> None:
         self._context.playback.close()
         self._refresh()
@@ -171,6 +200,7 @@ class _Page:
             first = next(iter(names), None)
             self._choice.set_options(names, value=wanted if wanted in names else first)
         self._show_playback()
+        self._show_waiting()
         if (chips := _state_of(context)) != self._chips:
             self._chips = chips
             self._state.clear()
@@ -197,12 +227,41 @@ def _clock(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
+def waiting_lines(status: Mapping[str, Any] | None) -> list[str]:
+    """Describe what is configured and what was received while there is no aircraft."""
+    if status is None:
+        return ["No aircraft yet, and no gateway runs on this machine: start `mavgate run`."]
+    report, sources = status["report"], status["report"]["sources"]
+    state = (report["port"], report["connected"], report["bytes_received"], report["frames"])
+    configured = [receiver_state(*state), *(f"source {one['url']}" for one in sources)]
+    ports = [one["name"] for one in status["listeners"] if one["name"] != PANEL_CLIENT]
+    configured += [f"listening on {name}" for name in ports]
+    received = [("receiver", report["frames"], "frame")]
+    received += [(one["url"], one["records"], "record") for one in sources]
+    received += [
+        (one["name"], one["received"], "frame")
+        for one in status["clients"]
+        if not one["name"].startswith(PANEL_CLIENT)
+    ]
+    counts = [f"{counted(count, noun)} of {name}" for name, count, noun in received if count]
+    return [
+        "No aircraft yet.",
+        f"Configured: {'; '.join(filter(None, configured)) or 'no receiver, source or port'}.",
+        f"Received: {'; '.join(counts) or 'nothing'}.",
+    ]
+
+
 def _mode_of(context: ViewContext) -> str:
     """Return the source of the data."""
     status = context.parts.watch.status
     if status is None:
         return "MAVLink"
-    return "simulation" if status["simulated"] else "serial"
+    if status["simulated"]:
+        return "simulation"
+    report = status["report"]
+    if report["port"] != NO_RECEIVER:
+        return "serial"
+    return "sources" if report["sources"] else "router"
 
 
 def _state_of(context: ViewContext) -> list[tuple[str, str]]:

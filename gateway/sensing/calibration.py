@@ -54,7 +54,7 @@ class NodeCalibration(Settings, frozen=True):
         _Rows,
         setting(
             "Rotation from accelerometer and gyroscope axes to body FRD: rows of the matrix in "
-            "this file, angles as parameters.",
+            "settings files, angles as parameters.",
             rotation=True,
         ),
     ] = FACE_UP
@@ -72,8 +72,8 @@ class NodeCalibration(Settings, frozen=True):
     mag_mounting: Annotated[
         _Rows,
         setting(
-            "Rotation from magnetometer axes to body FRD: rows of the matrix in this file, angles "
-            "as parameters.",
+            "Rotation from magnetometer axes to body FRD: rows of the matrix in settings files, "
+            "angles as parameters.",
             rotation=True,
         ),
     ] = FACE_UP

@@ -87,7 +87,7 @@ async def test_start_next_to_others_names_their_process_and_socket(
     listen: Open, caplog: pytest.LogCaptureFixture
 ) -> None:
     await listen("run", 1)
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(logging.INFO, "gateway.live.other_gateways"):
         await asyncio.to_thread(log_other_gateways)
     (line,) = caplog.messages
     assert "another gateway runs here: pid 1, since 2027-01-15 08:00:00 UTC, socket" in line

@@ -84,9 +84,9 @@ def _gps(vehicle: VehicleState, now_us: int) -> list[Alert]:
         return []
     age_us = vehicle.state.age_us(now_us, "GPS_RAW_INT")
     if age_us > FIX_OLD_US:
-        detail = f"nothing from the receiver for {age_us // US_PER_S:.0f} s"
+        detail = f"nothing from the GPS for {age_us // US_PER_S:.0f} s"
     elif vehicle.state.fields["GPS_RAW_INT"]["fix_type"] < mavlink.GPS_FIX_TYPE_2D_FIX:
-        detail = "the receiver has no fix"
+        detail = "the GPS has no fix"
     else:
         return []
     return [Alert("gps", AlertLevel.CRITICAL, "GPS lost", detail)]

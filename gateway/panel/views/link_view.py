@@ -19,8 +19,8 @@ from gateway.panel.widgets import (
     heading,
     notify_failure,
 )
-from gateway.printable import UNKNOWN, figure, printable, receiver_state, source_state
-from gateway.records import RadioState, channel_name
+from gateway.printable import NO_RECEIVER, UNKNOWN, figure, printable, receiver_state
+from gateway.records import NodeId, RadioState, board_name, channel_name
 from gateway.units import US_PER_S, counted
 
 REFRESH_S: Final = 1.0
@@ -39,6 +39,10 @@ LOSS_WARN: Final = 5.0
 LOSS_BAD: Final = 20.0
 """Loss of payloads, percent, above which the estimators mostly extrapolate."""
 
+NEW_ENDPOINT: Final = "udp:192.168.1.7:14550, or a source: crsf:/dev/ttyUSB0"
+CLIENT_COLUMNS: Final = (
+    "Client", "State", "Sent", "Rate", "Dropped", "Received", "Round trip", "Heard", "Trust"
+)  # fmt: skip
 NODE_COLUMNS: Final = (
     "Node", "Rate", "Received", "Lost", "Loss", "Restarts", "Clock", "Age", "Chips"
 )  # fmt: skip
@@ -57,14 +61,17 @@ class LinkView:
             with ui.element("div").classes("card padded wide"):
                 heading("Receiver")
                 self._receiver = ui.label(UNKNOWN).classes("figure").props("data-role=receiver")
-                self._sources = ui.label().classes("figure").props("data-role=sources")
-                self._sources.style("white-space: pre-line")
                 if context.may_change:
                     self._build_serial()
                 self._nodes = DataTable(
                     NODE_COLUMNS,
                     "No node was received.",
                 ).props("data-role=nodes")
+            with ui.element("div").classes("card padded wide"):
+                heading("Sources")
+                self._sources = DataTable(
+                    ("Source", "State", "Records", "Newest", "Faults"), "No source is configured."
+                ).props("data-role=sources")
             with ui.element("div").classes("card padded wide"):
                 heading("Clients")
                 self._build_clients()
@@ -85,14 +92,14 @@ class LinkView:
     def _build_clients(self) -> None:
         may = self._context.may_change
         self._clients = DataTable(
-            ("Client", "State", "Sent", "Rate", "Dropped", "Received", "Trip", "Heard", "Trust"),
+            CLIENT_COLUMNS,
             "No client.",
             buttons=[RowButton("close", "Remove this client", self._ask_remove)] if may else (),
         )
         if may:
             with ui.element("div").classes("line"):
-                self._url = ui.input(placeholder="udp:192.168.1.7:14550").props(
-                    'dense outlined aria-label="Endpoint of a new client"'
+                self._url = ui.input(placeholder=NEW_ENDPOINT).props(
+                    'dense outlined aria-label="Endpoint of a new client or source"'
                 )
                 ui.button("Add", on_click=self._add).props("no-caps")
 
@@ -196,19 +203,21 @@ class LinkView:
         status = watch.status
         if status is None:
             self._receiver.set_text("No gateway runs on this machine.")
-            for table in (self._nodes, self._clients, self._ports):
+            for table in (self._nodes, self._sources, self._clients, self._ports):
                 table.show({})
             return
         self._receiver.set_text(_receiver_line(status))
-        found = [source_state(each, status["time_us"]) for each in status["report"]["sources"]]
-        self._sources.set_text("\n".join(found))
+        self._nodes.set_visibility(status["report"]["port"] != NO_RECEIVER)
         now_us = status["report"]["time_us"]
-        boards = {_name_of(b): b for one in status["aircraft"] for b in one["boards"]}
+        boards = {_key_of(b): b for one in status["aircraft"] for b in one["boards"]}
         self._nodes.show(
             {
-                (name := _name_of(node)): _node_row(node, now_us, boards.get(name))
+                (key := _key_of(node)): _node_row(node, now_us, boards.get(key))
                 for node in status["report"]["nodes"]
             }
+        )
+        self._sources.show(
+            {source["url"]: _source_row(source, now_us) for source in status["report"]["sources"]}
         )
         before = {} if watch.before is None else _sent_by_client(watch.before)
         span_s = (status["time_us"] - (watch.before or status)["time_us"]) / US_PER_S
@@ -270,8 +279,12 @@ def _receiver_line(status: Record) -> str:
     return " · ".join(parts)
 
 
-def _name_of(node: Record) -> str:
+def _key_of(node: Record) -> str:
     return f"{node['node']['vehicle_id']}.{node['node']['node_id']}"
+
+
+def _name_of(node: Record, board: Record | None) -> str:
+    return board_name(NodeId(**node["node"]), board["sensors_present"] if board else 0)
 
 
 def _node_row(node: Record, now_us: int, board: Record | None) -> Cells:
@@ -283,7 +296,7 @@ def _node_row(node: Record, now_us: int, board: Record | None) -> Cells:
     if (signal := node["signal"]) is not None:
         rate += f", {signal['rssi_dbm']} dBm, SNR {signal['snr_db']:.0f} dB"
     return (
-        _name_of(node),
+        _name_of(node, board),
         rate,
         str(node["received"]),
         str(node["lost"]),
@@ -292,6 +305,21 @@ def _node_row(node: Record, now_us: int, board: Record | None) -> Cells:
         figure(node["clock_skew_ppm"], "+.0f", "ppm"),
         (f"{age_us / US_PER_S:.1f} s", "bad" if age_us > SILENT_US else "good"),
         ", ".join(board["chips"]) if board is not None else UNKNOWN,
+    )
+
+
+def _source_row(source: Record, now_us: int) -> Cells:
+    age = UNKNOWN
+    if source["last_time_us"] is not None:
+        age = f"{max(0, now_us - source['last_time_us']) / US_PER_S:.1f} s ago"
+    faults = ", ".join(f"{count} {kind}" for kind, count in source["faults"])
+    state = ("connected", "good") if source["connected"] else (printable(source["reason"]), "bad")
+    return (
+        printable(source["url"]),
+        state,
+        str(source["records"]),
+        age,
+        (faults or "none", "warn" if faults else ""),
     )
 
 
@@ -305,15 +333,21 @@ def _client_row(client: Record, now_us: int, before: dict[int, int], span_s: flo
     if sent_before is not None and span_s > 0:
         rate = f"{(client['sent'] - sent_before) / span_s:.0f} Hz"
     heard_us, trip_us = client["heard_us"], client["round_trip_us"]
-    is_open = client["state"] == "open"
+    # A client that has not answered yet is no fault: the panel's own is one for a second.
+    kind = {"open": "good", "unproven": ""}.get(client["state"], "bad")
+    heard = "never" if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.0f} s ago"
+    trust = "may change" if client["trusted"] else "may look"
+    if not client["receives"]:
+        # An output.
+        heard = trust = UNKNOWN
     return (
         client["name"],
-        (client["reason"] or client["state"], "good" if is_open else "bad"),
+        (client["reason"] or client["state"], kind),
         str(client["sent"]),
         rate,
         (str(client["dropped"]), "warn" if client["dropped"] else ""),
         str(client["received"]),
         figure(trip_us and trip_us / 1000, ".1f", "ms"),
-        "never" if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.0f} s ago",
-        "may change" if client["trusted"] else "may look",
+        heard,
+        trust,
     )

@@ -414,6 +414,8 @@ export default {
         craft.turned_ms = now_ms;
       }
       for (const id of Object.keys(this.aircraft)) if (!(id in mavgate.vehicles)) this.discard(id);
+      // Before the first position there is no ground.
+      this.fine.visible = this.coarse.visible = Boolean(this.origin);
       const mark = mavgate.state?.mark;
       this.beacon.visible = Boolean(mark && this.origin);
       if (this.beacon.visible) this.beacon.position.copy(this.place(mark.lat_deg, mark.lon_deg, this.origin.alt + 30));

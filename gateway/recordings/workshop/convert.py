@@ -125,8 +125,11 @@ class FlightToWrite:
         editor = TlogEditor(edits, self.remark)
         yield from editor.apply(self._batches(editor, sources), self.senders)
 
-    def chosen(self) -> Iterator[Batch]:
-        """Yield the selected MAVLink, of all messages, not edited; its senders are known."""
+    def chosen(self, counted_id: int | None = None) -> Iterator[Batch]:
+        """Yield the selected MAVLink, of all messages, not edited; its senders are known.
+
+        The remark on the number of kept records counts those of one message if it is given.
+        """
         choice = replace(self._edits.choice, messages=frozenset())
         editor = TlogEditor(replace(self._edits, choice=choice), self.remark)
         batches: Iterable[Batch] = self._batches(editor, self._sources)
@@ -135,7 +138,7 @@ class FlightToWrite:
             batches = [*batches]
             for batch in batches:
                 self.senders.add(batch)
-        return editor.chosen(batches, self.senders)
+        return editor.chosen(batches, self.senders, counted_id)
 
     def _batches(self, editor: TlogEditor, sources: list[TlogSource]) -> Iterator[Batch]:
         if self.is_mavlink:
@@ -284,7 +287,7 @@ def add_writer(ending: str, write: Write, lacks: Lacks = Lacks()) -> None:
 def _write_csv(flight: FlightToWrite) -> Iterator[bytes]:
     if flight.message_id is None:
         return _write_table(flight)
-    return message_csv.write(flight.chosen(), flight.message_id)
+    return message_csv.write(flight.chosen(flight.message_id), flight.message_id)
 
 
 def _write_table(flight: FlightToWrite) -> Iterator[bytes]:

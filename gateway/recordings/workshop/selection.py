@@ -6,7 +6,7 @@ All functions take batches and return batches with fewer records; frames are not
 import difflib
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Final
@@ -100,10 +100,10 @@ class StateChoice:
     """Names in upper case, or numbers as text; an empty set does not restrict."""
     margin_s: float = 0.0
 
-    def includes(self, beat: Any) -> bool:
-        """Return whether the time after this heartbeat is selected."""
+    def includes(self, beat: Any, mode: tuple[str, str]) -> bool:
+        """Return whether the time after this heartbeat, of a mode by `mode_of`, is selected."""
         is_armed = bool(beat["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        is_in_mode = not self.modes or not self.modes.isdisjoint(mode_of(beat))
+        is_in_mode = not self.modes or not self.modes.isdisjoint(mode)
         return (is_armed or not self.armed) and is_in_mode
 
 
@@ -140,13 +140,14 @@ class ChosenState:
         for row, beat in zip(rows.tolist(), columns_of(batch, rows, HEARTBEAT_ID), strict=True):
             origin = int(batch.origins[row])
             is_chosen = not self._systems or origin >> 8 in self._systems
-            if not is_chosen or origin != self._senders.vehicle(origin >> 8).origin:
+            vehicle = self._senders.vehicle(origin >> 8)
+            if not is_chosen or origin != vehicle.origin:
                 continue
             found[at:row] = batch.time_us[at:row] <= self._end_us
             at = row
-            name, number = mode_of(beat)
-            self.modes.add(f"{name} {number}".strip())
-            if self.choice.includes(beat):
+            mode = mode_of(beat, vehicle.modes)
+            self.modes.add(" ".join(mode).strip())
+            if self.choice.includes(beat, mode):
                 self._until_us[origin] = int(batch.time_us[row]) + HEARTBEAT_TIMEOUT_US
             else:
                 self._until_us.pop(origin, None)
@@ -158,10 +159,14 @@ class ChosenState:
         return max(self._until_us.values(), default=_LONG_AGO_US)
 
 
-def mode_of(beat: Any) -> tuple[str, str]:
-    """Return the mode in a heartbeat by name, empty if it has none, and as a number."""
+def mode_of(beat: Any, names: Mapping[int, str]) -> tuple[str, str]:
+    """Return the mode in a heartbeat by name, empty if it has none, and as a number.
+
+    `names` are those of AVAILABLE_MODES.
+    """
     number = int(beat["custom_mode"])
-    return mode_name(int(beat["autopilot"]), int(beat["type"]), number), str(number)
+    known = mode_name(int(beat["autopilot"]), int(beat["type"]), number)
+    return known or names.get(number, ""), str(number)
 
 
 def while_in_state(batches: Iterable[Batch], state: ChosenState) -> Iterator[Batch]:

@@ -94,9 +94,14 @@ class TlogEditor:
         if total == self._left_out():
             raise FlightError(NOTHING_LEFT)
 
-    def chosen(self, batches: Iterable[Batch], senders: Senders) -> Iterator[Batch]:
-        """Yield the selected records, not edited; raises FlightError if no record is left."""
-        edits, total, kept = self._edits, 0, 0
+    def chosen(
+        self, batches: Iterable[Batch], senders: Senders, counted_id: int | None = None
+    ) -> Iterator[Batch]:
+        """Yield the selected records, not edited; raises FlightError if no record is left.
+
+        The remark on their number counts those of one message if it is given.
+        """
+        edits, total, kept, of_message = self._edits, 0, 0, 0
 
         def all_records() -> Iterator[Batch]:
             nonlocal total
@@ -111,6 +116,7 @@ class TlogEditor:
             cut = while_in_state(cut, state)
         for batch in map(edits.choice.apply, cut):
             kept += len(batch)
+            of_message += int(np.count_nonzero(batch.message_ids == counted_id))
             yield batch
         unknown = "" if state is None else state.unknown
         if not kept:
@@ -121,7 +127,7 @@ class TlogEditor:
         if unknown:
             self._remark(unknown)
         if not edits.are_none:
-            kept -= self._left_out()
+            kept = kept - self._left_out() if counted_id is None else of_message
             self._remark(f"kept {kept} of {counted(total, 'record')}")
 
     def _left_out(self) -> int:

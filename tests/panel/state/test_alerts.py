@@ -30,10 +30,10 @@ RECORDING = "Recording 2026-11-22_001122"
 CASES: dict[str, tuple[list[tuple[float, Any]], float, list[tuple[str, str]]]] = {
     "all is well": ([(0, gps(3))], 1, []),
     "GPS that was never there": ([(0, gps(0))], 0, []),
-    "GPS lost": ([(0, gps(3)), (1, gps(0))], 2, [("GPS lost", "the receiver has no fix")]),
+    "GPS lost": ([(0, gps(3)), (1, gps(0))], 2, [("GPS lost", "the GPS has no fix")]),
     "GPS found again": ([(0, gps(3)), (1, gps(0)), (2, gps(3))], 3, []),
     "GPS in an outage": (
-        [(0, gps(3)), (6, HEARTBEAT)], 6, [("GPS lost", "nothing from the receiver for 6 s")]
+        [(0, gps(3)), (6, HEARTBEAT)], 6, [("GPS lost", "nothing from the GPS for 6 s")]
     ),
     "two nodes silent": (
         [(0, text("IMU node 1 silent")), (0, text("GPS node 12 silent"))], 1,
