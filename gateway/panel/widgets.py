@@ -250,7 +250,7 @@ class RecorderControls:
             ui.button("Save", on_click=save).props("no-caps")
 
     async def _save(self, name: str) -> None:
-        await self._ask("save", f"Saved as {name}", name=name)
+        await self._ask("rename", f"Saved as {name}", name=name)
 
     async def _ask_delete(self) -> None:
         with notify_failure(self._context):
