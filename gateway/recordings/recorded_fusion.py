@@ -8,13 +8,14 @@ used, with a remark. mavgate's own recordings keep theirs.
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from itertools import chain
 from pathlib import Path
 from typing import Final
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from gateway import __version__
 from gateway.aircraft import Aircraft, AircraftSettings, FusedStates, Outputs
@@ -24,6 +25,7 @@ from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import make_estimator
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import (
+    COLUMNS,
     GPS,
     NAV_COLUMNS,
     WHOLE_COLUMNS,
@@ -48,6 +50,7 @@ from gateway.recordings.fuse import (
     interpolated_positions,
     sample_log,
     samples_of,
+    samples_of_cells,
     smoothed_states,
     with_estimator,
     with_reference,
@@ -63,8 +66,10 @@ from gateway.recordings.recorded_table import (
 )
 from gateway.recordings.table import (
     FORMAT_LINE,
+    NO_ROWS,
     NOTE,
     TableBlock,
+    TableComment,
     TableHeader,
     TableNote,
     TableReader,
@@ -73,13 +78,15 @@ from gateway.recordings.table import (
 from gateway.recordings.tlog import UNRECORDED, Stamper
 from gateway.recordings.workshop.joining import joined_tables
 from gateway.records import RECORDED_ONLY, FusionState, NodeStatus
-from gateway.sensing.chain import IntArray
+from gateway.sensing.chain import IntArray, SensorChain
 from gateway.units import US_PER_S, counted
 from gateway.vehicle.service import INFO, StatusText
 from gateway.wire.recorded_frames import RecordedFrame
 
 PIECE: Final = 200
 """Rows fused per step of a playback: some milliseconds, in which nothing is sent."""
+SAMPLES: Final = 20_000
+"""Samples in a piece of the estimation of the GPS latency: 4 MB of states."""
 LONGEST_GAP_US: Final = 1_000_000
 """In a longer gap the pipeline's timers are not run step by step."""
 HEAD_LINES: Final = 20
@@ -189,7 +196,20 @@ def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) 
 def estimate_latency(log: SampleLog) -> FoundLatency | None:
     """Estimate the GPS latency of a whole flight; None if no manoeuvre allows it."""
     estimator = KernelEstimator(make_gains(EskfSettings(), USUAL), USUAL)
-    estimator.run(log)
+    # In pieces, since the states, which are not used, take much memory.
+    begin, heights, fixes = 0, 0, 0
+    while begin < len(log.imu_time_us):
+        imu = slice(begin, begin + SAMPLES)
+        newest_us = log.imu_time_us[imu][-1]
+        baro = slice(heights, int(np.searchsorted(log.baro_time_us, newest_us, "right")))
+        gps = slice(fixes, int(np.searchsorted(log.gps_time_us, newest_us, "right")))
+        estimator.run(
+            SampleLog(
+                log.imu_time_us[imu], log.imu[imu], log.baro_time_us[baro], log.baro_alt_m[baro],
+                log.gps_time_us[gps], log.gps[gps],
+            )
+        )  # fmt: skip
+        begin, heights, fixes = begin + SAMPLES, max(heights, baro.stop), max(fixes, gps.stop)
     return estimator.found_latency()
 
 
@@ -203,10 +223,39 @@ def smoothed_latency_in_words(used_s: float, set_s: float) -> str:
 
 def _log_of(table: RecordedTable, aircraft: AircraftSettings) -> SampleLog:
     """Read a table for `estimate_latency`, and keep its rows for the next reader."""
-    blocks = list(table.blocks)
-    table.blocks = iter(blocks)
-    samples = samples_of(blocks, aircraft.calibration)
-    return sample_log(samples, _kalman_filter(aircraft))
+    calibration, kalman = SensorChain(aircraft.calibration), _kalman_filter(aircraft)
+    kept: list[PackedBlock] = []
+    parts = [sample_log(samples_of_cells(NO_ROWS, calibration), kalman)]
+    for block in table.blocks:
+        kept.append(PackedBlock.of(block))
+        parts.append(sample_log(samples_of_cells(block.cells, calibration), kalman))
+    table.blocks = (packed.block() for packed in kept)
+    names = [field.name for field in fields(SampleLog)]
+    return SampleLog(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass(frozen=True, slots=True)
+class PackedBlock:
+    """A block of rows, most of whose cells are empty."""
+
+    is_known: NDArray[np.uint8]
+    """One bit for each cell."""
+    values: FloatArray
+    rows: int
+    comments: tuple[tuple[int, TableComment], ...]
+
+    @classmethod
+    def of(cls, block: TableBlock) -> "PackedBlock":
+        """Pack a block."""
+        is_known = ~np.isnan(block.cells)
+        return cls(np.packbits(is_known), block.cells[is_known], len(block), block.comments)
+
+    def block(self) -> TableBlock:
+        """Return the rows."""
+        cells = np.full((self.rows, len(COLUMNS)), np.nan)
+        is_known = np.unpackbits(self.is_known, count=cells.size).astype(bool)
+        cells.ravel()[is_known] = self.values
+        return TableBlock(cells, self.comments)
 
 
 def _kalman_filter(aircraft: AircraftSettings) -> KernelEstimator:
