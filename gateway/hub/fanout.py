@@ -102,6 +102,11 @@ class _Subscription:
         systems = self.client.endpoint.systems
         return not systems or systems.lets_out(frame)
 
+    def begin_numbers(self, origin: Origin) -> None:
+        """Begin to number the frames of another system for this client."""
+        if len(self.inserted) < MAX_KINDS:
+            self.inserted.setdefault(origin, 0)
+
     def gap_of(self, origin: Origin) -> _Gap:
         gap = self.gaps.get(origin)
         if gap is None:
@@ -358,7 +363,7 @@ class Fanout:
             subscription = self._subscriptions.get(client_id)
             if subscription and subscription.lets_out(frame):
                 if source is not None and source.client.endpoint.cache:
-                    subscription.inserted.setdefault(frame.origin, 0)
+                    subscription.begin_numbers(frame.origin)
                 subscription.answered += len(frame.data)
                 self._sender(subscription, frame.origin)(frame)
         for monitor in self._monitors:
@@ -390,7 +395,7 @@ class Fanout:
             if interval_us != NO_MESSAGES:
                 limit, client = subscription.limit_of(frame.key, interval_us), subscription.client
                 if source.endpoint.cache:
-                    subscription.inserted.setdefault(frame.origin, 0)
+                    subscription.begin_numbers(frame.origin)
                 is_edited = frame.origin in subscription.inserted
                 send = self._sender(subscription, frame.origin) if is_edited else None
                 targets.append((client, limit, send))

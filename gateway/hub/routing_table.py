@@ -29,6 +29,8 @@ Origin = tuple[int, int]
 
 MAX_ORIGINS: Final = 256
 """Maximum per client: every possible system id, or fewer with several components each."""
+MAX_ADDRESSED: Final = 16
+"""Maximum systems and components that one is known to have addressed: scripts address a few."""
 ROUTE_FRESH_US: Final = 10 * US_PER_S
 """A path on which a system was received this recently is preferred to stale ones."""
 MEMORY_US: Final = 30 * US_PER_S
@@ -179,7 +181,7 @@ class SystemPath:
 
     def note_address(self, target: Origin) -> None:
         """Note that it has addressed a system and component."""
-        if len(self.addressed) < MAX_ORIGINS:
+        if len(self.addressed) < MAX_ADDRESSED:
             self.addressed.add(target)
 
     def note_boot(self, frame: MavFrame, now_us: int) -> None:

@@ -8,6 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.hub import Hub
+from gateway.vehicle.services.ftp import ACK, Opcode, Packet
 from gateway.wire.mavlink_signing import is_genuine
 from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.hub import Rig, Station
@@ -164,6 +165,20 @@ async def test_kept_answers_leave_no_gap_in_the_numbers_of_the_vehicle(
 
     await rig.until(are_all_sent)
     assert [counted_losses(each) for each in numbers] == [0, 0]
+
+
+async def test_file_goes_only_to_the_station_that_asked_if_two_share_an_id(rig: Rig) -> None:
+    one = await scene(rig, "&cache=yes")
+    for station, sequence in ((0, 40), (1, 7)):
+        asked = Packet(sequence, 0, Opcode.OPEN_FILE_RO, 7, 0, 0, 0, b"/a.json")
+        one.ask(station, mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, asked.encode()))
+        await rig.quiet()
+        one.vehicle.received(), [each.received() for each in one.stations]
+        reply = asked.answer(ACK, station, b"\5\0\0\0").encode()
+        one.report(mavlink.MAVLink_file_transfer_protocol_message(0, 255, 190, reply))
+        await rig.quiet()
+        got = [len(each.received()) for each in one.stations]
+        assert got == [station == 0, station == 1]
 
 
 async def test_answers_stay_when_the_client_of_the_vehicle_proves_that_it_receives(
