@@ -89,31 +89,6 @@ def test_settings_and_socket_may_follow_the_command(words: str, moved: str) -> N
     assert hoisted(words.split()) == moved.split()
 
 
-@pytest.mark.parametrize("words", ["{0} info x", "info x {0}"])
-def test_settings_file_is_read_wherever_it_is_named(words: str, tmp_path: Path) -> None:
-    file = tmp_path / "absent.toml"
-    found = invoke(*words.format(f"--config {file}").split(), code=2)
-    assert f"{file}: cannot be read" in found.output
-    # Another call starts from nothing.
-    assert str(file) not in invoke("info", "x").output
-
-
-@pytest.mark.parametrize(
-    ("words", "endings"),
-    [
-        ("fuse x -o x.pdf", ".tlog, .csv, .kml, .gpx, .geojson, .mcap, .parquet"),
-        ("convert x -o x.doc", ".tlog, .csv, .kml, .gpx, .geojson, .mcap, .parquet"),
-        ("recover x -o x.kml", ".tlog, .csv"),
-        ("sweep x -o best.csv", ".toml"),
-        ("sweep x --table trials.toml", ".csv"),
-        ("flash imu -o imu.bin", ".hex"),
-    ],
-)
-def test_output_of_another_ending_is_refused(words: str, endings: str) -> None:
-    found = invoke(*words.split(), code=2)
-    assert f": the output must end in {endings}" in found.output
-
-
 @pytest.mark.parametrize(
     "words", [["--help"], ["status"], ["clients", "list"], ["clients", "mark", "1", "2"],
               ["record", "status"], ["nonsense"]],
@@ -131,31 +106,6 @@ def test_small_commands_import_nothing_large(words: list[str], tmp_path: Path) -
     env = {"HOME": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path), "PATH": "/usr/bin:/bin"}
     done = python("-c", program, *words, cwd=CLI.parents[1], env=env)
     assert done.stderr.splitlines()[-1] == ""
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        ("sweep --hold-out x", "'x': write a whole number"),
-        ("sweep --gps-interval x", "'x': write a number"),
-        ("play x --id 300", "'300': must be at most 249"),
-        ("play x --skip-gaps -1", "'-1': must be at least 0"),
-        ("fuse x -o y.csv --fuse-with old", "'old' is not one of 'recorded', 'current'"),
-        ("clients mark north 8", "'north': write a number"),
-        *(
-            (f"clients mark {words}", "write a number")
-            for words in ("nan nan", "inf 0", "47 8 nan")
-        ),
-        ("runn", "Did you mean 'run'"),
-        ("rout", "Did you mean 'run'"),
-        ("replay", "Did you mean 'play'"),
-        ("xyzzy", "No such command 'xyzzy'."),
-    ],
-)
-def test_invalid_value_is_named_with_what_is_allowed(words: str, text: str) -> None:
-    found = CliRunner().invoke(app, words.split(), env={"COLUMNS": "200"})
-    assert (found.exit_code, text in found.output) == (2, True)
-    assert not re.search("Input should|Value error|parse string", found.output)
 
 
 def test_user_without_a_home_gets_defaults_and_a_warning(

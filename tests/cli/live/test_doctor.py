@@ -260,16 +260,3 @@ def test_template_is_written_once_into_a_new_folder(
     assert (again.exit_code, f"{file}: exists, and is not overwritten" in again.output) == (2, True)
     assert file.read_text() == "# mine"
     assert invoke("doctor", "--template", "all").output.count("\n[") > template.count("\n[")
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "code", "words"),
-    [
-        ("udp-listen:127.0.0.1:0", 1, "uses any free port"),
-        ("udp:127.0.0.1:0", 1, "port must be 1 to 65535"),
-        ("udp-listen:127.0.0.1:14550", 0, "all settings are valid"),
-    ],
-)
-def test_settings_are_checked(tmp_path: Path, endpoint: str, code: int, words: str) -> None:
-    (file := tmp_path / "gateway.toml").write_text(f'[hub]\nendpoints = ["{endpoint}"]\n')
-    assert words in invoke("doctor", file, code=code).output

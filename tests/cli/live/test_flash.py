@@ -64,37 +64,6 @@ def test_lora_image_holds_its_settings_and_names_its_airtime(images: Path, tmp_p
     assert settings.lora_frequency_khz == 868_300
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("imu --vehicle 32", "--vehicle 32: must be 1 to 31"),
-        ("imu --air-rate 500", "--air-rate 500: must be 250, 1000, 2000 kbit/s"),
-        ("imu --power 3", "--power 3: must be -18, -12, -6, 0 dBm"),
-        ("imu --gps-rate 5", "--gps-rate: the program imu has no such setting"),
-        ("imu --address xyz", "--address xyz"),
-        ("imu --clock 20", "--clock 20: 16 or 8"),
-        ("imu --spreading 8", "--spreading: needs --radio sx1276"),
-        ("imu --radio sx1276 --channel 80", "--channel: needs --radio nrf24"),
-        ("imu --radio sx1276 --power 21", "--power 21: must be 2 to 20 dBm"),
-        ("imu --send-rate 20", "--send-rate 20: must be 60 to 250 Hz"),
-        ("imu --radio sx1276 --spreading 7 --send-rate 20",
-         "55 % time on air, more than 45 %; --send-rate 16 would fit"),
-        ("gps", "make firmware"),
-        ("--show", "no port fits 'auto'"),
-        ("", "no USB adapter is connected"),
-    ],
-    ids=str,
-)  # fmt: skip
-def test_wrong_option_ends_with_the_reason(
-    images: Path, tmp_path: Path, words: str, message: str
-) -> None:
-    # Also before any port is looked for.
-    out = ["-o", tmp_path / "out.hex"] if words[:1].isalpha() else []
-    for options in ([], out):
-        assert message in flash(*words.split(), *options, code=2)
-    assert not (tmp_path / "out.hex").exists()
-
-
 def test_port_that_another_program_holds_is_left_alone(images: Path) -> None:
     master, slave = pty.openpty()
     try:

@@ -279,32 +279,3 @@ def test_subtitles_of_chosen_fields_as_ass(tlog: Path, tmp_path: Path) -> None:
     lines = [line for line in out.read_text().splitlines() if line.startswith("Dialogue")]
     assert lines[-1].endswith("Default,50.0 m  LOITER")
     assert re.match(r"Dialogue: 0,\d:\d\d:\d\d\.\d\d,\d:\d\d:\d\d\.\d\d,", lines[0])
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ((), "at least one file"),
-        (("--params", "a.txt"), "must end in"),
-        (("--params", "a.param", "--system", "9"), "no vehicle 9"),
-        (("--subtitles", "a.srt", "--fields", "x"), "choose mode"),
-        (("--subtitles", "a.srt", "--offset", "x"), "--offset"),
-        (("--params", "a.param"), "no parameters"),
-        (("--mission", "a.plan"), "no mission of this vehicle; a.plan is not written"),
-    ],
-)
-def test_invalid_options_or_missing_content_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], text: str
-) -> None:
-    tlog = written(tmp_path, flight()[:1])
-    monkeypatch.chdir(tmp_path)
-    assert text in run("extract", tlog, *options, code=2)
-    assert [path.name for path in tmp_path.iterdir()] == ["flight.tlog"]
-
-
-def test_missing_mission_is_reported_and_other_files_are_written(tmp_path: Path) -> None:
-    plan, parameters = tmp_path / "a.plan", tmp_path / "a.param"
-    path = written(tmp_path, flight()[:2])
-    text = run("extract", path, "--mission", plan, "--params", parameters, code=1)
-    assert f"no mission of this vehicle; {plan} is not written" in text
-    assert (plan.exists(), parameters.exists()) == (False, True)

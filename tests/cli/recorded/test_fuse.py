@@ -59,14 +59,6 @@ def test_settings_file_overrides_facts_of_the_log(log: Path) -> None:
     assert yaw_deg(last) == pytest.approx(-20.0, abs=0.5)
 
 
-@pytest.mark.parametrize("force", [[], ["--force"]])
-def test_input_as_output_is_refused(log: Path, force: list[str]) -> None:
-    before = log.read_bytes()
-    result = invoke("fuse", log, "-o", log, *force, code=2)
-    assert "is an input; give another output" in result.output
-    assert log.read_bytes() == before
-
-
 @pytest.mark.slow
 def test_latency_in_neither_log_nor_settings_is_estimated(tmp_path: Path) -> None:
     log, out = tmp_path / "log.csv", tmp_path / "out.csv"

@@ -90,22 +90,10 @@ def test_play_accepts_a_name(config: Path, tmp_path: Path, monkeypatch: pytest.M
     assert (played[0], len(played)) == ("alps_01.tlog", 2)
 
 
-def test_sweep_accepts_a_name(config: Path, tmp_path: Path) -> None:
-    best = tmp_path / "best.toml"
-    words = ("--vary", "beta=0.5", "--jobs", "1", "--metric", "interpolated", "-o", best)
-    run("sweep", "alps", *words, "--config", config)
-    assert "beta_velocity" in best.read_text()
-
-
 def test_demo_flies_the_named_recording(config: Path) -> None:
     frames, aircraft = recorded_line(load(config), Path("alps"))
     assert list(aircraft) == [1]
     assert next(frames).data
-
-
-def test_folder_or_unknown_name_is_refused_with_the_command_for_it(tmp_path: Path) -> None:
-    assert "give one folder" in run("info", tmp_path, "sea", code=2)
-    assert "`mavgate info` lists them" in run("info", "sea", code=2)
 
 
 def test_existing_path_takes_precedence_over_a_name(tmp_path: Path) -> None:

@@ -36,13 +36,6 @@ def test_recording_is_compared_with_other_settings(
     assert (folder / "timing.csv").exists()
 
 
-def test_file_without_rows_is_refused(tmp_path: Path) -> None:
-    empty = write_table(tmp_path / "empty.csv", TableHeader(), [])
-    result = invoke("report", empty, "-o", tmp_path / "out", code=2)
-    assert "contains no row" in result.output
-    assert not (tmp_path / "out").exists()
-
-
 def test_flight_without_samples_has_a_section_for_pilots(tmp_path: Path) -> None:
     records = []
     for second in range(60):

@@ -1,0 +1,205 @@
+"""Arrangements of files for the transcripts, by name; see `test_transcripts.py`."""
+
+import gzip
+import os
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+from intelhex import IntelHex
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.aircraft import AircraftSettings
+from gateway.flashing import boards
+from gateway.live.serial_port import Port
+from gateway.recordings.columns import TableRow
+from gateway.recordings.recorded_table import header_for
+from gateway.recordings.table import TableHeader
+from tests.analysis.test_flight import rows
+from tests.flashing.test_settings_block import BLOCK, NRF24_BLOCK, image_with, with_crc
+from tests.kit.mavlink import Sender
+from tests.kit.recordings import (
+    START_US,
+    make_frames,
+    make_records,
+    records_of,
+    write_table,
+    write_tlog,
+)
+from tests.kit.records import state_at
+from tests.recordings.flights import flown_table, read
+
+NAMES = "time_s,ax,ay,az,gx,gy,gz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m"
+NUMBERS = ("0", "0", "-9.8", "0", "0", "0", "100", "0.1", "47", "8", "500")
+RECORDS = make_records(500)
+
+
+def log(folder: Path, name: str = "log.csv", **odd: str) -> Path:
+    """Write a tracker's log of a second, every tenth row of which has an odd cell."""
+    lines = [NAMES]
+    for number in range(100):
+        cells = dict(zip(NAMES.split(","), [f"{number / 100}", *NUMBERS], strict=True))
+        lines.append(",".join((cells | odd if number % 10 == 5 else cells).values()))
+    (folder / name).write_text("\n".join(lines) + "\n")
+    return folder / name
+
+
+def odd_log(folder: Path, cell: str) -> None:
+    """Write a log with `COLUMN=VALUE` in every tenth row; `1*99` is 99 ones."""
+    column, _, value = cell.partition("=")
+    digit, star, count = value.partition("*")
+    log(folder, **{column: digit * int(count) if star else value})
+
+
+def table(folder: Path, head: str = "unix_us_at_zero=0", name: str = "table.csv") -> Path:
+    """Write a table of one state."""
+    key, _, value = head.partition("=")
+    header = msgspec.structs.replace(header_for(AircraftSettings(), 1), **{key: int(value)})
+    return write_table(folder / name, header, [TableRow(1000, state=state_at(1000))])
+
+
+def flight(folder: Path) -> None:
+    """Write a tlog of 10 s, and a table of 20 s with all sensors."""
+    write_tlog(folder / "flight.tlog", RECORDS)
+    (folder / "flight.csv").write_bytes(flown_table(20))
+
+
+def half_minute(folder: Path, speed: str = "") -> None:
+    """Write half a minute of flight, or of a receiver at rest."""
+    made = rows(raw=False)
+    if speed == "rest":
+        slow = {"vel_n_mps": (0.2, 0.1, 0.0)}
+        made = [replace(r, gps=r.gps and msgspec.structs.replace(r.gps, **slow)) for r in made]
+    write_table(folder / "flight.csv", TableHeader(), made)
+
+
+def recordings(folder: Path) -> None:
+    """Write recordings `alps` (tlog and tables of two parts) and `lake` (a tlog of system 7)."""
+    below = folder / "recordings"
+    below.mkdir()
+    write_tlog(below / "alps_01.tlog", make_records(4000))
+    header, flown = read(flown_table(12))
+    header = msgspec.structs.replace(header, unix_us_at_zero=START_US)
+    write_table(below / "alps_01_v1.csv", header, flown[: len(flown) // 2])
+    write_table(below / "alps_02_v1.csv", header, flown[len(flown) // 2 :])
+    write_tlog(below / "lake_01.tlog", make_records(30, system_id=7))
+    (folder / "gateway.toml").write_text(f'[recording]\nfolder = "{below}"\n')
+
+
+def packed(path: Path, head: bytes, piece: bytes, mb: int) -> Path:
+    """Pack a head and many copies of a piece of a megabyte."""
+    with gzip.open(path, "wb") as file:
+        file.write(head)
+        for _ in range(mb):
+            file.write(piece)
+    return path
+
+
+def zipped(folder: Path, fault: str) -> None:
+    """Write `log.csv.gz`: cut, damaged, a bomb, or no gzip file (and `log.csv`, which is one)."""
+    path = folder / "log.csv.gz"
+    data = log(folder, path.name).read_bytes()
+    if fault == "none":
+        (folder / "log.csv").write_bytes(gzip.compress(data))
+    elif fault == "bomb":
+        packed(path, NAMES.encode() + b"\n", b"#\n" * (1 << 19), 34)
+    else:
+        whole = gzip.compress(data)
+        path.write_bytes(whole[:-100] if fault == "cut" else whole[:-8] + bytes(8))
+
+
+def endless(folder: Path, kind: str) -> None:
+    path = folder / "log.csv.gz"
+    os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
+
+
+def introduced(folder: Path) -> None:
+    """Write a tlog with a heartbeat and a parameter."""
+    sent = (
+        mavlink.MAVLink_heartbeat_message(2, 3, 128, 5, 4, 3),
+        mavlink.MAVLink_param_value_message(b"WPNAV_SPEED", 512.5, 9, 3, 0),
+    )
+    write_tlog(folder / "a.tlog", records_of(map(Sender().pack, sent), 100_000))
+
+
+def future(folder: Path) -> None:
+    records = (struct.pack(">Q", 10**18) + frame for frame in make_frames(20))
+    (folder / "future.tlog").write_bytes(b"".join(records))
+
+
+def images(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write images of one program, on a machine without serial ports."""
+    for name, block in (("imu", NRF24_BLOCK), ("imu_sx1276", BLOCK)):
+        image = IntelHex()
+        image.puts(0, image_with(with_crc(block)))
+        for mhz in (16, 8):
+            image.write_hex_file(str(folder / f"{name}_{mhz}mhz.hex"))
+    monkeypatch.setattr(boards, "IMAGES", folder)
+    for module in ("flash", "doctor"):
+        monkeypatch.setattr(f"gateway.cli.live.{module}.list_serial_ports", list[Port])
+
+
+MAKE: dict[str, Callable[..., object]] = {
+    made.__name__: made
+    for made in (
+        log, odd_log, table, flight, half_minute, recordings, zipped, endless, introduced,
+        future, images,
+    )
+}  # fmt: skip
+
+
+def change(path: Path, how: str) -> None:
+    """Do `A => B`, `cut BYTES`, `insert AT COUNT`, `blank LINE`, `bom` or `latin TEXT`."""
+    data = path.read_bytes()
+    word, *numbers = how.split()
+    match word:
+        case "cut":
+            data = data[: -int(numbers[0])]
+        case "insert":
+            at, count = map(int, numbers)
+            data = data[:at] + b"\xaa" * count + data[at:]
+        case "blank":
+            lines = data.split(b"\n")
+            lines[int(numbers[0]) - 1] = b"\0" * 50
+            data = b"\n".join(lines)
+        case "bom":
+            data = b"\xef\xbb\xbf" + data
+        case "latin":
+            data = how.removeprefix("latin ").encode("latin-1") + b"\n" + data
+        case _:
+            old, new = how.split(" => ")
+            assert old.encode() in data
+            data = data.replace(old.encode(), new.encode(), 1)
+    path.write_bytes(data)
+
+
+def arrange(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make an arrangement.
+
+    Arguments with ` @ FILE` at their end change it; `FILE: TEXT` writes one; the others are the
+    arguments of the function.
+    """
+    name, *arguments = text.split("; ")
+    own, after = list[str](), list[str]()
+    for one in arguments:
+        (after if " @ " in one or re_file(one) else own).append(one)
+    if name in MAKE:
+        extra = (monkeypatch,) if name == "images" else ()
+        MAKE[name](folder, *own, *extra)
+    for one in after:
+        if " @ " in one:
+            how, _, file = one.rpartition(" @ ")
+            change(folder / file, how)
+        else:
+            file, _, content = one.partition(": ")
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            (folder / file).write_text(content.replace("\\n", "\n").replace("HERE", str(folder)))
+
+
+def re_file(text: str) -> bool:
+    """Return whether an argument is a file to write."""
+    head, colon, _ = text.partition(": ")
+    return bool(colon) and " " not in head
