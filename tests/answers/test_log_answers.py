@@ -107,13 +107,6 @@ def test_complete_download_is_the_mission(day: Day) -> None:
     assert day.answers(START_US).mission(MISSION) == mission, "loaded before the recording"
 
 
-def test_upload_is_the_mission_once_acknowledged(day: Day) -> None:
-    day.send(day.station, count_of(1, FENCE, 3), item(0, FENCE, 3))
-    assert day.answers().mission(FENCE) is None
-    day.send(day.vehicle, ack(FENCE))
-    assert len(day.answers().mission(FENCE) or ()) == 1
-
-
 def test_mission_and_parameter_set_in_flight_did_not_exist_before(day: Day) -> None:
     day.send(day.vehicle, value("READ", 1.0))
     set_us = day.now_us
@@ -128,15 +121,6 @@ def test_mission_and_parameter_set_in_flight_did_not_exist_before(day: Day) -> N
     assert (len(later.mission(MISSION) or ()), before.mission(MISSION)) == (1, None)
 
 
-def test_denied_upload_leaves_the_mission_unchanged(day: Day) -> None:
-    day.send(day.vehicle, count_of(1), item(0))
-    day.send(day.station, count_of(1, target=3), item(0, target=3))
-    day.send(day.vehicle, ack(MISSION, mavlink.MAV_MISSION_DENIED))
-    mission = day.answers().mission(MISSION)
-    assert mission is not None
-    assert read_back(mission[0]).get_srcSystem() == 3
-
-
 UPLOADS = {
     "cleared and uploaded at once": ("clear count ack 0 1 ack", [0, 1]),
     "clear is never acknowledged": ("clear count 0 1 ack", [0, 1]),
@@ -149,6 +133,7 @@ UPLOADS = {
     "counted again": ("count 0 count 0 1 ack", [0, 1]),
     "another station's upload": ("count 0 other 1 ack", [0, 1]),
     "part written": ("count 0 1 ack part 1 ack", [0, 1]),
+    "refused, and nothing before": ("count 0 1 no", None),
     "nothing is acknowledged": ("clear count 0 1", None),
 }
 """Messages in their order, and the numbers of the items of the mission after them."""

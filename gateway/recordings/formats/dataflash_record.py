@@ -79,7 +79,12 @@ RALLY_FRAMES: Final = {
 TITLE_BYTES: Final = 1 << 16
 """Bytes at the begin of a text log that are searched for the title line."""
 _NOT_IN_WORDS: Final = re.compile(r"[^0-9A-Za-z]")
-_FORMER_NAMES: Final = {"FLYBYWIREA": "FBWA", "FLYBYWIREB": "FBWB", "HYBRID": "POSHOLD"}
+_FORMER_NAMES: Final = {
+    "FLYBYWIREA": "FBWA",
+    "FLYBYWIREB": "FBWB",
+    "HYBRID": "POSHOLD",
+    "STEARING": "STEERING",
+}
 """Other names of modes, and the names in the table of modes."""
 _FIRMWARE: Final = re.compile(r"(Copter|Plane|Rover|Sub|Blimp|Tracker)\s*V\d", re.IGNORECASE)
 _FRAME_TYPES: Final = {
