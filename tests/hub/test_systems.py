@@ -294,6 +294,27 @@ class TestHub:
         assert self.origins(second) == ([(3, 102)] if passes else [])
         assert self.origins(seat) == ([] if companion else [(3, 102)])
 
+    @pytest.mark.parametrize("message", [ODOMETRY, attitude()], ids=["input", "telemetry"])
+    async def test_compiled_route_ends_when_an_excluded_vehicle_is_received(
+        self, rig: Any, message: Any
+    ) -> None:
+        hub, first, second, seat = await self.open(rig, "systems=1", "")
+        await self.say(rig, (first, heartbeat(), 1, 1))
+        if message is ODOMETRY:
+            await self.say(rig, (second, GCS, 255, STATION))
+        for each in (second, seat):
+            each.received()
+        await self.say(rig, *[(first, message, 1, 1)] * 3)
+        number = message.get_msgId()
+        assert self.origins(second) == [(1, number)] * 3
+        if hub.forwarding.is_compiled:
+            [source, *_] = hub._clients.values()
+            assert any(route._words is not None for route in source.routes.values())
+        await self.say(rig, (second, heartbeat(), 2, 1), (first, message, 1, 1))
+        passes = message is not ODOMETRY and self.origins(seat)[-1] == (1, number)
+        assert self.origins(second) == []
+        assert passes == (message is not ODOMETRY)
+
     async def test_heartbeat_of_a_station_with_the_id_of_a_vehicle_changes_nothing(
         self, rig: Any
     ) -> None:
