@@ -27,9 +27,9 @@ bytes of a stream that were sent; addresses of the parts, of headers for each pa
 group, of the groups' control data, and of a header of all parts."""
 OUTBOX_WORDS: Final = 8
 HEADER_WORDS: Final = 8
-FIRST_AT, COUNT, CONTROL, CONTROL_SIZE, LENGTH = 2, 3, 4, 5, 7
+FIRST_AT, COUNT, CONTROL, CONTROL_SIZE, FLAGS, LENGTH = 2, 3, 4, 5, 6, 7
 """Words of a `struct mmsghdr`: address and number of its parts, address and size of its control
-data; the bytes received or sent."""
+data, flags of what was received; the bytes received or sent."""
 CONTROL_WORDS: Final = 4
 SEGMENT_SIZE, FIRST = 2, 3
 """Words of control data: the size of the datagrams; the first part of the group, which the system

@@ -8,6 +8,8 @@ import ctypes
 from functools import cache
 from typing import Any, Final
 
+MSG_TRUNC: Final = 0x20
+"""Flag of a received datagram that was longer than its buffer."""
 MSG_DONTWAIT: Final = 0x40
 MSG_NOSIGNAL: Final = 0x4000
 MSG_EOR: Final = 0x80

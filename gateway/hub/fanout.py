@@ -15,17 +15,19 @@ not changed, and a filter on those does show as loss; with one exception: frames
 answers are kept are numbered for each client, because the gateway sends some in their name.
 
 The frames to a client of known bandwidth are counted, and thinned once a second so that they fit:
-see `send_queue.py`. A client whose endpoint has `monitor=yes` gets every frame. A client of
-MAVLink 1 gets the messages that this version can carry, without extensions and signatures.
+see `send_queue.py`. That changes limits and no routes. A client whose endpoint has `monitor=yes`
+gets every frame. A client of MAVLink 1 gets the messages that this version can carry, without
+extensions and signatures.
 """
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Final
+from weakref import WeakValueDictionary
 
 from gateway.hub.endpoint import NO_MESSAGES, Endpoint
 from gateway.hub.forwarding import Forwarding
-from gateway.hub.forwarding_step import IS_RECORDED, TARGETS
+from gateway.hub.forwarding_step import IS_OBSERVED, TARGETS
 from gateway.hub.limits import RateLimit
 from gateway.hub.routing_table import Origin, SystemPath
 from gateway.hub.send_queue import (
@@ -43,12 +45,17 @@ from gateway.wire.mavlink_messages import base_size
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame
 
-MAX_KINDS: Final = 4096
-"""Maximum kinds of frame per client: a vehicle sends some fifty; forged headers could be any."""
+MAX_KINDS: Final = 16_384
+"""Maximum kinds of frame per client, as many as routes."""
 LEAST_BYTES: Final = 10_000
 """Bytes to a client after which it is decided whether most of them are telemetry."""
-MAX_ROUTES: Final = 1024
-"""Maximum cached routes per source; more than a few hundred come from forged headers."""
+MAX_ROUTES: Final = 16_384
+"""Maximum cached routes per source, of some 600 bytes each: 800 vehicles of 20 kinds each. Beyond,
+the oldest one is discarded."""
+
+OnRun = Callable[[Forwarding], None]
+"""Called with the run of the compiled step, which `run` or `records` return."""
+_TargetsKey = tuple[tuple[int, int, Origin | None], ...]
 
 
 @dataclass(slots=True)
@@ -116,17 +123,27 @@ class _Subscription:
         return gap
 
     def limit_of(self, key: bytes, interval_us: int) -> RateLimit | None:
-        """Return the limit of a kind of frame, with its present interval; None without a limit."""
-        if not interval_us:
+        """Return the limit of a kind of frame; None if there is none, and never will be."""
+        planned_us = self.bandwidth.interval_us(key) if self.bandwidth else 0
+        if not interval_us and self.bandwidth is None:
             return None
         limit = self.limits.get(key)
         if limit is None:
             if len(self.limits) >= MAX_KINDS:
-                self.limits.clear()
+                del self.limits[next(iter(self.limits))]
             limit = self.limits[key] = RateLimit(interval_us)
-        elif limit.interval_us != interval_us:
-            limit.change(interval_us)
+        limit.least_us = interval_us
+        limit.change(max(interval_us, planned_us))
         return limit
+
+    def plan(self, offered: dict[bytes, tuple[int, int, int]], elapsed_s: float) -> None:
+        """Adapt the limits to the bandwidth, if it is known; no route depends on intervals."""
+        if self.bandwidth is None:
+            return
+        self.bandwidth.plan(offered, self.answered, elapsed_s)
+        self.answered = 0
+        for key, limit in self.limits.items():
+            limit.change(max(limit.least_us, self.bandwidth.interval_us(key)))
 
     def interval_us(self, frame: MavFrame, *, is_ours: bool) -> int:
         """Return the least time between two frames; the settings bound a client's request."""
@@ -149,8 +166,7 @@ class _Subscription:
         requested = self.requested.get((frame.origin[0], message_id), 0)
         if NO_MESSAGES in (limit, requested):
             return NO_MESSAGES
-        planned = self.bandwidth.interval_us(frame.key) if self.bandwidth else 0
-        return max(limit, requested, planned)
+        return max(limit, requested)
 
 
 class OwnRoute:
@@ -180,16 +196,17 @@ class Fanout:
         signer: FrameSigner,
         forwarding: Forwarding | None = None,
         on_foreign: OnForeign | None = None,
+        on_run: OnRun | None = None,
         *,
         is_recording: bool = False,
     ) -> None:
         self._is_recording = is_recording
         self.forwarding = forwarding or Forwarding()
-        self.forwarding.work[IS_RECORDED] = on_foreign is not None
-        self._on_foreign = on_foreign
-        self._targets: dict[tuple[tuple[int, int, Origin | None], ...], Targets] = {}
+        self.forwarding.work[IS_OBSERVED] = on_foreign is not None
+        self._on_foreign, self._on_run = on_foreign, on_run
+        self._targets: WeakValueDictionary[_TargetsKey, Targets] = WeakValueDictionary()
         """Targets by client, limit and renumbered system of each: routes share them."""
-        self._targets_at: dict[int, Targets] = {}
+        self._targets_at: WeakValueDictionary[int, Targets] = WeakValueDictionary()
         """The same targets by the address of their memory."""
         self.others: dict[tuple[int, bytes], Route] = {}
         """Routes by client and key of frames that are not only forwarded, such as heartbeats."""
@@ -210,31 +227,36 @@ class Fanout:
     def clear(self) -> None:
         """Discard all routes, because a fact on which some depend has changed."""
         self.settle()
+        self._meter_all()
         self._own.clear()
         self.others.clear()
         self.forwarding.clear()
-        self._targets.clear()
-        self._targets_at.clear()
         for subscription in self._subscriptions.values():
             subscription.client.routes.clear()
 
     def settle(self) -> None:
         """Bring all counters up to date."""
         for subscription in self._subscriptions.values():
-            for key, route in subscription.client.routes.items():
-                self.forwarded += self._meter(key, route)
-        for (_, key), route in self.others.items():
-            self.forwarded += self._meter(key, route)
-        for key, own in self._own.items():
-            self._meter(key, own)
+            self.forwarded += subscription.client.settle()
+        for targets in self._targets.values():
+            self.forwarded += targets.settle()
 
-    def _meter(self, key: bytes, route: Route | OwnRoute) -> int:
-        """Count the frames that a route has sent since the last time; return their number."""
-        frames, size = route.settle()
-        if frames and self._is_metered and len(self._offered) < MAX_KINDS:
+    def _meter_all(self) -> None:
+        """Count the frames of each kind for the plans of bandwidths, if there are any."""
+        if not self._is_metered:
+            return
+        for subscription in self._subscriptions.values():
+            for key, route in subscription.client.routes.items():
+                self._meter(key, route.message_id, *route.settle(self.forwarding))
+        for (_, key), route in self.others.items():
+            self._meter(key, route.message_id, *route.settle(self.forwarding))
+        for key, own in self._own.items():
+            self._meter(key, own.message_id, *own.settle())
+
+    def _meter(self, key: bytes, message_id: int, frames: int, size: int) -> None:
+        if frames and len(self._offered) < MAX_KINDS:
             _, known_frames, known_size = self._offered.get(key, (0, 0, 0))
-            self._offered[key] = route.message_id, known_frames + frames, known_size + size
-        return frames
+            self._offered[key] = message_id, known_frames + frames, known_size + size
 
     def add(self, client: Client) -> None:
         """Include a client from the next frame on."""
@@ -384,8 +406,6 @@ class Fanout:
 
         `reaches` returns whether they may be sent to a client.
         """
-        if max(len(source.routes), len(self.others)) >= MAX_ROUTES:
-            self.clear()
         targets: list[Target] = []
         key: list[tuple[int, int, Origin | None]] = []
         for subscription in self._subscriptions.values():
@@ -408,17 +428,41 @@ class Fanout:
 
     def keep_route(self, route: Route, source: Client, key: bytes) -> None:
         """Forward all frames of this kind from a client by a route, without examining each."""
+        if len(source.routes) >= MAX_ROUTES:
+            oldest = next(iter(source.routes))
+            self._discard(oldest, source.routes.pop(oldest))
         source.routes[key] = route
         if source.renumbering is None:
             route.enter(self.forwarding, key)
 
+    def keep_other(self, route: Route, source: Client, key: bytes) -> None:
+        """Forward all frames of this kind from a client by a route, after examining each."""
+        if len(self.others) >= MAX_ROUTES:
+            oldest = next(iter(self.others))
+            self._discard(oldest[1], self.others.pop(oldest))
+        self.others[source.client_id, key] = route
+
+    def _discard(self, key: bytes, route: Route) -> None:
+        self.forwarded += route.targets.settle()
+        if self._is_metered:
+            self._meter(key, route.message_id, *route.settle(self.forwarding))
+        route.leave(self.forwarding, key)
+
+    def observe(self, *, runs: bool) -> None:
+        """Pass the runs of the compiled step to `on_run`, or not."""
+        self.forwarding.work[IS_OBSERVED] = runs
+
     def finish_run(self, now_us: int) -> None:
         """Complete the forwarding of a run: the part that the compiled step leaves to Python."""
-        run = self.forwarding.run()
-        targets = self._targets_at[self.forwarding.work[TARGETS]]
-        targets.finish(run, self.forwarding.failures(), now_us)
-        if self._on_foreign is not None:
-            self._on_foreign(run)
+        forwarding = self.forwarding
+        targets, failures = self._targets_at[forwarding.work[TARGETS]], forwarding.failures()
+        if failures or targets.others:
+            targets.finish(forwarding.run(), failures, now_us)
+        if forwarding.work[IS_OBSERVED]:
+            if self._on_run is not None:
+                self._on_run(forwarding)
+            elif self._on_foreign is not None:
+                self._on_foreign(forwarding.run())
 
     def align(self, client_ids: Sequence[int]) -> None:
         """Send the same frames with the same numbers to all links of one peer from now on.
@@ -441,11 +485,9 @@ class Fanout:
             return
         elapsed_s = (now_us - self._planned_us) / US_PER_S
         self._planned_us = now_us
-        self.clear()
+        self._meter_all()
         for subscription in self._subscriptions.values():
-            if subscription.bandwidth is not None:
-                subscription.bandwidth.plan(self._offered, subscription.answered, elapsed_s)
-                subscription.answered = 0
+            subscription.plan(self._offered, elapsed_s)
         self._offered = {}
 
     def update_buffer(self, client_id: int, free_percent: int) -> None:
@@ -472,7 +514,7 @@ class Fanout:
 
     def _make_own_route(self, frame: MavFrame) -> OwnRoute:
         if len(self._own) >= MAX_KINDS:
-            self.clear()
+            del self._own[next(iter(self._own))]
         route = OwnRoute(frame.message_id)
         for subscription in self._subscriptions.values():
             interval_us = self._interval_us(subscription, frame, is_ours=True)
@@ -487,4 +529,5 @@ class Fanout:
 
 
 def _bandwidth(endpoint: Endpoint) -> Bandwidth | None:
-    return Bandwidth(endpoint.budget) if endpoint.budget >= SATELLITE_BUDGET else None
+    is_planned = endpoint.budget >= SATELLITE_BUDGET and not endpoint.monitor
+    return Bandwidth(endpoint.budget) if is_planned else None

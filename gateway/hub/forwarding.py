@@ -47,17 +47,24 @@ class Forwarding:
         places = np.column_stack([begins, np.full(step.READS, step.MAX_DATAGRAM)])
         received, self._outbox = headers_of(places), Outbox()
         self._table = np.zeros((step.ENTRIES, 3), np.int64)
+        self._filled: set[int] = set()
+        """Entries of the table that are used."""
         self._routes = np.zeros((MAX_COMPILED, step.ROUTE_WORDS), np.int64)
+        self._route_words = self._routes.data
         self._used = 0
+        self._free: list[int] = []
+        """Rows of the routes used before that are free."""
         self._failed = np.zeros((step.MAX_FAILED, step.FAILED_WORDS), np.int64)
-        memory = (buffer, received, self._outbox.words, self._table, self._failed)
+        records = np.zeros(step.READS * step.MAX_RECORD, np.uint8)
+        memory = (buffer, received, self._outbox.words, self._table, self._failed, records)
         work = np.zeros(step.WORDS, np.int64)
         work[step.MOST] = len(buffer)
         work[step.BUFFER_AT :] = [address_of(each) for each in memory]
         self.work: Words = work.data
         self._work_at = address_of(work)
-        self._buffer, self._lengths = buffer.data, received[:, LENGTH]
+        self._buffer, self._lengths, self._records = buffer.data, received[:, LENGTH], records.data
         self._kept = (*memory, places)
+        self._record = step.record.bound(self._work_at) if self.is_compiled else None
 
     def step(self, client: Words, *, reads: bool) -> Callable[[], None]:
         """Return a client's step: one that receives first, or one that continues a read."""
@@ -66,30 +73,75 @@ class Forwarding:
         return step.forward.bound(self._work_at, address_of(client), int(reads))
 
     def enter(
-        self, client_id: int, key: bytes, seed: int, targets_at: int, numbers_at: int
-    ) -> Words | None:
-        """Add the route of a client's frames of one key; return its counters, None if full.
+        self, client_id: int, key: bytes, seed: int, targets_at: int, stream_at: int, heard_at: int
+    ) -> int | None:
+        """Add the route of a client's frames of one key; return its row, None without room.
 
-        The caller keeps the targets and the times by sequence number, which are passed by address.
+        The caller keeps what is passed by address: targets, the stream of the system, and the time
+        when it was received last.
         """
-        if not self.is_compiled or self._used == MAX_COMPILED:
+        if not self.is_compiled or (self._used == MAX_COMPILED and not self._free):
             return None
-        row = self._routes[self._used]
-        self._used += 1
-        row[:] = seed, targets_at, numbers_at, 0, 0, 0
+        if self._free:
+            row = self._free.pop()
+        else:
+            row, self._used = self._used, self._used + 1
+        self._routes[row] = seed, targets_at, stream_at, heard_at, 0, 0
         number = int.from_bytes(key, "little")
         entry = step.entry_of(client_id, number)
-        while self._table[entry, step.KEY_CLIENT]:
+        while entry in self._filled:
             entry = (entry + 1) % step.ENTRIES
-        self._table[entry] = client_id, number, address_of(row)
-        words: Words = row.data
-        return words
+        self._filled.add(entry)
+        self._table[entry] = client_id, number, address_of(self._routes[row])
+        return row
+
+    def leave(self, client_id: int, key: bytes, row: int) -> None:
+        """Remove a route; the entries after it move up, since a search ends at the first gap."""
+        number, table = int.from_bytes(key, "little"), self._table
+        gap = step.entry_of(client_id, number)
+        while (table[gap, step.KEY_CLIENT], table[gap, step.KEY]) != (client_id, number):
+            gap = (gap + 1) % step.ENTRIES
+        entry = gap
+        while (entry := (entry + 1) % step.ENTRIES) in self._filled:
+            begin = step.entry_of(*map(int, table[entry, : step.ROUTE_AT]))
+            if (entry - begin) % step.ENTRIES >= (entry - gap) % step.ENTRIES:
+                table[gap] = table[entry]
+                gap = entry
+        table[gap, step.KEY_CLIENT] = 0
+        self._filled.discard(gap)
+        self._free.append(row)
+
+    def settle(self, row: int) -> tuple[int, int]:
+        """Return the frames and bytes of a route since the last call."""
+        words = self._route_words
+        frames = words[row, step.FRAMES]
+        if not frames:
+            return 0, 0
+        size = words[row, step.SIZE]
+        words[row, step.FRAMES] = words[row, step.SIZE] = 0
+        return frames, size
 
     def clear(self) -> None:
         """Discard all routes."""
-        if self._used:
-            self._used = 0
-            self._table[:, step.KEY_CLIENT] = 0
+        if self._filled:
+            self._table[list(self._filled), step.KEY_CLIENT] = 0
+            self._filled.clear()
+        self._used = 0
+        self._free.clear()
+
+    def records(self, first_us: int, step_us: int) -> bytes:
+        """Return the frames of the run as in a tlog, with the time of the first and the step."""
+        if self._record is None:
+            return b""
+        work = self.work
+        work[step.TIME_US], work[step.TIME_STEP] = first_us, step_us
+        self._record()
+        return bytes(self._records[: work[step.RECORDS_SIZE]])
+
+    @property
+    def run_length(self) -> int:
+        """The number of frames of the run."""
+        return int(self._outbox.words[PARTS])
 
     def load(self, data: bytes, now_us: int) -> None:
         """Load a chunk of a stream, of at most 256 kB, as if the step had received it."""

@@ -9,11 +9,12 @@ so that all frames stay in order. These bytes are:
 | bytes                                                               | status      |
 | ------------------------------------------------------------------- | ----------- |
 | not a MAVLink 2 frame with a route in the table and a good checksum | `HAND_OVER` |
-| a run that is recorded, has other clients, or was not sent to all   | `RUN_SENT`  |
+| a run that is observed, has other clients, or was not sent to all   | `RUN_SENT`  |
 | an error of the socket                                              | `ERROR`     |
 | datagrams after one of these, or beyond the byte limit of a read    | `UNREAD`    |
 
-Counters are kept in the rows of the routes. All memory belongs to `forwarding.Forwarding`.
+Counters are kept where they are needed: of the source, of its system, of the targets, and of the
+route. All memory belongs to `forwarding.Forwarding`.
 """
 
 import errno
@@ -24,6 +25,7 @@ import numpy as np
 from gateway.compiled import array_at, compiled
 from gateway.compiled.entry_point import EntryPoint
 from gateway.compiled.messages import (
+    FLAGS,
     HEADER_WORDS,
     LAST_SIZE,
     LENGTH,
@@ -34,8 +36,9 @@ from gateway.compiled.messages import (
     group,
     send_parts,
 )
-from gateway.compiled.system_calls import receive_many
-from gateway.wire.frame_scan import SEQUENCE, frame_holds, frame_key, frame_size
+from gateway.compiled.system_calls import MSG_TRUNC, receive_many
+from gateway.hub.stream_words import ACCEPTED, LEADER, NEWEST_US, STREAM_WORDS
+from gateway.wire.frame_scan import SEQUENCE, TIME_SIZE, frame_holds, frame_key, frame_size
 
 MAX_DATAGRAM: Final = 4096
 """Maximum size of a datagram, longer ones are truncated: programs that join frames fill a network
@@ -44,28 +47,34 @@ READS: Final = ROOM
 """Maximum datagrams of a read, and maximum frames of a run."""
 HAND_OVER, RUN_SENT, ERROR, UNREAD = 1, 2, 4, 8
 
-STATUS, NOW_US, MOST, IS_RECORDED, COUNT, AT, OFFSET, TAKEN, READ, ERROR_NUMBER = range(10)
+STATUS, NOW_US, MOST, IS_OBSERVED, COUNT, AT, OFFSET, TAKEN, READ, ERROR_NUMBER = range(10)
 """Words of the state of a step: its result and the time; maximum bytes of a read, and whether
-Python records each run; the number of datagrams, the present one and the offset in it; bytes
+Python gets each run; the number of datagrams, the present one and the offset in it; bytes
 processed and read; the number of an error."""
-FRAME, TARGETS, FAILED, BUFFER_AT, HEADERS_AT, OUTBOX_AT, TABLE_AT, FAILED_AT = range(10, 18)
+FRAME, TARGETS, RUN_SIZE, FAILED, TIME_US, TIME_STEP, RECORDS_SIZE = range(10, 17)
 """Size of the frame that is passed to Python, if it is one; the address of the targets of the run,
-and the number of failed ones; addresses of the other memory."""
-WORDS: Final = 18
-CLIENT_ID, INPUT, OUTPUT, WAY, IS_PLAIN, LARGEST = range(6)
+its bytes, and the number of failed targets; the time of its first record, and between two, and the
+bytes of all."""
+BUFFER_AT, HEADERS_AT, OUTBOX_AT, TABLE_AT, FAILED_AT, RECORDS_AT = range(17, 23)
+"""Addresses of the other memory."""
+WORDS: Final = 23
+CLIENT_ID, INPUT, OUTPUT, WAY, IS_PLAIN, LARGEST, CUT, RECEIVED, RECEIVED_SIZE, HEARD_US = range(10)
 """Words of a client: its id; the files to receive from and to send to, or -1, and the mode of
 sending; whether its frames may be forwarded without Python; the size of its largest recent
-datagram."""
-CLIENT_WORDS: Final = 6
-SEED, TARGETS_OF, NUMBERS_AT, FRAMES, SIZE, HEARD_US = range(6)
-"""Words of a route: seed of the checksum, addresses of its targets and of the times by sequence
-number; numbers of frames and bytes, and the time of the last frame."""
+datagram; datagrams that were cut, frames and bytes that were forwarded, time of the last one."""
+CLIENT_WORDS: Final = 10
+SEED, TARGETS_OF, STREAM_AT, HEARD_AT, FRAMES, SIZE = range(6)
+"""Words of a route: seed of the checksum, addresses of its targets, of the stream of its system and
+of the time when the system was received last; numbers of frames and bytes."""
 ROUTE_WORDS: Final = 6
-TARGET_COUNT, HAS_OTHERS, FIRST_TARGET = range(3)
-"""Words of targets: number of clients, whether Python serves others, address of the first."""
+TARGET_COUNT, HAS_OTHERS, SENT, SENT_SIZE, FIRST_TARGET = range(5)
+"""Words of targets: number of clients, whether Python serves others, frames and bytes sent to each,
+address of the first."""
 KEY_CLIENT, KEY, ROUTE_AT = range(3)
 """Words of an entry of the table."""
-ENTRIES: Final = 8192
+ENTRIES: Final = 65_536
+MAX_RECORD: Final = TIME_SIZE + 280
+"""Maximum size of a recorded frame, bytes."""
 FAILED_WORDS: Final = 4
 """Words of a failed client: index among the targets, number of frames sent, number of the error,
 and bytes of the next frame that were sent."""
@@ -73,6 +82,9 @@ MAX_FAILED: Final = 4096
 
 _INT: Final = np.dtype(np.int64)
 _BYTE: Final = np.dtype(np.uint8)
+_LOW_KEY: Final = (1 << 24) - 1
+_FACTORS: Final = (0x9E3779, 0x85EBCB, 0xC2B2AF)
+"""Odd factors of a hash, of 24 bits, so that no product exceeds 64 bits."""
 _LEAST_DATAGRAM: Final = 32
 
 
@@ -109,6 +121,8 @@ def _receive(work: Any, client: Any, headers: Any) -> None:
     for k in range(count):
         work[READ] += headers[k, LENGTH]
         largest = max(largest, headers[k, LENGTH])
+        if headers[k, FLAGS] & MSG_TRUNC:
+            client[CUT] += 1
     client[LARGEST] = largest
 
 
@@ -135,7 +149,7 @@ def _walk(work: Any, client: Any, headers: Any, outbox: Any) -> None:
                 _send_run(work, outbox)
                 if work[STATUS] & RUN_SENT:
                     return
-            _gather(work, outbox, route, data, begin, size)
+            _gather(work, client, outbox, route, data, begin, size)
             begin += size
             work[OFFSET] += size
         work[TAKEN] += headers[work[AT], LENGTH]
@@ -146,7 +160,9 @@ def _walk(work: Any, client: Any, headers: Any, outbox: Any) -> None:
 @compiled
 def entry_of(client_id: int, key: int) -> int:
     """Return the index in the table at which the search for a route begins."""
-    return (key ^ key >> 13 ^ key >> 24 ^ client_id * 61) % ENTRIES
+    low, high = (key & _LOW_KEY) * _FACTORS[0], (key >> 24) * _FACTORS[1]
+    number = low ^ high ^ client_id * _FACTORS[2]
+    return (number >> 24 ^ number >> 8) % ENTRIES
 
 
 @compiled
@@ -163,14 +179,23 @@ def _route_of(work: Any, client: Any, data: Any, begin: int) -> int:
 
 
 @compiled
-def _gather(work: Any, outbox: Any, route: Any, data: Any, begin: int, size: int) -> None:
+def _gather(
+    work: Any, client: Any, outbox: Any, route: Any, data: Any, begin: int, size: int
+) -> None:
     """Add a frame to the run, and count it."""
     parts = array_at(outbox[PARTS_AT], (READS, 2), _INT)
     parts[outbox[PARTS], 0], parts[outbox[PARTS], 1] = work[BUFFER_AT] + begin, size
     outbox[PARTS] += 1
     work[TARGETS] = route[TARGETS_OF]
-    numbers = array_at(route[NUMBERS_AT], (256,), _INT)
-    numbers[data[begin + SEQUENCE]] = route[HEARD_US] = work[NOW_US]
+    work[RUN_SIZE] += size
+    stream = array_at(route[STREAM_AT], (STREAM_WORDS,), _INT)
+    stream[data[begin + SEQUENCE]] = stream[NEWEST_US] = work[NOW_US]
+    stream[ACCEPTED] += 1
+    stream[LEADER] = client[CLIENT_ID]
+    heard = array_at(route[HEARD_AT], (1,), _INT)
+    heard[0] = client[HEARD_US] = work[NOW_US]
+    client[RECEIVED] += 1
+    client[RECEIVED_SIZE] += size
     route[FRAMES] += 1
     route[SIZE] += size
 
@@ -193,7 +218,31 @@ def _send_run(work: Any, outbox: Any) -> None:
             failed[row, 0], failed[row, 1] = k, max(sent, 0)
             failed[row, 2], failed[row, 3] = max(-sent, 0), outbox[LAST_SIZE]
             work[FAILED] += 1
-    if work[FAILED] or targets[HAS_OTHERS] or work[IS_RECORDED]:
+    targets[SENT] += outbox[PARTS]
+    targets[SENT_SIZE] += work[RUN_SIZE]
+    work[RUN_SIZE] = 0
+    if work[FAILED] or targets[HAS_OTHERS] or work[IS_OBSERVED]:
         work[STATUS] |= RUN_SENT
     else:
         outbox[PARTS] = 0
+
+
+@EntryPoint
+def record(work_at: int) -> None:
+    """Write the frames of the run one after the other, each behind its time, as in a tlog."""
+    work = array_at(work_at, (WORDS,), _INT)
+    outbox = array_at(work[OUTBOX_AT], (OUTBOX_WORDS,), _INT)
+    parts = array_at(outbox[PARTS_AT], (READS, 2), _INT)
+    data = array_at(work[BUFFER_AT], (READS * MAX_DATAGRAM,), _BYTE)
+    records = array_at(work[RECORDS_AT], (READS * MAX_RECORD,), _BYTE)
+    end, time_us = 0, work[TIME_US]
+    for k in range(outbox[PARTS]):
+        for i in range(TIME_SIZE):
+            records[end + i] = time_us >> 8 * (TIME_SIZE - 1 - i) & 0xFF
+        end += TIME_SIZE
+        begin = parts[k, 0] - work[BUFFER_AT]
+        for i in range(parts[k, 1]):
+            records[end + i] = data[begin + i]
+        end += parts[k, 1]
+        time_us += work[TIME_STEP]
+    work[RECORDS_SIZE] = end

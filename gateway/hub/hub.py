@@ -12,7 +12,7 @@ from typing import Any, Final
 import msgspec
 
 from gateway.hub.endpoint import parse_endpoint
-from gateway.hub.fanout import Fanout
+from gateway.hub.fanout import Fanout, OnRun
 from gateway.hub.forwarding import Forwarding
 from gateway.hub.forwarding_step import MOST
 from gateway.hub.limits import TokenBucket
@@ -83,6 +83,8 @@ class Hub:
         The gateway clock.
     on_foreign : callable, optional
         Called with the frames of other systems, each once, byte for byte, as for a recorder.
+    on_run : callable, optional
+        Called in place of `on_foreign` with the runs of the compiled step, while they are observed.
     on_gone : callable, optional
         Called with the id of a client that has gone for good.
     on_alert : callable, optional
@@ -104,6 +106,7 @@ class Hub:
         on_frame: Callable[[Incoming], None],
         now_us: Callable[[], int],
         on_foreign: OnForeign | None = None,
+        on_run: OnRun | None = None,
         on_gone: Callable[[int], None] | None = None,
         on_alert: Callable[[bool, str], None] | None = None,
         signer: FrameSigner | None = None,
@@ -116,8 +119,7 @@ class Hub:
         self.recordings = recordings
         self.signer = signer = signer or FrameSigner()
         self.now_us = now_us
-        burst = UNTRUSTED_READ_BURST
-        self.untrusted_reads = TokenBucket(UNTRUSTED_READ_RATE, burst, burst)
+        self.untrusted_reads = TokenBucket(UNTRUSTED_READ_RATE, *[UNTRUSTED_READ_BURST] * 2)
         self._on_gone, self._on_foreign, self._on_alert = on_gone, on_foreign, on_alert
         self._alerts = ClientAlerts()
         self._connections = LogRateLimiter(CONNECTIONS_IN_FULL, CONNECTIONS_NOT_LOGGED)
@@ -126,8 +128,9 @@ class Hub:
         self._next_id = 1
         self.forwarding = _new_forwarding()
         self._share_reads()
-        self._fanout = Fanout(signer, self.forwarding, on_foreign, is_recording=keeps_order)
+        self._fanout = Fanout(signer, self.forwarding, on_foreign, on_run, is_recording=keeps_order)
         self.finish_run, self.update_buffer = self._fanout.finish_run, self._fanout.update_buffer
+        self.observe = self._fanout.observe
         self.reroute, self.numbers = self._fanout.reconfigure, self._fanout.numbers
         self._round_trip, self._vehicles = RoundTrip(), OwnVehicles()
         self.greet = self._vehicles.await_greeting

@@ -127,6 +127,8 @@ class RateLimit:
 
     interval_us: int
     due_us: int = 0
+    least_us: int = 0
+    """Interval by settings and requests, which a plan of the bandwidth may only increase."""
 
     def is_due(self, now_us: int) -> bool:
         """Return whether a frame may be sent now, and count it as sent."""
@@ -138,6 +140,8 @@ class RateLimit:
 
     def change(self, interval_us: int) -> None:
         """Apply another interval from the next frame on."""
+        if interval_us == self.interval_us:
+            return
         if self.due_us:
             self.due_us += interval_us - self.interval_us
         self.interval_us = interval_us

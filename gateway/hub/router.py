@@ -399,7 +399,7 @@ class Router:
         source_id, key = client.client_id, frame.key
         route = self._fanout.others.get((source_id, key))
         if route is None:
-            path = path or SystemPath(now_us, now_us)
+            path = path or SystemPath(now_us)
             is_shared = self._table.is_shared(frame.origin, now_us)
             rejects = partial(self._is_rejected, client, path) if is_shared else None
             route = self._fanout.make_route(frame, client, path, rejects, reaches)
@@ -408,7 +408,7 @@ class Router:
             if telemetry and is_plain and not is_kept:
                 self._fanout.keep_route(route, client, key)
             else:
-                self._fanout.others[source_id, key] = route
+                self._fanout.keep_other(route, client, key)
         route.forward(frame, now_us, is_checked=True)
 
     def _count(self, frame: MavFrame) -> None:

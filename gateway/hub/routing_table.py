@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Final, Generic, TypeVar
 
+from gateway.hub.stream_words import ACCEPTED, LEADER, NEWEST_US, STREAM_WORDS
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS, boot_time_us
 from gateway.wire.mavlink_splitter import MavFrame
@@ -27,8 +28,8 @@ from gateway.wire.mavlink_splitter import MavFrame
 Origin = tuple[int, int]
 """System and component id."""
 
-MAX_ORIGINS: Final = 256
-"""Maximum per client: every possible system id, or fewer with several components each."""
+MAX_ORIGINS: Final = 1024
+"""Maximum per client: every possible system id with four components each, of 3 kB each."""
 MAX_ADDRESSED: Final = 16
 """Maximum systems and components that one is known to have addressed: scripts address a few."""
 ROUTE_FRESH_US: Final = 10 * US_PER_S
@@ -86,31 +87,44 @@ def _kind_of(heartbeat: MavFrame) -> SenderKind:
 class FrameStream:
     """The frames of one system and component that were accepted."""
 
-    count: int = 0
-    leader: int = 0
-    """The client that brought the newest frame."""
-    newest_us: int = 0
-    """When the newest frame was sent, as estimated by the lag of its path."""
-    sent_us: "array[int]" = field(default_factory=lambda: array("q", bytes(8 * 256)))
-    """The same for the newest frame of each sequence number; 0 for none."""
+    words: "array[int]" = field(default_factory=lambda: array("q", bytes(8 * STREAM_WORDS)))
+    """When the newest frame of each sequence number was sent, as estimated by the lag of its path,
+    0 for none; then those of `stream_words`."""
+
+    @property
+    def count(self) -> int:
+        """The number of accepted frames."""
+        return self.words[ACCEPTED]
+
+    @property
+    def leader(self) -> int:
+        """The client that brought the newest frame."""
+        return self.words[LEADER]
+
+    @property
+    def newest_us(self) -> int:
+        """When the newest frame was sent."""
+        return self.words[NEWEST_US]
 
     def accept(self, sequence: int, client_id: int, sent_us: int) -> None:
         """Register a frame that is neither a copy nor late."""
-        self.count += 1
-        self.sent_us[sequence] = sent_us
-        if sent_us >= self.newest_us:
-            self.newest_us, self.leader = sent_us, client_id
+        words = self.words
+        words[ACCEPTED] += 1
+        words[sequence] = sent_us
+        if sent_us >= words[NEWEST_US]:
+            words[NEWEST_US], words[LEADER] = sent_us, client_id
 
     def newest_sequence(self) -> int:
         """Return the number of the newest frame; of several at one time, the last of their run."""
-        newest_us = max(self.sent_us)
+        sent_us = self.words[:256]
+        newest_us = max(sent_us)
         return (
             next(
                 number
                 for number in range(256)
-                if self.sent_us[number] == newest_us != self.sent_us[number + 1 & 0xFF]
+                if sent_us[number] == newest_us != sent_us[number + 1 & 0xFF]
             )
-            if newest_us != min(self.sent_us)
+            if newest_us != min(sent_us)
             else 0
         )
 
@@ -125,7 +139,7 @@ class FrameStream:
 
     def _nearest(self, sequence: int, step: int) -> int:
         for distance in range(step, step * (NEIGHBOURS + 1), step):
-            if sent_us := self.sent_us[sequence + distance & 0xFF]:
+            if sent_us := self.words[sequence + distance & 0xFF]:
                 return sent_us
         return 0
 
@@ -136,7 +150,6 @@ class SystemPath:
 
     since_us: int
     """Time of its first frame after a timeout."""
-    heard_us: int
     stream: FrameStream = field(default_factory=FrameStream)
     """Frames of the system on all its paths."""
     kind: SenderKind = SenderKind.UNKNOWN
@@ -152,13 +165,21 @@ class SystemPath:
     """When the system started, computed from the newest frame with its time since start."""
     booted_heard_us: int = 0
     """When that frame was received."""
+    heard: "array[int]" = field(default_factory=lambda: array("q", [0]))
+    """When it was received last, in memory that the compiled step writes too."""
 
-    def count(self, frames: int, client_id: int, heard_us: int) -> None:
-        """Register frames whose sequence numbers are in the stream already."""
-        self.heard_us = max(self.heard_us, heard_us)
-        self.stream.count += frames
-        if heard_us >= self.stream.newest_us:
-            self.stream.newest_us, self.stream.leader = heard_us, client_id
+    def __post_init__(self) -> None:
+        """Begin with its first frame."""
+        self.heard_us = self.since_us
+
+    @property
+    def heard_us(self) -> int:
+        """When it was received last."""
+        return self.heard[0]
+
+    @heard_us.setter
+    def heard_us(self, heard_us: int) -> None:
+        self.heard[0] = heard_us
 
     @property
     def is_station(self) -> bool:
@@ -401,7 +422,7 @@ class RoutingTable:
             self._drop(client_id, stalest)
         paths = self._to.setdefault(origin, {})
         stream = next((path.stream for path in paths.values()), FrameStream())
-        known[origin] = paths[client_id] = path = SystemPath(now_us, now_us, stream)
+        known[origin] = paths[client_id] = path = SystemPath(now_us, stream)
         return path
 
     def _drop(self, client_id: int, origin: Origin) -> None:

@@ -44,6 +44,7 @@ class ClientCounters:
     received: int = 0
     bytes_received: int = 0
     bytes_garbage: int = 0
+    cut: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,8 @@ class ClientStats:
     """Frames that could not be renumbered."""
     receives: bool = True
     """Whether it can send anything; an output of another format cannot."""
+    cut: int = 0
+    """Datagrams from it that were longer than a read, and lost their end."""
     cached: tuple[str, ...] = ()
     """The kept answers of the systems behind it, with their ages; see `AnswerCache.describe`."""
     note: str = ""

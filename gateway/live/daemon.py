@@ -36,6 +36,7 @@ from gateway.live.control_verbs import (
 from gateway.live.kept_files import PlanFiles, TimestampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.other_gateways import conflicts, identity_verb, log_other_gateways
+from gateway.live.part import Run
 from gateway.live.pty_port import PtyPort
 from gateway.live.recorder import Recorder
 from gateway.live.recording_budget import RecordingBudget
@@ -121,6 +122,7 @@ class Daemon:
             self._on_frame,
             self.now_us,
             on_foreign=self._record_foreign,
+            on_run=self._record_run,
             on_gone=self._on_gone,
             on_alert=self._alert,
             signer=self._pipeline.signer,
@@ -128,8 +130,7 @@ class Daemon:
         )
         self._announcer = Announcer()
         """Sends the texts of a gateway without an aircraft of its own."""
-        self._recorder = self._make_recorder()
-        self._budget = RecordingBudget()
+        self._recorder, self._budget = self._make_recorder(), RecordingBudget()
         callbacks = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
         self._serial = SerialPort(serial, *callbacks, self.now_us, needed=needed)
         self._sources = [SourcePort(s, self._on_source, self._hub) for s in self._pipeline.ported]
@@ -168,6 +169,7 @@ class Daemon:
             lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
             self._introduction,
             self._locations,
+            self._observe,
             # A simulated time begins with the machine's, and is late by the start-up.
             gps_time=self._receiver is None,
         )
@@ -297,6 +299,7 @@ class Daemon:
             # loading the library then would stop the telemetry for 0.3 s.
             import_module("gateway.live.system_metrics")
         self._metrics.listen(port)
+        self._observe()
 
     def _metrics_text(self) -> Iterator[str]:
         from gateway.live.metrics import prometheus_text, text_of
@@ -388,6 +391,17 @@ class Daemon:
         for frame in frames:
             self._record(frame)
             self._vehicles.feed_received(frame, now_us)
+
+    def _observe(self) -> None:
+        """Take the runs of the compiled step only while somebody needs them."""
+        self._hub.observe(runs=self._recorder.takes_frames or self._systems is not None)
+
+    def _record_run(self, run: Run) -> None:
+        # No secret is among them: messages with a target are not forwarded in runs.
+        self._recorder.run(run)
+        if self._systems is not None:
+            for frame in run.run():
+                self._systems.feed(frame_of(frame), self.now_us(), is_received=True)
 
     def _record(self, frame: bytes) -> None:
         """Record a frame of another sender, unless it contains a key or a password."""

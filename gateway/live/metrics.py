@@ -89,6 +89,7 @@ CLIENT_COUNTERS: Final = {
     "unheard": "Frames sent to a port without a listener, as before a station is started.",
     "bytes_sent": "Bytes sent to a client; their rate over the link's bandwidth is its load.",
     "received": "Frames received from a client.",
+    "cut": "Datagrams of a client that were longer than 4096 bytes, and lost their end.",
     "bytes_garbage": "Bytes of a client that were not MAVLink: a wrong baud rate or program.",
 }
 CLIENT_GAUGES: Final = {

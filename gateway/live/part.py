@@ -1,18 +1,32 @@
 """One part of a recording: the data buffered for its files until it is written."""
 
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol
 
 import msgspec
 
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
 from gateway.recordings.table import TableHeader, TableNote, encode_head, encode_line
-from gateway.recordings.tlog import Stamper, encode_record
+from gateway.recordings.tlog import STEP_US, Stamper, encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 
 PENDING_LIMIT: Final = 16 << 20
 """Maximum bytes that wait for a slow disk: minutes of telemetry. More is dropped."""
 TLOG: Final = ".tlog"
+
+
+class Run(Protocol):
+    """Frames that the hub has forwarded together."""
+
+    @property
+    def run_length(self) -> int:
+        """The number of frames."""
+
+    def run(self) -> list[bytes]:
+        """Return the frames."""
+
+    def records(self, first_us: int, step_us: int) -> bytes:
+        """Return the frames as in a tlog, with the time of the first and the step between two."""
 
 
 @dataclass(slots=True)
@@ -61,6 +75,11 @@ class Part:
     def add_frame(self, frame: bytes, now_us: int) -> None:
         """Buffer a MAVLink frame for the tlog."""
         self.add(TLOG, encode_record(self.stamper.stamp(now_us), frame))
+
+    def add_run(self, run: Run, now_us: int) -> None:
+        """Buffer frames that arrived together for the tlog."""
+        first_us = self.stamper.stamp_several(now_us, run.run_length)
+        self.add(TLOG, run.records(first_us, STEP_US))
 
     def introduces(self, vehicle_id: int) -> bool:
         """Return whether an aircraft is new in this part, and note that it no longer is."""

@@ -26,7 +26,7 @@ import msgspec
 
 from gateway.live.armed_watch import ArmedWatch, VehicleLocations, label_of
 from gateway.live.kept_files import begin_worker, done_by
-from gateway.live.part import PENDING_LIMIT, Part
+from gateway.live.part import PENDING_LIMIT, Part, Run
 from gateway.live.part_files import DiskState, PartFiles, close_behind, free_bytes_near, reason_of
 from gateway.live.restamper import Restamper, clear_copies
 from gateway.live.session import (
@@ -64,7 +64,8 @@ class Recorder:
     a vehicle's fusion after all records passed to `flight`; `introduction_of` the frames of a
     vehicle that every part begins with: version, modes, parameters, missions, home; `vehicles_of`
     latitude and longitude of the homes of own aircraft, or None, by id. `announce` is called with
-    whether it is a problem, and a text for the user. Without `gps_time`, the time of GPS is ignored
+    whether it is a problem, and a text for the user, `on_change` when `takes_frames` may have
+    changed. Without `gps_time`, the time of GPS is ignored
     and the machine's is used.
     """
 
@@ -78,6 +79,7 @@ class Recorder:
         state_of: Callable[[int], FusionState | None] = lambda _: None,
         introduction_of: Callable[[int], list[bytes]] = lambda _: [],
         vehicles_of: Callable[[], VehicleLocations] = dict,
+        on_change: Callable[[], None] = lambda: None,
         *,
         gps_time: bool = True,
     ) -> None:
@@ -86,12 +88,12 @@ class Recorder:
         self._header_of = header_of
         self._announce = announce
         self._state_of, self._introduction_of = state_of, introduction_of
-        self._vehicles_of = vehicles_of
+        self._vehicles_of, self._on_change = vehicles_of, on_change
         self._gps_time = gps_time
         self._session = Session(settings)
         self._civil = CivilClock()
         self._seen: set[int] = set()
-        self._part: Part | None = None
+        self._present: Part | None = None
         self._memory: deque[tuple[int, Part]] = deque()
         """The data before arming, in two parts whose begins differ by half its length."""
         self._watch = ArmedWatch() if settings.mode == "armed" else None
@@ -229,6 +231,30 @@ class Recorder:
             self._watch.feed(frame, now_us)
         for part in self._parts() if self._settings.tlog else ():
             part.add_frame(frame, now_us)
+
+    @property
+    def takes_frames(self) -> bool:
+        """Whether frames are recorded at the moment, or held in memory."""
+        return self._settings.tlog and (self._part is not None or self._watch is not None)
+
+    @property
+    def _part(self) -> Part | None:
+        """The part that is being written."""
+        return self._present
+
+    @_part.setter
+    def _part(self, part: Part | None) -> None:
+        self._present = part
+        self._on_change()
+
+    def run(self, run: Run) -> None:
+        """Record frames that the hub has forwarded together."""
+        now_us = self._clock()
+        if self._watch is not None:
+            for frame in run.run():
+                self._watch.feed(frame, now_us)
+        for part in self._parts() if self._settings.tlog else ():
+            part.add_run(run, now_us)
 
     def flight(self, record: BaroRaw | GpsFix | FusedSample | NodeStatus) -> None:
         """Record a sample of the estimator, or the resulting state."""

@@ -242,6 +242,12 @@ class Stamper:
         self._last_us = max(wanted_us, self._last_us + STEP_US)
         return self._last_us
 
+    def stamp_several(self, now_us: int, count: int) -> int:
+        """Return the first timestamp of `count` frames of one moment, `STEP_US` apart."""
+        first_us = self.stamp(now_us)
+        self._last_us += STEP_US * (count - 1)
+        return first_us
+
     def has_jumped(self, clock: CivilClock) -> bool:
         """Return whether the clock now has a time that differs too much from this file's."""
         offset_us = clock.offset_us

@@ -137,7 +137,7 @@ def test_message_of_a_foreign_satellite_link_goes_to_all() -> None:
     flight = Flight("udp:h:1", "udp:h:2?budget=20", "udp:h:3?budget=5760")
     frame = b"\xfd\x01\0\0\0\x2a\1\xeb\0\0" + bytes(3)
     source = KeepingClient(9, "udp:h:9")
-    flight.fanout.make_route(frame_of(frame), source, SystemPath(0, 0), None).forward(
+    flight.fanout.make_route(frame_of(frame), source, SystemPath(0), None).forward(
         frame_of(frame), 10
     )
     assert [len(sink.frames) for sink in flight.sinks] == [1, 1, 1]

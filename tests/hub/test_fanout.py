@@ -1,11 +1,19 @@
 """Which client gets which frame, at which rate and with which sequence number."""
 
+import itertools
+from random import Random
+
+import numpy as np
 import pytest
 
-from gateway.hub.fanout import MAX_ROUTES, Fanout
-from gateway.hub.forwarding_step import HAND_OVER, IS_PLAIN, RUN_SENT, STATUS
+from gateway.compiled import address_of
+from gateway.hub.fanout import Fanout
+from gateway.hub.forwarding import Forwarding
+from gateway.hub.forwarding_step import HAND_OVER, IS_PLAIN, RUN_SENT, STATUS, _route_of
 from gateway.hub.routing_table import SystemPath
+from gateway.hub.transports.base import Route
 from gateway.records import ClientInterval
+from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 from tests.kit.hub import KeepingClient
@@ -44,7 +52,7 @@ def answer(fanout: Fanout, data: bytes, client_ids: list[int]) -> None:
 def forward(fanout: Fanout, data: bytes, source: KeepingClient, now_us: int = 0) -> None:
     frame = frame_of(data)
     if frame.key not in source.routes:
-        path = SystemPath(0, 0)
+        path = SystemPath(0)
         source.routes[frame.key] = fanout.make_route(frame, source, path, None)
     source.routes[frame.key].forward(frame, now_us)
 
@@ -206,20 +214,72 @@ def test_monitor_gets_every_frame_without_a_gap(fanout: Fanout, vehicle: Sender)
     assert monitor.sequences() == [0, 1, 2, 0]
 
 
-def test_forged_headers_do_not_fill_the_memory(fanout: Fanout) -> None:
-    Peer(fanout, 1)
-    source = Peer(fanout, 99)
-    for system in range(1, 200):
-        for component in range(1, 60):
-            forward(fanout, Sender(system, component).heartbeat(), source)
-    assert len(source.routes) <= MAX_ROUTES
+def keep(fanout: Fanout, data: bytes, source: KeepingClient) -> None:
+    """Forward a frame by a route of its own, which is kept."""
+    frame = frame_of(data)
+    route = fanout.make_route(frame, source, SystemPath(0), None)
+    fanout.keep_route(route, source, frame.key)
+    route.forward(frame, 0)
+
+
+def test_kinds_beyond_the_bound_replace_the_oldest_route_only(
+    fanout: Fanout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gateway.hub.fanout.MAX_ROUTES", 1000)
+    limited = Peer(fanout, 1, "?rate=HEARTBEAT:1")
+    source, other = Peer(fanout, 99), Peer(fanout, 98)
+    keep(fanout, Sender(99, 1).heartbeat(), other)
+    keys = []
+    for system, component in itertools.product(range(1, 41), range(1, 31)):
+        keep(fanout, Sender(system, component).heartbeat(), source)
+        keys.append(bytes((system, component, 0, 0, 0)))
+    assert [*source.routes] == keys[-1000:]
+    assert len(other.routes) == 1
+    assert len(fanout._targets) == len(fanout._targets_at) == 1001, "one of each limit"
+    fanout.settle()
+    assert (fanout.forwarded, len(limited.frames)) == (1201, 1201)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_step_finds_the_routes_that_have_not_left(seed: int) -> None:
+    random, forwarding = Random(seed), Forwarding()
+    known: dict[tuple[int, bytes], int] = {}
+    kinds = [(client, bytes((1, 1, m, m, 0))) for client in (1, 2) for m in range(200)]
+    for client_id, key in random.choices(kinds, k=1500):
+        if (client_id, key) in known:
+            forwarding.leave(client_id, key, known.pop((client_id, key)))
+        else:
+            row = forwarding.enter(client_id, key, 0, 0, 0, 0)
+            assert row is not None
+            known[client_id, key] = row
+    assert sorted(known.values()) == sorted(set(known.values()))
+    data = np.zeros(12, np.uint8)
+    for client_id, key in kinds:
+        data[5:10] = list(key)
+        found = _route_of(forwarding.work.obj, [client_id], data, 0)
+        row = known.get((client_id, key))
+        assert found == (0 if row is None else address_of(forwarding._routes[row]))
+
+
+def test_plan_of_a_bandwidth_changes_limits_and_no_routes(fanout: Fanout, vehicle: Sender) -> None:
+    radio, station = Peer(fanout, 1, "?budget=300"), Peer(fanout, 2)
+    source, other, routes = Peer(fanout, 3), Sender(2), set[Route]()
+    for step in range(400):
+        now_us = radio.now_us = step * 50_000
+        fanout.thin(now_us)
+        publish(fanout, vehicle.attitude(), now_us)
+        forward(fanout, other.attitude(), source, now_us)
+        routes |= {*source.routes.values()}
+    assert (len(routes), len(station.frames)) == (1, 800)
+    flow = len(b"".join(radio.since(10 * US_PER_S))) / 10
+    assert 150 < flow <= 1.1 * 300
 
 
 def test_frames_of_the_compiled_step_are_counted_when_their_route_is_settled(
     fanout: Fanout, vehicle: Sender
 ) -> None:
     peer, source = (Peer(fanout, number, direct=True) for number in (1, 2))
-    path, forwarding = SystemPath(0, 0), fanout.forwarding
+    path, forwarding = SystemPath(0), fanout.forwarding
     frames = [vehicle.attitude() for _ in range(3)]
     route = fanout.make_route(frame_of(frames[0]), source, path, None)
     fanout.keep_route(route, source, frame_of(frames[0]).key)
@@ -234,9 +294,11 @@ def test_frames_of_the_compiled_step_are_counted_when_their_route_is_settled(
     step()
     assert forwarding.work[STATUS] & HAND_OVER
     assert peer.frames == frames
-    assert route.settle() == (3, sum(map(len, frames)))
-    assert route.settle() == (0, 0)
+    assert route.settle(forwarding) == (3, sum(map(len, frames)))
+    assert route.settle(forwarding) == (0, 0)
+    fanout.settle()
+    assert fanout.forwarded == 3
     assert (peer.counters.sent, source.counters.received) == (3, 3)
     stream = path.stream
     assert (path.heard_us, stream.count, stream.newest_us, stream.leader) == (72, 3, 72, 2)
-    assert list(stream.sent_us[:3]) == [70, 71, 72]
+    assert list(stream.words[:3]) == [70, 71, 72]

@@ -18,6 +18,8 @@ from gateway.hub import forwarding_step
 from gateway.hub import hub as hub_module
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.forwarding import Forwarding
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientStats
 from gateway.hub.transports.udp import UdpClient
 from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter
@@ -290,3 +292,33 @@ async def test_more_datagrams_than_one_turn_allows_are_forwarded_in_order(rig: R
     for station in stations:
         got = b"".join([await station.receive() for _ in frames])
         assert got == b"".join(frames)
+
+
+async def test_runs_are_passed_on_only_while_they_are_observed(rig: Rig) -> None:
+    station, runs = rig.station(), list[tuple[list[bytes], bytes]]()
+    hub = Hub(
+        HubSettings(endpoints=("udp-listen:127.0.0.1:0", f"udp:127.0.0.1:{station.port}")),
+        rig.incoming.append,
+        rig.clock,
+        rig.foreign.extend,
+        on_run=lambda run: runs.append((run.run(), run.records(1 << 56 | 5, 4))),
+    )
+    rig.closing.append(hub.close)
+    hub.start()
+    await rig.until_open(hub)
+    link = rig.station(hub.listening_ports()[0], origin=(7, 1))
+    link.send(link.sender.attitude())
+    await rig.until(lambda: rig.foreign)
+    for is_observed in (True, False):
+        hub.observe(runs=is_observed)
+        frames = [link.sender.attitude(time_ms=number) for number in range(5)]
+        link.send(*frames)
+        await rig.quiet()
+        assert station.received()[-5:] == frames
+        assert len(rig.foreign) == 1
+        if is_observed:
+            times = [(1 << 56 | 5 + 4 * number).to_bytes(8, "big") for number in range(5)]
+            records = b"".join(time + frame for time, frame in zip(times, frames, strict=True))
+            assert runs == [(frames, records)]
+    assert len(runs) == 1
+    assert hub.counters().forwarded == 11

@@ -151,7 +151,7 @@ class Links:
     def __init__(self) -> None:
         self.filter = DuplicateFilter()
         stream = FrameStream()
-        self.paths = {FAST: SystemPath(0, 0, stream), SLOW: SystemPath(0, 0, stream)}
+        self.paths = {FAST: SystemPath(0, stream), SLOW: SystemPath(0, stream)}
 
     def check(self, client_id: int, number: int, now_us: int, content: bytes | None = None) -> int:
         return self.filter.check(

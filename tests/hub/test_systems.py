@@ -433,7 +433,7 @@ class TestHub:
         await self.say(rig, *[(each, attitude(), 1, 1) for each in (first, second)] * 2)
         clients = list(hub._clients.values())
         compiled = [
-            any(route._words is not None for route in client.routes.values()) for client in clients
+            any(route.is_compiled for route in client.routes.values()) for client in clients
         ]
         if hub.forwarding.is_compiled:
             assert compiled == [True, False, False]

@@ -89,7 +89,12 @@ async def test_datagrams_of_unusual_sizes_are_counted(rig: Any) -> None:
     station = rig.station(hub.listening_ports()[0])
     station.send(station.sender.heartbeat(), b"", b"\xfd" * 65507, station.sender.heartbeat())
     await rig.until(lambda: len(rig.incoming) == 2)
-    assert hub.clients()[0].bytes_garbage == MAX_DATAGRAM
+    assert (hub.clients()[0].bytes_garbage, hub.clients()[0].cut) == (MAX_DATAGRAM, 1)
+    # Now the compiled step reads the client's own socket.
+    frames = [station.sender.attitude(time_ms=number) for number in range(3)]
+    station.send(frames[0], frames[1].ljust(MAX_DATAGRAM + 1, b"\xfd"), frames[2])
+    await rig.until(lambda: hub.clients()[0].received == 5)
+    assert hub.clients()[0].cut == 2
 
 
 async def refused(rig: Any) -> tuple[Any, Any]:

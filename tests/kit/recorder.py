@@ -8,6 +8,7 @@ from gateway.live.armed_watch import VehicleLocations
 from gateway.live.recorder import Recorder
 from gateway.live.session import RecordingSettings
 from gateway.recordings.table import TableHeader, TableReader
+from gateway.recordings.tlog import encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeId
 from gateway.wire.timesync import ENOUGH
 from tests.conftest import ManualClock
@@ -33,6 +34,20 @@ def read_table(path: Path) -> tuple[TableHeader, list[Any]]:
     return reader.header, events
 
 
+class ListedRun:
+    """Frames that the hub has forwarded together."""
+
+    def __init__(self, frames: list[bytes]) -> None:
+        self.frames, self.run_length = frames, len(frames)
+
+    def run(self) -> list[bytes]:
+        return self.frames
+
+    def records(self, first_us: int, step_us: int) -> bytes:
+        times = [first_us + number * step_us for number in range(len(self.frames))]
+        return b"".join(map(encode_record, times, self.frames))
+
+
 class RecorderBench:
     """A recorder in a folder of its own that is turned by hand, and what it announced."""
 
@@ -50,6 +65,7 @@ class RecorderBench:
         self.unix_at_zero_us = UNIX_US
         self.announced: list[tuple[bool, str]] = []
         options = {"folder": str(folder), "mode": "always", "free_floor_mb": 0.0, **settings}
+        self.takes_frames: list[bool] = []
         self.recorder = Recorder(
             RecordingSettings(**options),
             clock,
@@ -59,6 +75,7 @@ class RecorderBench:
             fusion_of,
             introduction_of,
             vehicles_of,
+            lambda: self.takes_frames.append(self.recorder.takes_frames),
         )
 
     async def turn(self, seconds: float = 0.5) -> None:

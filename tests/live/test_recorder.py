@@ -1,6 +1,7 @@
 """The recorder on a real folder, turned by hand on a manual clock."""
 
 import errno
+import itertools
 import os
 import shutil
 from pathlib import Path
@@ -24,6 +25,7 @@ from tests.kit.recorder import (
     HEADER,
     NAME,
     UNIX_US,
+    ListedRun,
     MakeBench,
     RecorderBench,
     frames_of,
@@ -339,6 +341,39 @@ async def test_recording_wanted_at_start_misses_no_frame(bench: RecorderBench) -
     bench.send(FRAMES)
     bench.recorder.close()
     assert frames_of(bench.recorder.folder) == FRAMES
+
+
+@pytest.mark.parametrize("mode", ["always", "armed"])
+async def test_runs_of_the_hub_are_recorded_in_order_with_frames(
+    make_bench: MakeBench, mode: str
+) -> None:
+    bench = make_bench(mode=mode)
+    bench.recorder.start()
+    assert bench.recorder.takes_frames
+    for number in range(0, 40, 8):
+        bench.recorder.run(ListedRun(FRAMES[number : number + 7]))
+        bench.recorder.frame(FRAMES[number + 7])
+    bench.recorder.record()
+    await bench.turn()
+    await bench.turn()
+    bench.recorder.close()
+    (path,) = bench.recorder.folder.glob("*.tlog")
+    records = list(read_tlog(path))
+    assert [each.frame for each in records] == FRAMES
+    assert all(b.time_us > a.time_us for a, b in itertools.pairwise(records))
+
+
+async def test_frames_are_taken_only_while_a_recording_runs(make_bench: MakeBench) -> None:
+    bench = make_bench(mode="manual")
+    bench.recorder.start()
+    await bench.turn()
+    assert not bench.recorder.takes_frames
+    bench.recorder.record()
+    await bench.turn()
+    bench.recorder.stop()
+    await bench.turn()
+    assert bench.takes_frames[0]
+    assert not bench.takes_frames[-1]
 
 
 async def test_failed_start_is_reported_and_retried(bench: RecorderBench) -> None:

@@ -131,6 +131,8 @@ class Targets:
     """The clients of some routes: those that the compiled step sends to, and others with limits."""
 
     def __init__(self, targets: "Iterable[Target]") -> None:
+        self.forwarded = 0
+        """Frames sent by `send` since the last call of `settle`."""
         self.direct: list[Client] = []
         self.others: list[tuple[Callable[[MavFrame], None], RateLimit | None]] = []
         for client, limit, send in targets:
@@ -139,11 +141,23 @@ class Targets:
             else:
                 self.others.append((send or client.send, limit))
         words = [address_of(client.words) for client in self.direct]
-        self._memory = np.array([len(words), bool(self.others), *words])
+        self._memory = np.array([len(words), bool(self.others), 0, 0, *words])
         self.address = address_of(self._memory)
+
+    def settle(self) -> int:
+        """Count what the compiled step has sent; return the number of frames sent otherwise."""
+        words = self._memory.data
+        if frames := words[kernel.SENT]:
+            for client in self.direct:
+                client.counters.sent += frames
+                client.counters.bytes_sent += words[kernel.SENT_SIZE]
+            words[kernel.SENT] = words[kernel.SENT_SIZE] = 0
+        forwarded, self.forwarded = self.forwarded, 0
+        return forwarded
 
     def send(self, frame: MavFrame, now_us: int) -> None:
         """Send a frame to every client."""
+        self.forwarded += 1
         for client in self.direct:
             client.transmit(frame)
         self._send_others(frame, now_us)
@@ -180,12 +194,13 @@ class Route:
     ) -> None:
         self.message_id = message_id
         self.frames = self.size = 0
-        self._targets = targets
+        self.targets = targets
         self._source = source
         self._path = path
         self._rejects = rejects
         self._on_foreign = on_foreign
-        self._words: Words | None = None
+        self._row: int | None = None
+        """Its row in the compiled step."""
 
     def enter(self, forwarding: Forwarding, key: bytes) -> None:
         """Let the compiled step forward such frames, unless it needs more than their headers."""
@@ -195,12 +210,28 @@ class Route:
             seed
             and is_plain
             and len(key) == KEY_SIZE_V2
-            and len(self._targets.direct) < kernel.MAX_FAILED
+            and len(self.targets.direct) < kernel.MAX_FAILED
         ):
-            numbers_at = address_of(self._path.stream.sent_us)
-            self._words = forwarding.enter(
-                self._source.client_id, key, seed[0], self._targets.address, numbers_at
+            path = self._path
+            self._row = forwarding.enter(
+                self._source.client_id,
+                key,
+                seed[0],
+                self.targets.address,
+                address_of(path.stream.words),
+                address_of(path.heard),
             )
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the compiled step forwards such frames."""
+        return self._row is not None
+
+    def leave(self, forwarding: Forwarding, key: bytes) -> None:
+        """Remove the route from the compiled step."""
+        if self._row is not None:
+            forwarding.leave(self._source.client_id, key, self._row)
+            self._row = None
 
     def forward(self, frame: MavFrame, now_us: int, *, is_checked: bool = False) -> None:
         """Send a frame to every client; a rejected one to none."""
@@ -212,24 +243,14 @@ class Route:
                 return
         self.frames += 1
         self.size += len(frame.data)
-        self._targets.send(frame, now_us)
+        self.targets.send(frame, now_us)
         if self._on_foreign is not None:
             self._on_foreign((frame.data,))
 
-    def settle(self) -> tuple[int, int]:
-        """Count what the compiled step has forwarded; return the frames and bytes of all."""
-        words = self._words
-        if words is not None and (count := words[kernel.FRAMES]):
-            size, heard_us = words[kernel.SIZE], words[kernel.HEARD_US]
-            words[kernel.FRAMES] = words[kernel.SIZE] = 0
-            self._source.count_received(count, size, heard_us)
-            self._path.count(count, self._source.client_id, heard_us)
-            for client in self._targets.direct:
-                client.counters.sent += count
-                client.counters.bytes_sent += size
-            self.frames += count
-            self.size += size
-        frames, size = self.frames, self.size
+    def settle(self, forwarding: Forwarding) -> tuple[int, int]:
+        """Return the frames and bytes that were forwarded since the last call."""
+        frames, size = (0, 0) if self._row is None else forwarding.settle(self._row)
+        frames, size = self.frames + frames, self.size + size
         self.frames = self.size = 0
         return frames, size
 
@@ -465,11 +486,18 @@ class Client:
         """Process received bytes, without the compiled step."""
         raise NotImplementedError
 
-    def count_received(self, frames: int, size: int, heard_us: int) -> None:
-        """Count frames that were forwarded by cached routes."""
-        self.counters.received += frames
-        self.counters.bytes_received += size
-        self.heard_us = max(self.heard_us or 0, heard_us)
+    def settle(self) -> int:
+        """Count what the compiled step has forwarded; return the number of frames."""
+        words = self.words
+        self.counters.cut += words[kernel.CUT]
+        words[kernel.CUT] = 0
+        frames = words[kernel.RECEIVED]
+        if frames:
+            self.counters.received += frames
+            self.counters.bytes_received += words[kernel.RECEIVED_SIZE]
+            words[kernel.RECEIVED] = words[kernel.RECEIVED_SIZE] = 0
+            self.heard_us = max(self.heard_us or 0, words[kernel.HEARD_US])
+        return frames
 
     def sink_bytes(self, data: bytes, now_us: int) -> bool:
         """Pass received bytes to the sink; return whether there is one."""

@@ -303,11 +303,12 @@ class DatagramClient(Client):
         size, most = 0, self.context.read_bytes
         for _ in range(kernel.READS):
             try:
-                data, address = sock.recvfrom(kernel.MAX_DATAGRAM)
+                data, _, flags, address = sock.recvmsg(kernel.MAX_DATAGRAM)
             except OSError as error:
                 self._note_read_error(error.errno)
                 break
             size += len(data)
+            self.counters.cut += bool(flags & socket.MSG_TRUNC)
             self._accept_from(data, address)
             if size >= most or sock.fileno() < 0:
                 break

@@ -115,7 +115,7 @@ class UdpListener(Listener[DatagramPeer]):
         size, is_client, is_empty = 0, True, False
         while is_client and size < self._context.read_bytes:
             try:
-                data, ancillary, _, address = sock.recvmsg(MAX_DATAGRAM, ANCILLARY_BYTES)
+                data, ancillary, flags, address = sock.recvmsg(MAX_DATAGRAM, ANCILLARY_BYTES)
             except OSError:
                 is_empty = True
                 break
@@ -124,6 +124,8 @@ class UdpListener(Listener[DatagramPeer]):
             # To admit a client takes as long as to serve the others several times.
             is_client = address[:2] in self._by_address
             self._accept(data, address, local_host_of(ancillary))
+            if flags & socket.MSG_TRUNC and (sender := self._by_address.get(address[:2])):
+                sender.counters.cut += 1
         read = math.inf if is_empty else self._received
         due = itertools.takewhile(lambda each: each[1].read_until <= read, self._held.items())
         for client, held in [*due]:
