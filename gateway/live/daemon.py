@@ -169,7 +169,6 @@ class Daemon:
             lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
             self._introduction,
             self._locations,
-            self._observe,
             # A simulated time begins with the machine's, and is late by the start-up.
             gps_time=self._receiver is None,
         )
@@ -299,7 +298,6 @@ class Daemon:
             # loading the library then would stop the telemetry for 0.3 s.
             import_module("gateway.live.system_metrics")
         self._metrics.listen(port)
-        self._observe()
 
     def _metrics_text(self) -> Iterator[str]:
         from gateway.live.metrics import prometheus_text, text_of
@@ -392,16 +390,12 @@ class Daemon:
             self._record(frame)
             self._vehicles.feed_received(frame, now_us)
 
-    def _observe(self) -> None:
-        """Take the runs of the compiled step only while somebody needs them."""
-        self._hub.observe(runs=self._recorder.takes_frames or self._systems is not None)
-
     def _record_run(self, run: Run) -> None:
         # No secret is among them: messages with a target are not forwarded in runs.
+        now_us = self.now_us()
         self._recorder.run(run)
-        if self._systems is not None:
-            for frame in run.run():
-                self._systems.feed(frame_of(frame), self.now_us(), is_received=True)
+        for frame in run.run():
+            self._vehicles.feed_received(frame, now_us)
 
     def _record(self, frame: bytes) -> None:
         """Record a frame of another sender, unless it contains a key or a password."""
