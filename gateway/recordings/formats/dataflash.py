@@ -13,6 +13,8 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
+from functools import cache
+from importlib.resources import files
 from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType
@@ -34,6 +36,7 @@ from gateway.recordings.files import (
     temporary_copy,
 )
 from gateway.recordings.formats.mavlink import MILLI, VELOCITY_AGE_US, autopilot_state
+from gateway.recordings.message_table import MessageTable, read_table
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, table_of_rows
 from gateway.records import (
     NAN,
@@ -58,14 +61,8 @@ LEAST_AGREEING: Final = 3
 """The same at the end of the log, where no more messages follow."""
 FIX_2D: Final = 2
 TIME_COLUMNS: Final = ("TimeUS", "TimeMS")
-SENSOR_NUMBERS: Final = ("I", "C")
-"""Columns with the number of the message's sensor or Kalman filter."""
-KINDS: Final = {
-    "IMU": "IMU", "IMU2": "IMU", "IMU3": "IMU", "MAG": "MAG", "MAG2": "MAG", "MAG3": "MAG",
-    "BARO": "BARO", "BAR2": "BARO", "BAR3": "BARO", "GPS": "GPS", "GPS2": "GPS",
-    "GPA": "GPA", "GPA2": "GPA",
-}  # fmt: skip
-"""Kind of sensor, by message name."""
+INSTANCES: Final = ("I", "C", "Instance", "Inst", "IMU")
+"""Columns with the number of a sensor, filter or battery."""
 SENSORS: Final = {
     "IMU": ("AccX", "AccY", "AccZ"),
     "MAG": ("MagX", "MagY", "MagZ"),
@@ -89,10 +86,23 @@ _AS_TEXT: Final = bytes(range(128)) + b"?" * 128
 _SKIPPED: Final = re.compile(r"Skipped (\d+) bad bytes")
 
 
-def sensor_of(name: str, message: Message) -> int:
-    """Return the number of a message's sensor or Kalman filter, counted from 0."""
-    number = next((n for column in SENSOR_NUMBERS if (n := getattr(message, column, None))), 0)
-    return int(number) or (int(name[-1]) - 1 if name in KINDS and name[-1].isdigit() else 0)
+@cache
+def table() -> MessageTable:
+    """Return the table of DataFlash."""
+    return read_table((files("gateway.recordings.formats") / "dataflash.toml").read_bytes())
+
+
+def kind_of(name: str) -> str:
+    """Return the kind of a message; that of a second sensor was formerly another one."""
+    return table().aliases.get(name, (name, 0))[0]
+
+
+def instance_of(name: str, message: Message) -> int:
+    """Return the number of the sensor, filter or battery in a message, from 0."""
+    columns = {message.fmt.instance_field, *INSTANCES} & {*message.fmt.columns}
+    found = (getattr(message, column) for column in columns)
+    number = next((value for value in found if isinstance(value, int)), 0)
+    return number or table().aliases.get(name, ("", 0))[1]
 
 
 def in_era(gps_us: int) -> int:
@@ -106,7 +116,7 @@ def own_us_of(name: str, message: Message) -> int:
     time_us = getattr(message, "TimeUS", None)
     if time_us is not None:
         return int(time_us)
-    return 1000 * int(message.T if KINDS.get(name) == "GPS" else message.TimeMS)
+    return 1000 * int(message.T if kind_of(name) == "GPS" else message.TimeMS)
 
 
 class LogClock(Generic[Item]):
@@ -212,12 +222,13 @@ class ArdupilotReader:
     @property
     def names(self) -> set[str]:
         """Names of the messages that are read."""
-        return {*self._handlers, *KINDS}
+        former = (name for name, (kind, _) in table().aliases.items() if kind in self._handlers)
+        return {*self._handlers, *former}
 
     def feed(self, name: str, message: Message) -> list[Imported]:
         """Process the next message."""
-        kind = KINDS.get(name, name)
-        if kind not in self._handlers or sensor_of(name, message) != self._sensors.get(kind, 0):
+        kind = kind_of(name)
+        if kind not in self._handlers or instance_of(name, message) != self._sensors.get(kind, 0):
             return []
         return self._handle(self.clock.feed(own_us_of(name, message), (kind, message)))
 
@@ -398,7 +409,7 @@ def _why_empty(log: Any, damage: PrintedDamage, reader: ArdupilotReader) -> str:
     needed = {*SENSORS["IMU"], "GyrX", "GyrY", "GyrZ"}
     for name, columns in formats.items():
         lacking = needed - columns | ({"TimeUS"} if columns.isdisjoint(TIME_COLUMNS) else set())
-        if KINDS.get(name) == "IMU" and lacking:
+        if kind_of(name) == "IMU" and lacking:
             return (
                 f"its {name} messages cannot be decoded: they have no {', '.join(sorted(lacking))}"
                 ", as in a log of sdlog2, PX4's logger before ULog, which is not supported"
@@ -412,13 +423,13 @@ def sensors_of(log: Any, damage: PrintedDamage) -> dict[str, int]:
     """Find the first sensor of each kind that has data; for GPS, a fix."""
     found: dict[str, int] = {}
     for kind, columns in SENSORS.items():
-        names = {name for name, of in KINDS.items() if of == kind}
+        names = {kind, *(name for name, (of, _) in table().aliases.items() if of == kind)}
         least = FIX_2D if kind == "GPS" else 0.0
         seen: set[int] = set()
         for message in islice(each_of(log, damage, names), MAX_LOOKED_AT):
             values = (getattr(message, column, 0) for column in columns)
             if any(isinstance(v, int | float) and abs(v) >= least and v != 0 for v in values):
-                seen.add(sensor_of(message.get_type(), message))
+                seen.add(instance_of(message.get_type(), message))
             if 0 in seen:
                 break
         found[kind] = min(seen, default=0)

@@ -4,8 +4,6 @@ import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping
-from functools import cache
-from importlib.resources import files
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -27,20 +25,21 @@ from gateway.recordings.autopilot_record import (
 )
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats.dataflash import (
-    KINDS,
     LogClock,
     Message,
     PrintedDamage,
     each_of,
+    instance_of,
     items_of,
+    kind_of,
     open_log,
     own_us_of,
     remarks_of,
     sensors_of,
     system_id_of,
+    table,
     unix_us_at,
 )
-from gateway.recordings.message_table import MessageTable, read_table
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.workshop.extracts import CIRCLES
 from gateway.records import NAN
@@ -52,8 +51,6 @@ ARMED, DISARMED = 10, 11
 """Event ids in EV."""
 ORIGIN, HOME = 0, 1
 """Types of origin in ORGN."""
-INSTANCES: Final = ("I", "C", "Instance", "Inst", "IMU")
-"""Columns with the number of a sensor, filter or battery."""
 PLANS: Final = {"CMD": MISSION, "FNCE": FENCE, "RALY": RALLY}
 """Messages with items of plans."""
 EVENTS: Final = frozenset({"PARM", "MODE", "ARM", "EV", "STAT", "MSG", *PLANS})
@@ -101,12 +98,6 @@ _BOAT: Final = 2
 """Value of FRAME_CLASS for a boat."""
 
 
-@cache
-def table() -> MessageTable:
-    """Return the table of DataFlash."""
-    return read_table((files("gateway.recordings.formats") / "dataflash.toml").read_bytes())
-
-
 def topic_of(known: Any) -> tuple[str, int]:
     """Return topic and instance of a format; CURR in volts and amperes is a former name of BAT."""
     topic, instance = table().aliases.get(known.name, (known.name, 0))
@@ -114,14 +105,6 @@ def topic_of(known: Any) -> tuple[str, int]:
         is_scaled = known.format[known.columns.index("Volt")] != "f"
         topic = topic if is_scaled else "BAT"
     return topic, instance
-
-
-def instance_of(name: str, message: Message) -> int:
-    """Return the number of the sensor, filter or battery in a message, from 0."""
-    columns = {message.fmt.instance_field, *INSTANCES} & {*message.fmt.columns}
-    found = (getattr(message, column) for column in columns)
-    number = next((value for value in found if isinstance(value, int)), 0)
-    return number or table().aliases.get(name, ("", 0))[1]
 
 
 class RowReader:
@@ -139,7 +122,7 @@ class RowReader:
             topic, _, name = where.partition(".")
             self._columns.setdefault(topic, set()).add(name)
         self._items: dict[int, LoggedItem] = {}
-        self.names = {*table().topics, "ORGN", *KINDS}
+        self.names = {*table().topics, *table().aliases, "ORGN"}
         """Names of the messages that are read."""
 
     def feed(self, name: str, message: Message) -> list[Entry]:
@@ -214,9 +197,7 @@ class RowReader:
 
 def _has_time(name: str, message: Message) -> bool:
     columns = message.fmt.columns
-    return (
-        "TimeUS" in columns or "TimeMS" in columns or (KINDS.get(name) == "GPS" and "T" in columns)
-    )
+    return "TimeUS" in columns or "TimeMS" in columns or (kind_of(name) == "GPS" and "T" in columns)
 
 
 def _mode_of(m: Message, modes: Mapping[str, int]) -> int | None:

@@ -16,7 +16,9 @@ def records_at(*times_us: int) -> tuple[list[int], ArdupilotReader]:
     reader = ArdupilotReader(1)
     found = []
     for time_us in times_us:
-        message = SimpleNamespace(TimeUS=time_us, I=0, T=20.0, **dict.fromkeys(AXES, 0.0))
+        known = SimpleNamespace(instance_field="I", columns=["TimeUS", "I"])
+        axes = dict.fromkeys(AXES, 0.0)
+        message = SimpleNamespace(TimeUS=time_us, I=0, T=20.0, fmt=known, **axes)
         found += [r.time_us for r in reader.feed("IMU", message) if isinstance(r, ImuCalibrated)]
     return found, reader
 
