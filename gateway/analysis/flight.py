@@ -6,7 +6,6 @@ were processed, on the gateway clock.
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from gateway.aircraft import AircraftSettings
 from gateway.estimation.columns import NAV_ALT, NAV_FLAGS, NAV_LAT, NAV_LON, NAV_QUAT, NAV_VEL
 from gateway.estimation.reference import is_usable
-from gateway.estimation.select import Estimator, make_estimator
+from gateway.estimation.select import ESTIMATORS, Estimator
 from gateway.recordings.columns import NAV, NODE_TIME, RAW, has_group
 from gateway.recordings.fuse import (
     SMOOTHED_ESTIMATOR,
@@ -26,6 +25,7 @@ from gateway.recordings.fuse import (
     fuse,
     has_sample,
     samples_of,
+    samples_of_cells,
     with_estimator,
 )
 from gateway.recordings.reading import is_table, open_rows
@@ -33,9 +33,9 @@ from gateway.recordings.recorded_fusion import aircraft_for, check_latency
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable
 from gateway.recordings.table import TableBlock
 from gateway.recordings.workshop.joining import joined_tables
-from gateway.records import BaroSample, GpsFix, NavFlags
+from gateway.records import BaroSample, FusionState, GpsFix, NavFlags
 from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut
-from gateway.sensing.chain import ImuLog
+from gateway.sensing.chain import ImuLog, SensorChain
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 from gateway.vehicle_state.positions import LocalFrame
 
@@ -271,20 +271,56 @@ def _track_of_cells(cells: FloatArray) -> FlightTrack:
 
 def fuse_track(flight: Flight, settings: FusionSettings) -> FlightTrack:
     """Fuse a flight causally, from the samples only, with the estimator in the settings."""
-    estimator = estimator_of(flight, settings)
+    estimator = flight.samples.estimator_or_cold(settings.estimation)
     return track_of(flight.time_us, fuse(flight.samples, estimator).states)
 
 
-def estimator_of(flight: Flight, settings: FusionSettings) -> Estimator:
-    """Build the estimator in the settings, in the state stored at the start if that is valid."""
-    with suppress(ValueError):
-        return flight.samples.estimator(settings.estimation)
-    return make_estimator(settings.estimation)
+def tracks_by_estimator(
+    files: Sequence[Path], options: ReadOptions, step_us: int
+) -> tuple[int, dict[str, FlightTrack]]:
+    """Fuse a recording with each estimator, and keep a state every `step_us`.
+
+    The rows are not held in memory. Also returns the civil time of clock time zero, or 0. Raises
+    FlightError or OSError if a file cannot be read, ValueError for fewer than two IMU samples.
+    """
+    table = joined_tables([open_rows(file, options) for file in files])
+    aircraft = aircraft_for(files, table, options, keep=False)
+    table = joined_tables([open_rows(file, options) for file in files])
+    return table.header.unix_us_at_zero or 0, _tracks_of(table.blocks, aircraft, step_us)
+
+
+def _tracks_of(
+    blocks: Iterable[TableBlock], aircraft: AircraftSettings, step_us: int
+) -> dict[str, FlightTrack]:
+    chain, newest = SensorChain(aircraft.calibration), -1
+    estimators: dict[str, Estimator] = {}
+    times_us: list[IntArray] = []
+    states: dict[str, list[FloatArray]] = {name: [] for name in ESTIMATORS}
+    for block in blocks:
+        samples = samples_of_cells(block.cells, chain)
+        at_begin = [comment for row, comment in block.comments if row == 0]
+        begin = next((one for one in at_begin if isinstance(one, FusionState)), None)
+        samples = replace(samples, calibration=aircraft.calibration, begin=begin)
+        if not estimators and (len(block) or begin):
+            for name in ESTIMATORS:
+                estimation = with_estimator(aircraft, name).estimation
+                estimators[name] = samples.estimator_or_cold(estimation)
+        step = samples.imu.time_us // step_us
+        kept = np.flatnonzero(np.diff(np.maximum.accumulate(step), prepend=newest) > 0)
+        newest = max(newest, int(step.max(initial=newest)))
+        times_us.append(samples.imu.time_us[kept])
+        for name, estimator in estimators.items():
+            states[name].append(fuse(samples, estimator).states[kept])
+    if sum(map(len, times_us)) < 2:
+        raise ValueError("its IMU samples are too few for a flight")
+    moments_us = np.concatenate(times_us)
+    return {name: track_of(moments_us, np.concatenate(of)) for name, of in states.items()}
 
 
 def smooth_track(flight: Flight, settings: FusionSettings) -> tuple[FlightTrack, float]:
     """Smooth a flight; also return the GPS latency used, s. See `fuse`."""
-    estimator = estimator_of(flight, with_estimator(settings, SMOOTHED_ESTIMATOR))
+    estimation = with_estimator(settings, SMOOTHED_ESTIMATOR).estimation
+    estimator = flight.samples.estimator_or_cold(estimation)
     fused = fuse(flight.samples, estimator, smoothed=True)
     # Smoothed states are in order of time; the samples are not, if one came late.
     states = np.empty_like(fused.states)

@@ -26,7 +26,7 @@ from gateway.analysis.case import (
     summarise,
     withheld_error_m,
 )
-from gateway.analysis.flight import Flight, estimator_of, flight_of_files
+from gateway.analysis.flight import Flight, flight_of_files
 from gateway.analysis.pilot import PilotFlight, read_pilot_flight
 from gateway.analysis.sweep import Axis, SweepError, grid, make_contest, run_trial, score_of
 from gateway.batch.executors import Executor, WorkFailed
@@ -138,7 +138,8 @@ class JudgeTask(FlightTask):
             figures = {"summary": _known(recorded_summary(recorded))}
             return Worked(recorded.vehicle_id, began_text(recorded.begin_us), figures, made)
         case = make_case(read.flight, recorded=recorded)
-        states = fuse(read.flight.samples, estimator_of(read.flight, case.fusion)).states
+        samples = read.flight.samples
+        states = fuse(samples, samples.estimator_or_cold(case.fusion.estimation)).states
         lines = fused_lines(read.header, read.flight.time_us, states)
         made = {f"fused/{name}.csv": b"".join(lines)}
         if self.pages:

@@ -22,15 +22,13 @@ from typing import Any, Final
 import numpy as np
 
 from gateway import __version__
-from gateway.analysis.flight import FlightTrack, FloatArray, flight_of_files, fuse_track
+from gateway.analysis.flight import FlightTrack, FloatArray, tracks_by_estimator
 from gateway.analysis.metrics import euler_rad
 from gateway.analysis.processes import begin_copy
-from gateway.estimation.select import ESTIMATORS
 from gateway.panel.state.history import FlightHistory
 from gateway.panel.state.vehicle import VehicleState
 from gateway.printable import printable, reason_of
 from gateway.recordings.files import FlightError
-from gateway.recordings.fuse import with_estimator
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.tallies import FACT_IDS, VehicleTally
 from gateway.recordings.vehicle_reader import VehicleMessage
@@ -118,6 +116,8 @@ def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageF
         system_id = message.system_id
         if system_id not in flight.tallies:
             flight.tallies[system_id] = VehicleTally(recorded.senders.vehicle(system_id))
+            flight.aircraft[system_id] = VehicleState(system_id, "recorded")
+            flight.histories[system_id] = FlightHistory(MAX_ROWS)
         flight.tallies[system_id].update(message)
         _add(flight, message, tracks[system_id])
     flight.remarks += recorded.remarks
@@ -135,12 +135,11 @@ def _add(flight: PageFlight, message: VehicleMessage, track: Continuity) -> None
         if len(flight.texts) < MAX_TEXTS:
             flight.texts.append((time_us, system_id, text.severity, text.text))
         return
-    vehicle = flight.aircraft.setdefault(system_id, VehicleState(system_id, "recorded"))
+    vehicle, history = flight.aircraft[system_id], flight.histories[system_id]
     vehicle.state.update(MESSAGE_NAMES[message.message_id], message.fields, time_us)
     if (at := message.position) is None or vehicle.state.position is None:
         return
     place = (time_us, at.lat_deg, at.lon_deg, message.boot_us)
-    history = flight.histories.setdefault(system_id, FlightHistory(MAX_ROWS))
     if time_us - history.newest_us < STEP_US and len(history):
         return
     if track.is_broken_at(*place):
@@ -169,25 +168,19 @@ def add_comparison(flight: PageFlight, compared: Connection) -> None:
 def _compare(argument: tuple[Sequence[Path], ReadOptions], sender: Connection) -> None:
     """Send the civil time of clock time zero and the tracks, or the reason why there are none."""
     try:
-        sensors, table, _ = flight_of_files(*argument, name=argument[0][0].name)
-        tracks = {
-            name: fuse_track(sensors, with_estimator(sensors.fusion, name)) for name in ESTIMATORS
-        }
-        sender.send((table.header.unix_us_at_zero or 0, tracks))
+        sender.send(tracks_by_estimator(*argument, COMPARED_STEP_US))
     except (FlightError, OSError, ValueError) as error:
         sender.send((reason_of(error), {}))
 
 
 def _compared(track: FlightTrack, zero_us: int) -> dict[str, FloatArray]:
-    moments_us = np.arange(track.time_us[0], track.time_us[-1], COMPARED_STEP_US)
-    rows = np.searchsorted(track.time_us, moments_us)
-    angles = np.degrees(euler_rad(track.q_nb[rows]))
+    angles = np.degrees(euler_rad(track.q_nb))
     return {
-        "time_us": (track.time_us[rows] - zero_us).astype(float),
+        "time_us": (track.time_us - zero_us).astype(float),
         "roll_deg": angles[:, 0],
         "pitch_deg": angles[:, 1],
         "yaw_deg": angles[:, 2] % 360.0,
-        "alt_amsl_m": track.alt_amsl_m[rows],
+        "alt_amsl_m": track.alt_amsl_m,
     }
 
 

@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from typing import Final, NamedTuple, TypeVar
 
@@ -28,7 +29,7 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.columns import NAV_COLUMNS as STATE_COLUMNS
 from gateway.estimation.kernel import Aiding, CompiledEstimator, KernelEstimator, SampleLog
-from gateway.estimation.select import EstimationSettings, Estimator
+from gateway.estimation.select import EstimationSettings, Estimator, make_estimator
 from gateway.estimation.smoother import smooth
 from gateway.geometry.angle import wrap_180
 from gateway.recordings.columns import (
@@ -109,6 +110,12 @@ class Samples:
         """Build an estimator in the stored state; ValueError if the state is of other settings."""
         settings = AircraftSettings(calibration=self.calibration, estimation=estimation)
         return make_fusion(settings, self.begin)[1]
+
+    def estimator_or_cold(self, estimation: EstimationSettings) -> Estimator:
+        """Build an estimator in the stored state, or without state if that is of other settings."""
+        with suppress(ValueError):
+            return self.estimator(estimation)
+        return make_estimator(estimation)
 
 
 class Fused(NamedTuple):

@@ -150,13 +150,18 @@ class Replay:
 
 
 def aircraft_for(
-    files: Sequence[Path], table: RecordedTable, options: ReadOptions, given_s: float | None = None
+    files: Sequence[Path],
+    table: RecordedTable,
+    options: ReadOptions,
+    given_s: float | None = None,
+    *,
+    keep: bool = True,
 ) -> AircraftSettings:
     """Choose the settings for a flight, and complete them from the values in its log.
 
     `given_s` is the GPS latency that the user gives. If it must be estimated, the table is read
-    here, and its rows are kept for the next reader. FlightError if a value in a # line is out of
-    range.
+    here, and with `keep` its rows are kept for the next reader. FlightError if a value in a # line
+    is out of range.
     """
     aircraft = aircraft_of(table, options)
     facts = {} if is_table(files[0]) else facts_of(files[0])
@@ -167,7 +172,7 @@ def aircraft_for(
     known = is_table(files[0]) or "gps_latency_s" in facts
     if known or latency_s != USUAL.gps_latency_s:
         return aircraft
-    log = _log_of(table, aircraft)
+    log = _log_of(table, aircraft, keep=keep)
     if len(log.gps) == 0:
         return aircraft
     found = estimate_latency(log)
@@ -221,13 +226,14 @@ def smoothed_latency_in_words(used_s: float, set_s: float) -> str:
     )
 
 
-def _log_of(table: RecordedTable, aircraft: AircraftSettings) -> SampleLog:
-    """Read a table for `estimate_latency`, and keep its rows for the next reader."""
+def _log_of(table: RecordedTable, aircraft: AircraftSettings, *, keep: bool = True) -> SampleLog:
+    """Read a table for `estimate_latency`, and keep its rows for the next reader if wanted."""
     calibration, kalman = SensorChain(aircraft.calibration), _kalman_filter(aircraft)
     kept: list[PackedBlock] = []
     parts = [sample_log(samples_of_cells(NO_ROWS, calibration), kalman)]
     for block in table.blocks:
-        kept.append(PackedBlock.of(block))
+        if keep:
+            kept.append(PackedBlock.of(block))
         parts.append(sample_log(samples_of_cells(block.cells, calibration), kalman))
     table.blocks = (packed.block() for packed in kept)
     names = [field.name for field in fields(SampleLog)]
