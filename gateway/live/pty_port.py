@@ -22,6 +22,7 @@ CATCH_UP_S: Final = 2.0
 DROPS_AT_ONCE: Final = 64
 """Frames dropped in the time of writing one: they cost little more than their generation."""
 
+NAME: Final = "pseudo-terminal of the simulated receiver (/dev/ptmx)"
 MAX_BATCH: Final = 4
 """Maximum frames written before the loop's other work gets its turn; some are generated first."""
 
@@ -38,13 +39,17 @@ class PtyPort:
         self.ended = asyncio.Event()
         """Set after the last frame, and by closing."""
         self._frames = frames
+        try:
+            self._master, self._slave = os.openpty()
+        except OSError as error:
+            # Its own text names nothing: "No such device", or "out of pty devices".
+            raise OSError(error.errno, error.strerror, NAME) from error
         # Generated before `start`, since the first frame takes as long as many of the others.
         self._next = next(frames, None)
         self._rest = b""
         self._start_s = 0.0
         self._late_since_s: float | None = None
         self._timer: asyncio.Handle | None = None
-        self._master, self._slave = os.openpty()
         # Our own end of the slave stays open, so a reader that leaves causes no hang-up.
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)

@@ -6,6 +6,7 @@ import inspect
 import logging
 import socket
 import ssl
+import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -23,6 +24,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from gateway.clock import GatewayClock
+from gateway.hub.stats import LogRateLimiter
 from gateway.live.terminal import on_end_signals, on_parent_gone
 from gateway.panel.access import HOLDER, ROLE, AccessControl
 from gateway.panel.connections import ConnectionLimits, LimitedProtocol, LimitedServer
@@ -47,6 +49,9 @@ from gateway.panel.view_context import WEB, PanelParts
 
 log = logging.getLogger(__name__)
 
+PAGE_ERRORS_IN_FULL: Final = 5
+"""Failed events of pages that are logged one by one in a minute."""
+MAX_PAGE_ERROR: Final = 300
 WS_QUEUE: Final = 4
 """Maximum waiting messages of a WebSocket, of at most 1 MB each."""
 RECONNECT_S: Final = 30.0
@@ -77,6 +82,7 @@ def run_panel(
     parts = make_parts(settings, recordings, connect, control_socket)
     app = make_app(parts)
     logging.getLogger("uvicorn.error").addFilter(without_traceback)
+    logging.getLogger("nicegui").addFilter(PageErrors(parts.clock))
     limits = ConnectionLimits()
     config = uvicorn.Config(
         AccessControl(
@@ -132,6 +138,31 @@ def without_traceback(record: logging.LogRecord) -> bool:
     if record.exc_info and isinstance(record.exc_info[1], UnicodeDecodeError):
         record.exc_info = None
     return True
+
+
+class PageErrors(logging.Filter):
+    """Log the exceptions of events of pages in one line each, and only a few a minute.
+
+    Whoever has a page can forge its events, and each traceback has some 30 lines.
+    """
+
+    def __init__(self, now_us: Callable[[], int]) -> None:
+        super().__init__()
+        self._now_us = now_us
+        self._limit = LogRateLimiter(PAGE_ERRORS_IN_FULL, "more events of pages failed")
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a line is written, which has no traceback."""
+        error = record.exc_info[1] if record.exc_info else None
+        if error is None:
+            return True
+        frames = traceback.extract_tb(error.__traceback__)
+        where = f", {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+        text = f"an event of a page failed: {type(error).__name__}: {error}{where}"
+        lines = self._limit.add(text[:MAX_PAGE_ERROR], self._now_us())
+        record.msg, record.args = "; ".join(lines), None
+        record.exc_info = record.exc_text = None
+        return bool(lines)
 
 
 def make_parts(

@@ -1,6 +1,7 @@
 """The pseudo-terminal: every byte reaches a reader, and none is kept without one."""
 
 import asyncio
+import errno
 import os
 import select
 from collections.abc import Callable, Iterator
@@ -193,3 +194,16 @@ async def test_frames_that_are_made_too_slowly_are_not_all_dropped(
     reader.close()
     port.close()
     assert port.dropped < 10 * port.written
+
+
+def test_machine_without_terminals_is_named_before_frames_are_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def none_left() -> tuple[int, int]:
+        raise OSError(errno.ENODEV, "out of pty devices")
+
+    monkeypatch.setattr(os, "openpty", none_left)
+    made = frames(1)
+    with pytest.raises(OSError, match="pseudo-terminal of the simulated receiver"):
+        PtyPort(made)
+    assert next(made), "not started"

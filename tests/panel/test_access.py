@@ -23,9 +23,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from gateway.panel import access, logins
 from gateway.panel.access import COOKIE, MAX_BODY, MAX_LOGIN_BODY, ROLE, AccessControl
 from gateway.panel.logins import MAX_ATTEMPTS, Logins, hash_password, matches
-from gateway.panel.panel_server import PanelError, tls_files, without_traceback
+from gateway.panel.panel_server import PageErrors, PanelError, tls_files, without_traceback
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.response_headers import HEADERS, ScriptNonces
+from tests.conftest import ManualClock
 from tests.panel.web_client import OPERATOR, VIEWER
 
 HERE = "http://127.0.0.1:14590"
@@ -399,6 +400,25 @@ def test_request_with_invalid_text_is_one_line_in_the_log(error: Exception, is_k
     record = logging.LogRecord("uvicorn.error", logging.ERROR, "", 0, "Invalid", (), cause)
     assert without_traceback(record)
     assert (record.exc_info is not None) == is_kept
+
+
+def test_failed_events_of_pages_are_a_few_lines_without_a_traceback(
+    caplog: pytest.LogCaptureFixture, clock: ManualClock
+) -> None:
+    logger = logging.getLogger("tests.pages")
+    logger.addFilter(PageErrors(clock))
+    for number in range(40):
+        clock.now_us = 100_000_000 + number * 2_000_000
+        try:
+            {}["forged"]
+        except KeyError as error:
+            logger.exception(error)  # noqa: TRY401 -- as NiceGUI does
+    logger.warning("unchanged")
+    assert "Traceback" not in caplog.text
+    lines = [record.getMessage() for record in caplog.records]
+    assert lines[0].startswith("an event of a page failed: KeyError: 'forged', test_access.py:")
+    assert "25 more events of pages failed" in lines[5]
+    assert (len(lines), lines[-1]) == (11, "unchanged")
 
 
 @pytest.mark.parametrize(
