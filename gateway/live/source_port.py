@@ -58,6 +58,7 @@ TOKEN_BYTES: Final = 12
 NOT_OPEN: Final = {"refused": "connection refused", "unreachable": "unreachable"}
 """Reasons of states of a transport that has not given one."""
 GONE: Final = "the other side closed the connection"
+REPLACED: Final = "another client has connected"
 NO_CLIENT: Final = "no client is connected"
 
 
@@ -86,9 +87,13 @@ class _NewestClient(TcpListener):
     A board that lost its supply connects again long before its old connection has timed out.
     """
 
+    is_replacing = False
+
     def _has_room(self, host: str, now_us: int) -> bool:  # noqa: ARG002
+        self.is_replacing = True
         for client in tuple(self._clients.values()):
             self.leave(client)
+        self.is_replacing = False
         return True
 
 
@@ -127,7 +132,8 @@ class _SourceLink(ByteLink):
     def vanish(self, client: Client) -> None:
         """Note that the client of a listening port has gone."""
         super().vanish(client)
-        self._port.lost(GONE)
+        is_replaced = isinstance(self.link, _NewestClient) and self.link.is_replacing
+        self._port.lost(REPLACED if is_replaced else GONE)
 
     def tick(self, now_us: int) -> None:
         """Open the transport if it is closed, and note why it is not open."""
@@ -226,7 +232,7 @@ class SourcePort:
         reason = reason or (GONE if self._source.connected else "")
         if not reason or self._is_closed:
             return
-        if reason != NO_CLIENT and (self._source.connected or reason != self._complaint):
+        if reason not in (NO_CLIENT, REPLACED) and (self._source.connected or reason != self._complaint):
             log.warning("source %s: %s; trying again", self._source.url.name, reason)
         self._complaint = reason
         self._source.lost(reason)
