@@ -232,7 +232,8 @@ class SourcePort:
         reason = reason or (GONE if self._source.connected else "")
         if not reason or self._is_closed:
             return
-        if reason not in (NO_CLIENT, REPLACED) and (self._source.connected or reason != self._complaint):
+        is_new = self._source.connected or reason != self._complaint
+        if is_new and reason not in (NO_CLIENT, REPLACED):
             log.warning("source %s: %s; trying again", self._source.url.name, reason)
         self._complaint = reason
         self._source.lost(reason)
