@@ -69,7 +69,7 @@ KINDS: Final = {
 
 
 class GatewaySettings(Settings, frozen=True):
-    """All settings of the gateway."""
+    """The settings file: a section for each part, with the defaults where it says nothing."""
 
     serial: SerialSettings = SerialSettings()
     hub: HubSettings = HubSettings()
@@ -241,7 +241,7 @@ def exposed_secrets(
 
 
 def aircraft_file(settings: GatewaySettings, vehicle_id: int) -> Path:
-    """Return the path of one aircraft's file."""
+    """Return `ID.toml` in the folder of the aircraft; it exists only if something was stored."""
     return aircraft_folder(settings) / f"{vehicle_id}.toml"
 
 

@@ -84,7 +84,7 @@ class CatalogueError(UserError):
 
 @dataclass(frozen=True, slots=True)
 class CataloguedFile:
-    """One file of the catalogue, and its flights."""
+    """A file with the state at its last reading, and a flight for each of its vehicles."""
 
     path: str
     """Path relative to the folder of the catalogue."""
@@ -260,7 +260,6 @@ def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
 
 @contextmanager
 def _open_read_only(folder: Path) -> Iterator[sqlite3.Connection]:
-    """Open a catalogue read-only."""
     path = folder / CATALOGUE_NAME
     # If the disk is full, indexing leaves an empty file.
     if not path.exists() or not path.stat().st_size:

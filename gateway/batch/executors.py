@@ -80,7 +80,7 @@ class ThisProcess:
 
 
 class LocalProcesses:
-    """Processes of this machine."""
+    """Processes of this machine; one that dies fails its item only, and is replaced."""
 
     def __init__(self, jobs: int | None) -> None:
         self._jobs = jobs or cores()

@@ -58,7 +58,7 @@ class BatchItem(msgspec.Struct, frozen=True):
 
 
 def is_url(name: str) -> bool:
-    """Return whether a name is a URL, not a path."""
+    """Return whether fsspec has to open it; `file://` counts too."""
     return MARK in name
 
 

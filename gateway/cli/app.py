@@ -58,7 +58,7 @@ GROUPS: Final = {
         "demo": "Fly the simulated tracker repeatedly until interrupted.",
         "panel": "Show the aircraft in a browser: instruments, map, link, recordings, calibration, "
         "tuning.",
-        "status": "Show the status of the gateway: receiver, nodes, aircraft, clients.",
+        "status": "Show the status of the gateway: receiver, nodes, vehicles, clients.",
         "clients": "List, add and remove clients and sources, and mark a location for them.",
         "fleet": "Show the vehicles of many sites here, through a Zenoh router.",
     },

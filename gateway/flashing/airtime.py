@@ -51,7 +51,7 @@ def share(program: Program, settings: BoardSettings) -> float:
 
 
 def duty_cycle(frequency_khz: int) -> float | None:
-    """Return the duty cycle of the band, or None if the frequency is not in a band."""
+    """Return the share of time allowed in Europe, 0 to 1; None outside its bands."""
     found = (duty for first, last, duty in BANDS if first <= frequency_khz <= last)
     return next(found, None)
 

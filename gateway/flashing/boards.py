@@ -73,7 +73,7 @@ class FlashError(Exception):
 
 
 class Program(IntEnum):
-    """The program of an image."""
+    """The board that an image is for, by its number in the settings block."""
 
     IMU = 1
     GPS = 2

@@ -31,7 +31,7 @@ class ArmedWatch:
         return bool(self._armed(now_us).keys() - own)
 
     def vehicles(self, now_us: int) -> VehicleLocations:
-        """Return the locations of the armed vehicles."""
+        """Return latitude and longitude of each armed vehicle, deg; None without a position."""
         return {
             system_id: None if (at := state.position) is None else (at.lat_deg, at.lon_deg)
             for system_id, state in self._armed(now_us).items()

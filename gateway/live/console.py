@@ -97,7 +97,7 @@ class LiveView:
         self._snapshots: deque[Snapshot] = deque(maxlen=RATE_SNAPSHOTS)
 
     def draw(self, snapshot: Snapshot) -> RenderableType:
-        """Build the view of one snapshot."""
+        """Lay out one snapshot for the size of the terminal; takes some milliseconds."""
         self._snapshots.append(snapshot)
         top: list[RenderableType] = [_link_line(snapshot), *_recorder_line(snapshot.recorder)]
         if self.link:

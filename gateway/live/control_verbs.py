@@ -44,7 +44,7 @@ VehicleId = Annotated[int, msgspec.Meta(ge=1, le=255)]
 
 
 class RecorderVerbs:
-    """`record.*`."""
+    """The verbs `record.*`, which answer when the disk has done what was asked."""
 
     def __init__(self, recorder: Recorder, has_vehicle: Callable[[], bool] = lambda: True) -> None:
         self._recorder, self._has_vehicle = recorder, has_vehicle

@@ -194,7 +194,7 @@ def prometheus_text(snapshot: Snapshot) -> Iterator[str]:
 
 
 def families(snapshot: Snapshot) -> Iterator[Metric]:
-    """Yield the metrics of a snapshot."""
+    """Yield gauges and counters: of the gateway first, then of its parts."""
     report = snapshot.report
     yield from _families(gauge, "", GATEWAY_GAUGES, (), [((), snapshot)])
     yield from _families(counter, "", GATEWAY_COUNTERS, (), [((), snapshot)])

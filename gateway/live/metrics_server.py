@@ -38,7 +38,7 @@ class MetricsServer:
 
     @property
     def port(self) -> int:
-        """The port that is bound, or 0."""
+        """The port that is bound; 0 before, or if another program has it."""
         return self._sockets[0].getsockname()[1] if self._sockets else 0
 
     def listen(self, port: int) -> None:

@@ -80,7 +80,7 @@ def other_gateways() -> list[Gateway]:
 
 
 def log_other_gateways() -> None:
-    """Log the other gateways that run."""
+    """Log the other gateways at the start; `conflicts` with them are warned of."""
     for other in other_gateways():
         # No fault: a fleet on one machine is two gateways. `conflicts` are warned of.
         log.info("another gateway runs here: %s", other)

@@ -24,7 +24,7 @@ SEEKING: Final = "seeking"
 
 @dataclass(frozen=True, slots=True)
 class PlayerStatus:
-    """State of the player."""
+    """Position and speed of the playback, as shown and sent by the control socket."""
 
     state: str
     position_s: float
@@ -86,18 +86,18 @@ class PlayerEdge:
         self._turn()
 
     def close(self) -> None:
-        """Stop."""
+        """Cancel the timer; the owner of the recordings closes them."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
     def pause(self) -> PlayerStatus:
-        """Pause."""
+        """Stay at the present frame; heartbeats go on."""
         self._player.pause(self._clock())
         return self._turned()
 
     def resume(self) -> PlayerStatus:
-        """Resume."""
+        """Play on from the present frame at the same speed."""
         self._player.resume(self._clock())
         return self._turned()
 

@@ -150,7 +150,7 @@ class Recorder:
             await self._turned.wait()
 
     def record(self) -> None:
-        """Record from now on."""
+        """Record until `stop`, whatever the setting `mode`; opens files at the next turn."""
         self._session.start()
         self._wake.set()
 

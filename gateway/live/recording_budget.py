@@ -20,7 +20,7 @@ class RecordingBudget:
         self._trusted: dict[int, TokenBucket] = {}
 
     def note(self, client_id: int, now_us: int, *, trusted: bool) -> None:
-        """Note whether a client is trusted."""
+        """Give a trusted client a quota of its own; all others share one."""
         if not trusted:
             self._trusted.pop(client_id, None)
         elif client_id not in self._trusted:

@@ -290,7 +290,7 @@ class SerialPort:
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open."""
+        """Whether the port is open; a receiver behind it may send nothing."""
         return self._port is not None
 
     def start(self) -> None:
@@ -298,7 +298,7 @@ class SerialPort:
         self._open()
 
     def close(self) -> None:
-        """Close the port for good."""
+        """Close the port without another attempt to open it."""
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None

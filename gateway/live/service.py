@@ -57,7 +57,7 @@ class ServiceNotifier:
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // NS_PER_US}")
 
     def stopping(self) -> None:
-        """Report that the service is stopping."""
+        """Report to systemd an end on purpose, and send no more keepalives."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -116,7 +116,7 @@ class RecordingSettings(Settings, frozen=True):
 
 
 class SessionState(StrEnum):
-    """State of the recording."""
+    """The states of the table in this module's head."""
 
     IDLE = "idle"
     OPENING = "opening"

@@ -126,7 +126,7 @@ class _SourceLink(ByteLink):
         self._port.feed(data)
 
     def greet(self, client_id: int) -> None:  # noqa: ARG002
-        """Note that it is open."""
+        """Log that it is open, so that its next fault is logged again."""
         self._port.opened()
 
     def vanish(self, client: Client) -> None:
@@ -186,7 +186,7 @@ class SourcePort:
         self._link.tick(self._hub.now_us())
 
     def close(self) -> None:
-        """Close it for good."""
+        """Close it without another attempt to open it."""
         self._is_closed = True
         if self._timer is not None:
             self._timer.cancel()
@@ -218,7 +218,7 @@ class SourcePort:
             await asyncio.sleep(RETRY_S)
 
     def opened(self) -> None:
-        """Note that it is open."""
+        """Log that it is open, so that its next fault is logged again."""
         log.info("source %s is open", self._source.url.name)
         self._complaint = ""
         self._source.opened()

@@ -426,7 +426,6 @@ class _Collecting:
 
 
 def _capture_live(vehicle: int) -> Capture:
-    """Return a capture from the running gateway."""
     for aircraft in ask("status")["aircraft"]:
         boards = aircraft["boards"] if aircraft["vehicle_id"] == vehicle else ()
         for board in boards:

@@ -287,7 +287,7 @@ def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
 
 
 def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check which extras are installed."""
+    """Name the missing extras, their use, and the command that installs each."""
     for extra, use in EXTRA_USES.items():
         if missing(extra):
             yield info("extra", how_to_add(use, extra))

@@ -115,7 +115,7 @@ class OneLineFormatter(PrintableFormatter):
     """Formatter of a record as one line, so that the gateway logs a traceback as one record."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the record as one line."""
+        """Join the lines by `LINE_BREAK`; the middle of a long record is left out."""
         text = super().format(record)
         if len(text) > LONGEST_RECORD:
             head = text.partition("\n")[0][:LONGEST]

@@ -423,7 +423,6 @@ def _height_text(figures: FlightFigures) -> str:
 
 
 def _each(figures: list[FlightFigures], text: Callable[[FlightFigures], str]) -> str:
-    """Return one figure of each vehicle as text."""
     return " ".join(map(text, figures)) or UNKNOWN
 
 

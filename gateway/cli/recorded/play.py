@@ -189,7 +189,7 @@ def step(count: Annotated[int, typer.Argument(min=1, help="Frames.")] = 1) -> No
 
 @group.command("speed")
 def set_speed(speed: Annotated[str, typer.Argument(help="0.1 to 100, or max.")]) -> None:
-    """Set the speed."""
+    """Play faster or slower from now on."""
     value = _speed(speed)
     wanted = None if value == AS_FAST_AS_POSSIBLE else value
     _show(ask("play.speed", {"speed": wanted}, of="play"))

@@ -199,7 +199,6 @@ def _drawn(make: Callable[[], Report], output: Path) -> Path:
 
 
 def _read_recorded(path: Path, settings: GatewaySettings, options: ReadOptions) -> PilotFlight:
-    """Read the flight as its recording contains it."""
     from gateway.analysis.pilot import read_pilot_flight
 
     files = files_of([path], folder_of(settings), "tlogs")

@@ -26,7 +26,7 @@ def socket_of(of: str) -> Path:
 
 
 def is_running() -> bool:
-    """Return whether a gateway of this user is running."""
+    """Return whether a gateway can be asked; a socket that the user gave is not tried."""
     return SOCKET.get() is not None or bool(live_sockets("run"))
 
 

@@ -67,7 +67,7 @@ def guide_phone(settings: GatewaySettings, file: Path, head: Callable[[str], Non
 def _with_phone(
     sources: tuple[SourceSettings, ...],
 ) -> tuple[str, tuple[SourceSettings, ...]]:
-    """Return the token of the phone, and the sources with the phone."""
+    """Keep the token of a phone in the settings, or add one; the app has stored its URL."""
     token = secrets.token_urlsafe(TOKEN_BYTES)
     for each in sources:
         if each.url.startswith(KIND):
