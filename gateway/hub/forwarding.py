@@ -56,7 +56,11 @@ class Forwarding:
         """Rows of the routes used before that are free."""
         self._failed = np.zeros((step.MAX_FAILED, step.FAILED_WORDS), np.int64)
         records = np.zeros(step.READS * step.MAX_RECORD, np.uint8)
-        memory = (buffer, received, self._outbox.words, self._table, self._failed, records)
+        self._newest = np.zeros((MAX_COMPILED, step.MAX_FRAME), np.uint8)
+        memory = (
+            *(buffer, received, self._outbox.words, self._table, self._failed),
+            *(records, self._routes, self._newest),
+        )
         work = np.zeros(step.WORDS, np.int64)
         work[step.MOST] = len(buffer)
         work[step.BUFFER_AT :] = [address_of(each) for each in memory]
@@ -86,7 +90,7 @@ class Forwarding:
             row = self._free.pop()
         else:
             row, self._used = self._used, self._used + 1
-        self._routes[row] = seed, targets_at, stream_at, heard_at, 0, 0
+        self._routes[row] = seed, targets_at, stream_at, heard_at, 0, 0, 0, 0
         number = int.from_bytes(key, "little")
         entry = step.entry_of(client_id, number)
         while entry in self._filled:
@@ -109,6 +113,7 @@ class Forwarding:
                 gap = entry
         table[gap, step.KEY_CLIENT] = 0
         self._filled.discard(gap)
+        self._routes[row, step.NEWEST_SIZE] = 0
         self._free.append(row)
 
     def settle(self, row: int) -> tuple[int, int]:
@@ -120,6 +125,15 @@ class Forwarding:
         size = words[row, step.SIZE]
         words[row, step.FRAMES] = words[row, step.SIZE] = 0
         return frames, size
+
+    def newest(self) -> list[tuple[bytes, int]]:
+        """Return the newest frame of each route that had one since the last call, and its time."""
+        routes, found = self._routes[: self._used], []
+        for row in np.flatnonzero(routes[:, step.NEWEST_SIZE]).tolist():
+            size, time_us = routes[row, step.NEWEST_SIZE :].tolist()
+            found.append((self._newest[row, :size].tobytes(), time_us))
+        routes[:, step.NEWEST_SIZE] = 0
+        return found
 
     def clear(self) -> None:
         """Discard all routes."""

@@ -37,7 +37,7 @@ from gateway.compiled.messages import (
     send_parts,
 )
 from gateway.compiled.system_calls import MSG_TRUNC, receive_many
-from gateway.hub.stream_words import ACCEPTED, LEADER, NEWEST_US, STREAM_WORDS
+from gateway.hub.stream_words import ACCEPTED, HALF, LAST, LEADER, LOST, NEWEST_US, STREAM_WORDS
 from gateway.wire.frame_scan import SEQUENCE, TIME_SIZE, frame_holds, frame_key, frame_size
 
 MAX_DATAGRAM: Final = 4096
@@ -55,26 +55,29 @@ FRAME, TARGETS, RUN_SIZE, FAILED, TIME_US, TIME_STEP, RECORDS_SIZE = range(10, 1
 """Size of the frame that is passed to Python, if it is one; the address of the targets of the run,
 its bytes, and the number of failed targets; the time of its first record, and between two, and the
 bytes of all."""
-BUFFER_AT, HEADERS_AT, OUTBOX_AT, TABLE_AT, FAILED_AT, RECORDS_AT = range(17, 23)
-"""Addresses of the other memory."""
-WORDS: Final = 23
+BUFFER_AT, HEADERS_AT, OUTBOX_AT, TABLE_AT, FAILED_AT = range(17, 22)
+RECORDS_AT, ROUTES_AT, NEWEST_AT = range(22, 25)
+"""Addresses of the other memory; `NEWEST_AT` is that of the newest frame of each route."""
+WORDS: Final = 25
 CLIENT_ID, INPUT, OUTPUT, WAY, IS_PLAIN, LARGEST, CUT, RECEIVED, RECEIVED_SIZE, HEARD_US = range(10)
 """Words of a client: its id; the files to receive from and to send to, or -1, and the mode of
 sending; whether its frames may be forwarded without Python; the size of its largest recent
 datagram; datagrams that were cut, frames and bytes that were forwarded, time of the last one."""
 CLIENT_WORDS: Final = 10
-SEED, TARGETS_OF, STREAM_AT, HEARD_AT, FRAMES, SIZE = range(6)
+SEED, TARGETS_OF, STREAM_AT, HEARD_AT, FRAMES, SIZE, NEWEST_SIZE, ROUTE_US = range(8)
 """Words of a route: seed of the checksum, addresses of its targets, of the stream of its system and
-of the time when the system was received last; numbers of frames and bytes."""
-ROUTE_WORDS: Final = 6
+of the time when the system was received last; numbers of frames and bytes; size and time of the
+newest frame."""
+ROUTE_WORDS: Final = 8
 TARGET_COUNT, HAS_OTHERS, SENT, SENT_SIZE, FIRST_TARGET = range(5)
 """Words of targets: number of clients, whether Python serves others, frames and bytes sent to each,
 address of the first."""
 KEY_CLIENT, KEY, ROUTE_AT = range(3)
 """Words of an entry of the table."""
 ENTRIES: Final = 65_536
-MAX_RECORD: Final = TIME_SIZE + 280
-"""Maximum size of a recorded frame, bytes."""
+MAX_FRAME: Final = 280
+MAX_RECORD: Final = TIME_SIZE + MAX_FRAME
+"""Maximum sizes of a frame, and of one with its time, bytes."""
 FAILED_WORDS: Final = 4
 """Words of a failed client: index among the targets, number of frames sent, number of the error,
 and bytes of the next frame that were sent."""
@@ -150,6 +153,7 @@ def _walk(work: Any, client: Any, headers: Any, outbox: Any) -> None:
                 if work[STATUS] & RUN_SENT:
                     return
             _gather(work, client, outbox, route, data, begin, size)
+            _keep(work, found, route, data, begin, size)
             begin += size
             work[OFFSET] += size
         work[TAKEN] += headers[work[AT], LENGTH]
@@ -179,6 +183,28 @@ def _route_of(work: Any, client: Any, data: Any, begin: int) -> int:
 
 
 @compiled
+def count_sequence(stream: Any, sequence: int) -> None:
+    """Count an accepted frame of a stream, and those lost before it."""
+    ahead = (sequence - stream[LAST]) & 0xFF
+    if stream[ACCEPTED] == 0:
+        stream[LAST] = sequence
+    elif 0 < ahead < HALF:
+        stream[LOST] += ahead - 1
+        stream[LAST] = sequence
+    stream[ACCEPTED] += 1
+
+
+@compiled
+def _keep(work: Any, route_at: int, route: Any, data: Any, begin: int, size: int) -> None:
+    """Keep a frame as the newest of its route."""
+    row = (route_at - work[ROUTES_AT]) // (8 * ROUTE_WORDS)
+    newest = array_at(work[NEWEST_AT] + row * MAX_FRAME, (MAX_FRAME,), _BYTE)
+    for i in range(size):
+        newest[i] = data[begin + i]
+    route[NEWEST_SIZE], route[ROUTE_US] = size, work[NOW_US]
+
+
+@compiled
 def _gather(
     work: Any, client: Any, outbox: Any, route: Any, data: Any, begin: int, size: int
 ) -> None:
@@ -189,8 +215,8 @@ def _gather(
     work[TARGETS] = route[TARGETS_OF]
     work[RUN_SIZE] += size
     stream = array_at(route[STREAM_AT], (STREAM_WORDS,), _INT)
+    count_sequence(stream, int(data[begin + SEQUENCE]))
     stream[data[begin + SEQUENCE]] = stream[NEWEST_US] = work[NOW_US]
-    stream[ACCEPTED] += 1
     stream[LEADER] = client[CLIENT_ID]
     heard = array_at(route[HEARD_AT], (1,), _INT)
     heard[0] = client[HEARD_US] = work[NOW_US]

@@ -18,7 +18,7 @@ from gateway.hub.forwarding_step import MOST
 from gateway.hub.limits import TokenBucket
 from gateway.hub.round_trip import RoundTrip
 from gateway.hub.router import Router
-from gateway.hub.routing_table import Origin, OwnVehicles
+from gateway.hub.routing_table import FrameStream, Origin, OwnVehicles
 from gateway.hub.send_queue import NOT_TELEMETRY_IDS, Numbering
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import (
@@ -243,6 +243,17 @@ class Hub:
         if self._vehicles.register(frame, now_us):
             self._fanout.clear()
         self._fanout.publish(frame, sequence, now_us)
+
+    def newest_frames(self) -> list[tuple[bytes, int]]:
+        """Return the newest frames that were forwarded unobserved since the last call, and times.
+
+        One frame of each kind from each client.
+        """
+        return self.forwarding.newest()
+
+    def streams(self) -> dict[Origin, FrameStream]:
+        """Return the frames of each system and component that have been received."""
+        return self._router.streams()
 
     def routed_vehicles(self) -> set[int]:
         """Return the routed systems that are neither ours nor ground stations."""

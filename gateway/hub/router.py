@@ -72,7 +72,8 @@ class Router:
         self._on_frame = on_frame
         self._on_foreign = on_foreign
         self._rejects = rejects
-        self._table = RoutingTable(fanout.clear)
+        self._table = table = RoutingTable(fanout.clear)
+        self.streams = table.streams
         fanout.hears_only_others = lambda key, system: self._table.systems(key).are_only_others(
             system
         )

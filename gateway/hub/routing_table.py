@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Final, Generic, TypeVar
 
-from gateway.hub.stream_words import ACCEPTED, LEADER, NEWEST_US, STREAM_WORDS
+from gateway.hub.stream_words import ACCEPTED, HALF, LAST, LEADER, LOST, NEWEST_US, STREAM_WORDS
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS, boot_time_us
 from gateway.wire.mavlink_splitter import MavFrame
@@ -97,6 +97,11 @@ class FrameStream:
         return self.words[ACCEPTED]
 
     @property
+    def lost(self) -> int:
+        """The number of sequence numbers that were left out."""
+        return self.words[LOST]
+
+    @property
     def leader(self) -> int:
         """The client that brought the newest frame."""
         return self.words[LEADER]
@@ -109,6 +114,12 @@ class FrameStream:
     def accept(self, sequence: int, client_id: int, sent_us: int) -> None:
         """Register a frame that is neither a copy nor late."""
         words = self.words
+        ahead = sequence - words[LAST] & 0xFF
+        if not words[ACCEPTED]:
+            words[LAST] = sequence
+        elif 0 < ahead < HALF:
+            words[LOST] += ahead - 1
+            words[LAST] = sequence
         words[ACCEPTED] += 1
         words[sequence] = sent_us
         if sent_us >= words[NEWEST_US]:
@@ -311,6 +322,10 @@ class RoutingTable:
         """Return the sequence number of the newest frame of a system; 0 if there is none."""
         paths = self._to.get(origin)
         return next(iter(paths.values())).stream.newest_sequence() if paths else 0
+
+    def streams(self) -> dict[Origin, FrameStream]:
+        """Return the frames of each system and component."""
+        return {origin: next(iter(paths.values())).stream for origin, paths in self._to.items()}
 
     def is_shared(self, origin: Origin, now_us: int) -> bool:
         """Return whether a system has been received recently on more than one path."""

@@ -169,6 +169,7 @@ class Daemon:
             lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
             self._introduction,
             self._locations,
+            lambda: self._hub.observe(runs=self._recorder.takes_frames),
             # A simulated time begins with the machine's, and is late by the start-up.
             gps_time=self._receiver is None,
         )
@@ -198,6 +199,7 @@ class Daemon:
         asyncio.get_running_loop().set_default_executor(begin_worker("lookups", 8))
         self._hub.start()
         self._recorder.start()
+        self._hub.observe(runs=self._recorder.takes_frames)
         self._serve_metrics()
         self._serial.start()
         for source in self._sources:
@@ -289,7 +291,9 @@ class Daemon:
     def _vehicle_rows(self) -> tuple[VehicleRow, ...]:
         link = ", ".join(source.url for source in self._pipeline.report.sources)
         own = {key: one.vehicle.telemetry.mode[1] for key, one in self._pipeline.aircraft.items()}
-        return self._vehicles.rows(self.now_us(), own, self._hub.clients(), link or RECEIVER)
+        return self._watch_vehicles().rows(
+            self.now_us(), own, self._hub.clients(), link or RECEIVER
+        )
 
     def _serve_metrics(self) -> None:
         port = self._settings.hub.metrics_port
@@ -304,7 +308,7 @@ class Daemon:
         from gateway.live.system_metrics import system_families
 
         yield from prometheus_text(self.snapshot())
-        yield from text_of(system_families(self._vehicles, self.now_us()))
+        yield from text_of(system_families(self._watch_vehicles(), self.now_us()))
 
     def announce(self, text: str) -> None:
         """Announce an event that is not a problem to the ground stations."""
@@ -388,14 +392,16 @@ class Daemon:
         now_us = self.now_us()
         for frame in frames:
             self._record(frame)
-            self._vehicles.feed_received(frame, now_us)
+            self._vehicles.feed(frame_of(frame), now_us)
+
+    def _watch_vehicles(self) -> VehicleWatch:
+        """Return the states of all vehicles, brought up to date."""
+        self._vehicles.update(self._hub.newest_frames(), self._hub.streams())
+        return self._vehicles
 
     def _record_run(self, run: Run) -> None:
         # No secret is among them: messages with a target are not forwarded in runs.
-        now_us = self.now_us()
         self._recorder.run(run)
-        for frame in run.run():
-            self._vehicles.feed_received(frame, now_us)
 
     def _record(self, frame: bytes) -> None:
         """Record a frame of another sender, unless it contains a key or a password."""

@@ -7,11 +7,11 @@ numbers; with several links to one system, only frames that all of them lost cou
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.hub.routing_table import FrameStream, Origin
 from gateway.hub.stats import ClientStats
 from gateway.status import VehicleRow
 from gateway.units import US_PER_S
@@ -23,28 +23,15 @@ MAX_SYSTEMS: Final = 32
 """Maximum vehicles; more are forged."""
 DECODED_US: Final = US_PER_S // 5
 """Minimum interval at which messages of one kind are decoded."""
-HALF: Final = 128
-"""A sequence number that is further ahead is an older one, of a late or repeated frame."""
 RECEIVER: Final = "receiver"
 """Link of a vehicle of the receiver's boards."""
 
 
-@dataclass(slots=True)
-class FrameCounter:
+class FrameCounter(NamedTuple):
     """Frame counters of the vehicle of a system."""
 
-    sequence: int
-    frames: int = 0
-    lost: int = 0
-
-    def count(self, sequence: int) -> None:
-        """Count a frame with this sequence number."""
-        ahead = (sequence - self.sequence) & 0xFF
-        if self.frames and not 0 < ahead < HALF:
-            return
-        self.lost += ahead - 1 if self.frames else 0
-        self.frames += 1
-        self.sequence = sequence
+    frames: int
+    lost: int
 
 
 class VehicleWatch:
@@ -57,13 +44,17 @@ class VehicleWatch:
         self._decoded_us: dict[tuple[int, int], int] = {}
         """When each message of each system was last decoded."""
 
-    def feed_received(self, data: bytes, now_us: int) -> None:
-        """Process a frame that was received from another sender."""
-        frame = frame_of(data)
-        self.feed(frame, now_us)
-        if self._vehicles.components.is_known(*frame.origin):
-            stream = self.streams.setdefault(frame.origin[0], FrameCounter(frame.sequence))
-            stream.count(frame.sequence)
+    def update(
+        self, newest: Iterable[tuple[bytes, int]], streams: Mapping[Origin, FrameStream]
+    ) -> None:
+        """Process the newest frames of others with their times, and all their sequence numbers."""
+        for data, time_us in newest:
+            self.feed(frame_of(data), time_us)
+        self.streams = {
+            origin[0]: FrameCounter(stream.count, stream.lost)
+            for origin, stream in streams.items()
+            if self._vehicles.components.is_known(*origin)
+        }
 
     def feed(self, frame: MavFrame, now_us: int) -> None:
         """Process a frame of a vehicle, received or of our own."""

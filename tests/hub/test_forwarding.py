@@ -321,4 +321,11 @@ async def test_runs_are_passed_on_only_while_they_are_observed(rig: Rig) -> None
             records = b"".join(time + frame for time, frame in zip(times, frames, strict=True))
             assert runs == [(frames, records)]
     assert len(runs) == 1
-    assert hub.counters().forwarded == 11
+    assert hub.newest_frames() == [(frames[-1], rig.clock())]
+    assert hub.newest_frames() == []
+    stream = hub.streams()[7, 1]
+    assert (stream.count, stream.lost) == (11, 0)
+    link.sender.link.seq += 3
+    link.send(link.sender.attitude())
+    await rig.until(lambda: stream.lost == 3)
+    assert hub.counters().forwarded == 12

@@ -309,7 +309,7 @@ class TestHub:
         assert self.origins(second) == [(1, number)] * 3
         if hub.forwarding.is_compiled:
             [source, *_] = hub._clients.values()
-            assert any(route._words is not None for route in source.routes.values())
+            assert any(route.is_compiled for route in source.routes.values())
         await self.say(rig, (second, heartbeat(), 2, 1), (first, message, 1, 1))
         passes = message is not ODOMETRY and self.origins(seat)[-1] == (1, number)
         assert self.origins(second) == []

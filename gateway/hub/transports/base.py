@@ -25,7 +25,7 @@ from gateway.hub.stats import ClientCounters, ClientStats, ListenerStats
 from gateway.hub.systems import SystemTranslation
 from gateway.printable import reason_of
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import CRC_EXTRA
+from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import (
     KEY_SIZE_V2,
@@ -51,6 +51,8 @@ VERSION_PROBE_US: Final = 5 * US_PER_S
 RETRY_US: Final = US_PER_S
 """Interval of attempts to reopen a socket."""
 
+EXAMINED: Final = frozenset({RADIO_STATUS, MESSAGE_IDS["AVAILABLE_MODES"]})
+"""Messages of which Python examines each, not only the newest."""
 OnForeign = Callable[[Sequence[bytes]], None]
 """Called with frames of other systems that are forwarded, in their order."""
 STALE_AFTER_US: Final = 3 * US_PER_S
@@ -205,7 +207,7 @@ class Route:
     def enter(self, forwarding: Forwarding, key: bytes) -> None:
         """Let the compiled step forward such frames, unless it needs more than their headers."""
         seed = CRC_EXTRA.get(self.message_id)
-        is_plain = self._rejects is None and self.message_id != RADIO_STATUS
+        is_plain = self._rejects is None and self.message_id not in EXAMINED
         if (
             seed
             and is_plain
