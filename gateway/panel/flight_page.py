@@ -222,6 +222,7 @@ def _data_of(flight: PageFlight) -> dict[str, Any]:
                 "system_id": system_id,
                 "title": printable(flight.aircraft[system_id].name),
                 "model": flight.aircraft[system_id].model,
+                "battery_name": flight.aircraft[system_id].battery_name,
                 "home": _spot(flight.aircraft[system_id].home),
                 "columns": dict(_columns_of(history, zero_us)),
                 "breaks": [time_us - zero_us for time_us in flight.breaks.get(system_id, ())],

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.columns import (
@@ -34,7 +35,7 @@ from gateway.vehicle_state.senders import RecordedSender, Senders
 from gateway.wire.frame_scan import TIME_SIZE
 from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS, MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import SEQUENCE_V1, SEQUENCE_V2, START_V2
-from gateway.wire.recorded_frames import Batch, IntArray
+from gateway.wire.recorded_frames import Batch, IntArray, columns_of
 
 ERROR: Final = 3
 """MAV_SEVERITY_ERROR; lower numbers are more severe."""
@@ -47,6 +48,7 @@ SURFACE_TYPES: Final = frozenset(
 """Values of MAV_TYPE that never fly."""
 STATES, FIXES = "states", "GPS fixes"
 """Rows with the positions of a table."""
+Columns = NDArray[np.void]
 UNKNOWN_U8, UNKNOWN_U16 = 0xFF, 0xFFFF
 MAX_DROP: Final = 10_000
 """Greatest valid drop_rate_comm, 100 %."""
@@ -60,8 +62,13 @@ _IDS: Final = {
         *("GPS_RAW_INT", "GPS2_RAW", "PARAM_VALUE", "AUTOPILOT_VERSION"),
     )
 }
-FACT_IDS: Final = frozenset({HEARTBEAT_ID, *_IDS.values()})
-"""Messages from which the facts are computed, in addition to positions, attitudes and texts."""
+FACT_IDS: Final = frozenset(
+    {
+        HEARTBEAT_ID,
+        *(_IDS[name] for name in ("EXTENDED_SYS_STATE", "HOME_POSITION", "AUTOPILOT_VERSION")),
+    }
+)
+"""Messages that are read one by one, in addition to positions, attitudes and texts."""
 _VELOCITY: Final = ("nav_vel_north_mps", "nav_vel_east_mps", "nav_vel_down_mps")
 _PLACED: Final = [
     COLUMNS.index(name)
@@ -82,20 +89,23 @@ class VehicleTally(FlightTally):
         self.firmware: str | None = None
         """Version of the autopilot's firmware."""
         self.is_surface = (vehicle.heartbeat or (0, 0))[0] in SURFACE_TYPES
-        self._parameters: dict[bytes, bytes] = {}
-        self._drops: list[int] = []
+        self._parameters: dict[bytes, float] = {}
+        self._drops = np.zeros(2, np.int64)
+        """Sum and number of the reported losses."""
         self._sequence: int | None = None
         self._gps_id = vehicle.position_id if vehicle.position_id in GPS_IDS else GPS_IDS[0]
         self._handlers = {
             HEARTBEAT_ID: self._on_heartbeat,
             _IDS["EXTENDED_SYS_STATE"]: self._on_landed,
             _IDS["HOME_POSITION"]: self._on_home,
-            _IDS["BATTERY_STATUS"]: self._on_battery,
-            _IDS["SYS_STATUS"]: self._on_status,
-            _IDS["VIBRATION"]: self._on_vibration,
-            _IDS["PARAM_VALUE"]: self._on_parameter,
             _IDS["AUTOPILOT_VERSION"]: self._on_version,
-            **dict.fromkeys(GPS_IDS, self._on_gps),
+        }
+        self._column_handlers = {
+            _IDS["BATTERY_STATUS"]: self._add_batteries,
+            _IDS["SYS_STATUS"]: self._add_status,
+            _IDS["VIBRATION"]: self._add_vibrations,
+            _IDS["PARAM_VALUE"]: self._add_parameters,
+            self._gps_id: self._add_fixes,
         }
 
     @property
@@ -107,16 +117,18 @@ class VehicleTally(FlightTally):
     @property
     def radio_loss(self) -> float | None:
         """See `FlightFacts`."""
-        return float(np.mean(self._drops)) / MAX_DROP if self._drops else None
+        total, number = self._drops.tolist()
+        return total / number / MAX_DROP if number else None
 
     @property
     def settings_checksum(self) -> str | None:
         """Checksum of the parameters; None without any."""
         sent = sorted(self._parameters.items())
-        return checksum(b"".join(name + value for name, value in sent)) if sent else None
+        packed = (name.ljust(16, b"\0") + struct.pack("<f", value) for name, value in sent)
+        return checksum(b"".join(packed)) if sent else None
 
     def add_batch(self, batch: Batch) -> None:
-        """Add the times and sequence numbers of the vehicle's frames."""
+        """Add the times, sequence numbers and frequent messages of the vehicle."""
         rows = batch.origins == self.vehicle.origin
         self.span.add_all(batch.time_us[batch.origins >> 8 == self.vehicle.origin >> 8])
         data, starts = np.frombuffer(batch.data, np.uint8), batch.starts[rows] + TIME_SIZE
@@ -130,6 +142,10 @@ class VehicleTally(FlightTally):
         self.frames_lost += int(gaps[gaps < 128].sum())
         self.frames_received += len(numbers)
         self._sequence = int(numbers[-1])
+        for message_id, handler in self._column_handlers.items():
+            chosen = np.flatnonzero(rows & (batch.message_ids == message_id))
+            if len(chosen):
+                handler(batch.time_us[chosen], columns_of(batch, chosen, message_id))
 
     def update(self, message: VehicleMessage) -> None:
         """Process the next message of the vehicle."""
@@ -160,39 +176,43 @@ class VehicleTally(FlightTally):
     def _on_home(self, message: VehicleMessage) -> None:
         self.home = named_position(message.fields) or self.home
 
-    def _on_gps(self, message: VehicleMessage) -> None:
-        if message.message_id != self._gps_id:
-            return
-        m = message.fields
-        self.add_gps(message.time_us, fixed=m["fix_type"] >= FIX_2D)
-        if (count := m["satellites_visible"]) != UNKNOWN_U8:
-            self.satellites = count if self.satellites is None else min(self.satellites, count)
+    def _add_fixes(self, time_us: IntArray, columns: Columns) -> None:
+        for at_us, is_fixed in zip(
+            time_us.tolist(), (columns["fix_type"] >= FIX_2D).tolist(), strict=True
+        ):
+            self.add_gps(at_us, fixed=is_fixed)
+        counts = columns["satellites_visible"]
+        if len(known := counts[counts != UNKNOWN_U8]):
+            fewest = int(known.min())
+            self.satellites = fewest if self.satellites is None else min(self.satellites, fewest)
 
-    def _on_battery(self, message: VehicleMessage) -> None:
-        m = message.fields
-        if (used := m["current_consumed"]) >= 0:
-            first, _ = self.used_mah.get(m["id"], (used, used))
-            self.used_mah[m["id"]] = (first, used)
+    def _add_batteries(self, _: IntArray, columns: Columns) -> None:
+        known = columns[columns["current_consumed"] >= 0]
+        for number in np.unique(known["id"]).tolist():
+            used = known["current_consumed"][known["id"] == number]
+            first, _last = self.used_mah.get(number, (int(used[0]), 0))
+            self.used_mah[number] = (first, int(used[-1]))
 
-    def _on_status(self, message: VehicleMessage) -> None:
-        m = message.fields
-        if m["drop_rate_comm"] <= MAX_DROP:
-            self._drops.append(m["drop_rate_comm"])
-        if self._is_due("battery", message.time_us, US_PER_S):
-            volts, percent = m["voltage_battery"], m["battery_remaining"]
-            self.battery.add(
-                message.time_us,
-                volts / MV_PER_V if 0 < volts != UNKNOWN_U16 else NAN,
-                percent if percent >= 0 else NAN,
-            )
+    def _add_status(self, time_us: IntArray, columns: Columns) -> None:
+        drops = columns["drop_rate_comm"][columns["drop_rate_comm"] <= MAX_DROP].astype(np.int64)
+        self._drops += (drops.sum(), len(drops))
+        # One in a second is enough.
+        chosen = np.flatnonzero(np.diff(time_us // US_PER_S, prepend=-1))
+        volts, percents = columns["voltage_battery"][chosen], columns["battery_remaining"][chosen]
+        for at_us, millivolts, percent in zip(
+            time_us[chosen].tolist(), volts.tolist(), percents.tolist(), strict=True
+        ):
+            is_known = 0 < millivolts != UNKNOWN_U16
+            voltage = millivolts / MV_PER_V if is_known else NAN
+            self.battery.add(at_us, voltage, percent if percent >= 0 else NAN)
 
-    def _on_vibration(self, message: VehicleMessage) -> None:
-        worst = max(message.fields[axis] for axis in _VIBRATION)
+    def _add_vibrations(self, _: IntArray, columns: Columns) -> None:
+        worst = max(float(columns[axis].max()) for axis in _VIBRATION)
         self.vibration_mps2 = max(self.vibration_mps2 or 0.0, worst)
 
-    def _on_parameter(self, message: VehicleMessage) -> None:
-        m = message.fields
-        self._parameters[m["param_id"].ljust(16, b"\0")] = struct.pack("<f", m["param_value"])
+    def _add_parameters(self, _: IntArray, columns: Columns) -> None:
+        names, values = columns["param_id"].tolist(), columns["param_value"].tolist()
+        self._parameters.update(zip(names, values, strict=True))
 
     def _on_version(self, message: VehicleMessage) -> None:
         version = message.fields["flight_sw_version"]

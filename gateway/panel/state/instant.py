@@ -49,6 +49,8 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     home: Location | None
     mark: Location | None
     battery_v: float
+    battery_name: str
+    """Name of the voltage, that of a battery or of the supply of boards."""
     battery_percent: float
     armed: bool
     attitude_s: float

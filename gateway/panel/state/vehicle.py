@@ -5,6 +5,7 @@ from collections import deque
 from typing import Any, Final
 
 import pymap3d.vincenty as vincenty
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.angle import wrap_180
 from gateway.panel.state.history import MAX_TRACK, TRACK_INTERVAL_US, FlightHistory
@@ -23,6 +24,7 @@ from gateway.vehicle_state.positions import (
     position_of,
 )
 
+AVIONICS: Final = mavlink.MAV_BATTERY_FUNCTION_AVIONICS
 LIVE: Final = "live"
 """Origin of an aircraft that is not played."""
 ATTITUDES: Final = ("ATTITUDE_QUATERNION", "ATTITUDE")
@@ -146,6 +148,7 @@ class VehicleState:
             home=self.home,
             mark=self._mark(),
             battery_v=battery_v,
+            battery_name=self.battery_name,
             battery_percent=battery_percent,
             attitude_s=self._age_s(now_us, *ATTITUDES),
             position_s=(now_us - state.position_us) / US_PER_S if state.position else NAN,
@@ -154,6 +157,13 @@ class VehicleState:
             battery_s=self._age_s(now_us, "BATTERY_STATUS", "SYS_STATUS"),
             armed=state.is_armed(),
         )
+
+    @property
+    def battery_name(self) -> str:
+        """Name of the voltage: that of the aircraft's battery, or of the supply of its boards."""
+        fields = self.state.fields.get("BATTERY_STATUS")
+        is_supply = fields is not None and fields["battery_function"] == AVIONICS
+        return "Board supply" if is_supply else "Battery"
 
     def _alt_home_m(self, at: Position) -> float:
         """Return the height above home, as reported or else from that of home."""

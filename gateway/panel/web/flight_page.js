@@ -118,7 +118,7 @@ export default {
       const id = String(aircraft.system_id);
       const columns = (mavgate.histories[id] = columns_of(aircraft.columns));
       this.angles[id] = add_angles(columns);
-      mavgate.vehicles[id] = { system_id: aircraft.system_id, title: aircraft.title, model: aircraft.model, origin: "live", generation: 0, home: aircraft.home, mark: null, lat_deg: columns.lat_deg[0], lon_deg: columns.lon_deg[0], alt_amsl_m: columns.alt_amsl_m[0] };
+      mavgate.vehicles[id] = { system_id: aircraft.system_id, title: aircraft.title, model: aircraft.model, origin: "live", generation: 0, battery_name: aircraft.battery_name, home: aircraft.home, mark: null, lat_deg: columns.lat_deg[0], lon_deg: columns.lon_deg[0], alt_amsl_m: columns.alt_amsl_m[0] };
       const track = mavgate.track(id);
       const has_height = columns.alt_amsl_m.some((alt) => alt !== null);
       const points = columns.lat_deg.map((lat, n) => [lat, columns.lon_deg[n], columns.alt_amsl_m[n], columns.time_us[n]]);

@@ -74,6 +74,6 @@ function items_of(state) {
     position("Latitude, longitude", ...here),
     ...(state.mark ? [position("Mark at", state.mark.lat_deg, state.mark.lon_deg)] : []),
     item("Satellites", state.fix_type ? angle(state.satellites, 0) : "—", "", "gps_s"),
-    ...(Number.isFinite(state.battery_v) ? [item("Battery", state.battery_v.toFixed(2), Number.isFinite(state.battery_percent) ? `V ${Math.round(state.battery_percent)} %` : "V", "battery_s")] : []),
+    ...(Number.isFinite(state.battery_v) ? [item(state.battery_name ?? "Battery", state.battery_v.toFixed(2), Number.isFinite(state.battery_percent) ? `V ${Math.round(state.battery_percent)} %` : "V", "battery_s")] : []),
   ];
 }
