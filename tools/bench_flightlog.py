@@ -12,7 +12,6 @@ import contextlib
 import json
 import math
 import os
-import resource
 import select
 import socket
 import subprocess
@@ -86,8 +85,11 @@ def write_tlog(path: Path, count: int) -> None:
             file.write(b"".join(piece))
 
 
-def flight_frames(second: int) -> list[bytes]:
-    """Pack the frames that the gateway sends in one second at its default rates, in 50 steps."""
+def flight_frames(second: int, imu_hz: int = 10) -> list[bytes]:
+    """Pack the frames that the gateway sends in one second at its default rates, in 50 steps.
+
+    `imu_hz` is 10 or 50.
+    """
     mav = mavlink.MAVLink(None, 1, 1)
     frames = []
     for step in range(50):
@@ -97,6 +99,12 @@ def flight_frames(second: int) -> list[bytes]:
             mavlink.MAVLink_attitude_quaternion_message(ms, *q, 0.4, 0.5, x),
             mavlink.MAVLink_attitude_message(ms, 0.1, x, 0.3, 0.4, 0.5, 0.6),
         ]
+        if step % 5 and imu_hz == 50:
+            accel, gyro, mag = (0.1, x, -9.81), (0.01 * x, 0.02, 0.03), (0.2, 0.01, 0.4)
+            air = (950.0 + x, 0.0, 500.0, 21.5)
+            messages.append(
+                mavlink.MAVLink_highres_imu_message(1000 * ms, *accel, *gyro, *mag, *air, 511)
+            )
         if step % 5 == 0:
             place = (471_000_000 + ms, 85_000_000 - ms, 500_000, 60_000)
             accel, gyro, mag = (0.1, x, -9.81), (0.01 * x, 0.02, 0.03), (0.2, 0.01, 0.4)
@@ -116,12 +124,12 @@ def flight_frames(second: int) -> list[bytes]:
     return frames
 
 
-def write_flight(path: Path, count: int) -> None:
+def write_flight(path: Path, count: int, imu_hz: int = 10) -> None:
     """Write the tlog of a flight, of at least `count` messages."""
     written, second = 0, 0
     with path.open("wb") as file:
         while written < count:
-            frames = flight_frames(second)
+            frames = flight_frames(second, imu_hz)
             begin_us, step_us = START_US + second * 1_000_000, 1_000_000 // len(frames)
             file.writelines(encode_record(begin_us + i * step_us, f) for i, f in enumerate(frames))
             written, second = written + len(frames), second + 1
@@ -129,10 +137,7 @@ def write_flight(path: Path, count: int) -> None:
 
 def cpu_of(*command: str) -> float:
     """Run a program and return its processor time."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return run_of(*command)["cpu_s"]
 
 
 def measure_files(folder: Path, count: int) -> dict[str, float]:
@@ -153,6 +158,17 @@ def measure_files(folder: Path, count: int) -> dict[str, float]:
             *(sys.executable, dump, "--format", "csv", "--types", "HIGHRES_IMU", str(path))
         ),
     }
+    # An autopilot's log on which all estimators run.
+    sampled = folder / "sampled.tlog"
+    write_flight(sampled, count, imu_hz=50)
+    for name, command, ending in (
+        ("mcap", "convert", ".mcap"), ("fuse", "fuse", ".csv"), ("page", "report", ".html"),
+        ("anonymise", "convert", ".tlog"),
+    ):  # fmt: skip
+        option = ("--anonymise",) if name == "anonymise" else ()
+        out = str(folder / f"{name}{ending}")
+        figures = run_of(*mavgate, command, str(sampled), "-o", out, *option)
+        found |= {f"{name}_{unit}": figures[unit] for unit in ("cpu_s", "memory_mb")}
     with table.open() as lines:
         found["rows"] = sum(not line.startswith("#") for line in lines) - 1
     return found
@@ -163,14 +179,18 @@ HOLE = 2 << 30
 
 
 def run_of(*command: str) -> dict[str, float]:
-    """Run a program; return its duration, and its peak memory."""
+    """Run a program; return its duration, and processor time and peak memory of it and its own."""
     begin = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, command)
-    return {"s": time.perf_counter() - begin, "memory_mb": usage.ru_maxrss / 1024}
+    return {
+        "s": time.perf_counter() - begin,
+        "cpu_s": usage.ru_utime + usage.ru_stime,
+        "memory_mb": usage.ru_maxrss / 1024,
+    }
 
 
 def measure_edits(folder: Path, count: int) -> dict[str, float]:
