@@ -6,8 +6,9 @@ from typing import Final, Protocol
 import msgspec
 
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
+from gateway.recordings.recorded_clock import STEP_US, Stamper
 from gateway.recordings.table import TableHeader, TableNote, encode_head, encode_line
-from gateway.recordings.tlog import STEP_US, Stamper, encode_record
+from gateway.recordings.tlog import encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 
 PENDING_LIMIT: Final = 16 << 20

@@ -43,8 +43,8 @@ from gateway.live.session import (
 from gateway.output import sync_folder
 from gateway.printable import without_folders
 from gateway.recordings.index import RecordingError, find_recording, move_recording, part_of
+from gateway.recordings.recorded_clock import CivilClock
 from gateway.recordings.table import NOTE, TableHeader, TableNote
-from gateway.recordings.tlog import CivilClock
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 from gateway.status import RecorderStatus
 from gateway.units import US_PER_S

@@ -20,7 +20,7 @@ from gateway.recordings.message_table import (
     MessageTable,
     Values,
 )
-from gateway.recordings.tlog import Stamper
+from gateway.recordings.recorded_clock import Stamper
 from gateway.records import NAN
 from gateway.units import US_PER_S
 from gateway.vehicle.encoding import Encoder

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.recordings.tlog import DAY_US
+from gateway.recordings.recorded_clock import DAY_US
 from gateway.units import US_PER_S
 
 IntArray = NDArray[np.int64]

@@ -26,14 +26,14 @@ from tempfile import TemporaryFile, gettempdir
 from typing import IO, Any, BinaryIO, Final, Literal, cast
 
 from gateway.printable import UserError
+from gateway.recordings.recorded_clock import LINE_BPS, FrameClock, Timeline
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
-from gateway.recordings.tlog import DAY_US, FIRST_CIVIL_US, Timeline, TlogScanner, encode_record
+from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.units import US_PER_S, counted
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.frame_scan import TIME_SIZE
-from gateway.wire.mavlink_messages import DEFINITIONS
-from gateway.wire.mavlink_splitter import MavlinkSplitter, SplitFault, message_id_of, origin_of
-from gateway.wire.recorded_frames import Batch, fields_of
+from gateway.wire.mavlink_splitter import MavlinkSplitter, SplitFault
+from gateway.wire.recorded_frames import Batch
 
 CHUNK: Final = 1 << 20
 SNIFF: Final = 512
@@ -85,18 +85,6 @@ DATAFLASH_BEGIN: Final = re.compile(
 )
 """Match up to a binary DataFlash log: its first message or, after other bytes, its first format."""
 _DATAFLASH_LINE: Final = re.compile(rb"^FMT, ?\d", re.MULTILINE)
-LINE_BPS: Final = 57_600
-"""Bit rate assumed for captures without times, that of usual telemetry radios; 10 bits per byte."""
-LAST_CIVIL_US: Final = 4_102_444_800 * US_PER_S
-"""The year 2100; later times are not civil time."""
-_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "time_unix_usec": 1}
-"""Fields with the sender's time, and their unit in µs."""
-_TIMES: Final = {
-    message_id: names
-    for message_id, kind in DEFINITIONS.items()
-    if (names := [name for name in _UNITS_US if name in kind.fieldnames])
-}
-"""Names of the time fields, by message id, of all messages that have some."""
 PIECE: Final = 1 << 12
 SHOWN_JUMPS: Final = 3
 _DAY_S: Final = 86_400
@@ -335,43 +323,6 @@ def read_blocks(path: Path, reader: TableReader, progress: Progress | None) -> I
     for data in read_chunks(path, progress):
         yield reader.feed_block(data)
     yield reader.feed_block(b"", final=True)
-
-
-class FrameClock:
-    """Times of frames, counted from the first one, derived from times in their messages."""
-
-    def __init__(self, *, by_size: bool = False) -> None:
-        self._by_size = by_size
-        self.civil_us_at_zero: int | None = None
-        """Civil time of the first frame; None until a message contains civil time."""
-        self.is_timed = False
-        """Whether any message contained a time."""
-        self._now_us = 0
-        self._line_us = 0.0
-        self._bases_us: dict[tuple[int | str, ...], tuple[int, int]] = {}
-        """Time at zero of the sender's clock, and its newest time, by sender and field."""
-
-    def time_us(self, frame: bytes) -> int:
-        """Return the time of the next frame."""
-        self._line_us += len(frame) * 10 * US_PER_S / LINE_BPS
-        message_id = message_id_of(frame)
-        if names := _TIMES.get(message_id):
-            fields = fields_of(frame)
-            for name in names:
-                if own_us := fields[name] * _UNITS_US[name]:
-                    self._update(own_us, (*origin_of(frame), message_id, name))
-        return round(self._line_us) if self._by_size else self._now_us
-
-    def _update(self, own_us: int, key: tuple[int | str, ...]) -> None:
-        is_civil = FIRST_CIVIL_US < own_us < LAST_CIVIL_US
-        if is_civil and self.civil_us_at_zero is None:
-            self.civil_us_at_zero = own_us - self._now_us
-        self.is_timed = True
-        base_us, newest_us = self._bases_us.get(key, (self._now_us - own_us, own_us))
-        if not -US_PER_S <= own_us - newest_us <= DAY_US:
-            base_us = self._now_us - own_us
-        self._now_us = max(self._now_us, base_us + own_us)
-        self._bases_us[key] = (base_us, own_us)
 
 
 class Layout(IntEnum):

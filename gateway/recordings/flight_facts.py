@@ -28,7 +28,7 @@ import numpy as np
 
 from gateway.recordings.columns import BoolArray, FloatArray
 from gateway.recordings.figures import gps_outages_us
-from gateway.recordings.tlog import DAY_US
+from gateway.recordings.recorded_clock import DAY_US
 from gateway.records import NAN
 from gateway.units import US_PER_S
 from gateway.vehicle_state.positions import (

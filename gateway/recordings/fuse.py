@@ -51,9 +51,9 @@ from gateway.recordings.columns import (
     FloatArray,
     has_group,
 )
+from gateway.recordings.recorded_clock import ORDER_US
 from gateway.recordings.recorded_table import settings_of
 from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader
-from gateway.recordings.tlog import ORDER_US
 from gateway.records import BaroSample, FusionState, GpsFix, GpsFixType, NavFlags
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import ImuLog, IntArray, SensorChain

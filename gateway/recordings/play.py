@@ -26,6 +26,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from gateway.answers.log_answers import answers_of, key_of, telemetry_of
+from gateway.recordings.recorded_clock import DAY_US
 from gateway.recordings.tlog import SEEK_BYTES, STRIDE, TlogScanner
 from gateway.recordings.tlog_index import TlogIndex
 from gateway.units import US_PER_S
@@ -55,8 +56,6 @@ AS_FAST_AS_POSSIBLE: Final = math.inf
 END_OF_TIME_US: Final = 1 << 64
 MAX_NUMBERS: Final = 256
 """Maximum number of frames of one message and sender with different numbers that are stored."""
-CLOCK_JUMP_US: Final = 86_400 * US_PER_S
-"""A longer gap is a change of the clock and is skipped."""
 
 
 class Source(Protocol):
@@ -408,7 +407,7 @@ class Player:
         """Set a new anchor if the next frame is too far ahead, or the recorded clock went back."""
         time_us = track.peek_us() or 0
         gap_us = time_us - self.position_us
-        longest_us = CLOCK_JUMP_US if self.max_gap_us is None else self.max_gap_us
+        longest_us = DAY_US if self.max_gap_us is None else self.max_gap_us
         went_back = gap_us < -US_PER_S
         if gap_us <= longest_us and not went_back:
             return

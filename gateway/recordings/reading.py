@@ -35,6 +35,7 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.formats.mavlink import AutopilotReader
+from gateway.recordings.recorded_clock import ORDER_US
 from gateway.recordings.recorded_table import (
     ReadOptions,
     RecordedTable,
@@ -42,7 +43,6 @@ from gateway.recordings.recorded_table import (
     table_of_blocks,
 )
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
-from gateway.recordings.tlog import ORDER_US
 from gateway.toml_file import TomlError, read_toml
 from gateway.units import counted
 from gateway.vehicle_state.senders import FIRST_GROUND_STATION

@@ -56,6 +56,7 @@ from gateway.recordings.fuse import (
     with_reference,
 )
 from gateway.recordings.reading import csv_reader, is_table, open_rows
+from gateway.recordings.recorded_clock import Stamper
 from gateway.recordings.recorded_table import (
     Line,
     ReadOptions,
@@ -75,7 +76,7 @@ from gateway.recordings.table import (
     TableReader,
     encode_line,
 )
-from gateway.recordings.tlog import UNRECORDED, Stamper
+from gateway.recordings.tlog import UNRECORDED
 from gateway.recordings.workshop.joining import joined_tables
 from gateway.records import RECORDED_ONLY, FusionState, NodeStatus
 from gateway.sensing.chain import IntArray, SensorChain

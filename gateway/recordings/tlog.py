@@ -1,16 +1,10 @@
-"""The tlog format: bytes to records, records to bytes, an index for seeking, and its times.
+"""The tlog format: bytes to records, and records to bytes."""
 
-Ground stations consider a tlog corrupt if its times are in the future or do not increase. So the
-offset from the gateway clock to civil time is constant while a file is open, and a clock jump
-requires a new file.
-"""
-
-from dataclasses import dataclass, replace
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gateway.recordings.recorded_clock import DAY_US, is_damaged
 from gateway.recordings.tlog_scan import (
     COLUMNS,
     KNOWN_IDS,
@@ -21,43 +15,16 @@ from gateway.recordings.tlog_scan import (
     lacks_end,
     scan,
 )
-from gateway.units import US_PER_S
 from gateway.wire.frame_scan import TIME_SIZE
 from gateway.wire.mavlink_messages import CRC_EXTRA, ids_of
 from gateway.wire.recorded_frames import Batch, Damage
-from gateway.wire.timesync import GpsTime
 
-DAY_US: Final = 86_400 * US_PER_S
-"""Records further apart are of different days: the time between them is not counted."""
-ORDER_US: Final = 2 * US_PER_S
-"""A time before that of the previous record, or after that of the next, by more is damaged."""
-
-Times = TypeVar("Times", int, NDArray[np.int64])
 STRIDE: Final = 256
 """Records per entry of the index: a seek scans at most this many, about 15 kB."""
 SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
-BACK_US: Final = 60 * US_PER_S
-"""Maximum backward step from reordering of two links' frames; more means a clock change."""
-FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
-"""The year 2000; an earlier time counts from the start of a clock."""
-MAX_JUMPS: Final = 1000
 UNRECORDED: Final = ids_of("HIGH_LATENCY2")
 """Messages for narrow links. Recorded next to the messages that they summarise, a ground
 station would take them for another state of the vehicle."""
-JUMP_US: Final = 2 * US_PER_S
-"""Minimum error of the assumed civil time that requires a new file. The arrival of GPS time lags
-by up to a second, and NTP slews smaller errors away."""
-STEP_US: Final = 4
-"""Minimum difference of two timestamps: readers use the low two bits as a link number."""
-_LINK_BITS: Final = 3
-
-
-def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDArray[np.bool_]:
-    """Return whether a time is not between its neighbours, which are in order."""
-    gap_us = after_us - before_us
-    is_in_order = (gap_us >= -ORDER_US) & (gap_us <= DAY_US)
-    is_outside = (time_us < before_us - ORDER_US) | (time_us > after_us + ORDER_US)
-    return is_in_order & is_outside
 
 
 def _crc_extra_table() -> ExtraArray:
@@ -136,119 +103,3 @@ class TlogScanner:
                 mended, count = i, count + 1
         self._last_us = int(times[-1])
         return count
-
-
-@dataclass(frozen=True, slots=True)
-class ClockJump:
-    """A step of a recording's clock that the timeline removes."""
-
-    offset_us: int
-    """Time of the step since the first record."""
-    step_us: int
-
-
-class Timeline:
-    """A continuous time for a tlog whose clock was set while it was written.
-
-    A step of the clock between two records by more than a day, or back by more than a minute, is
-    a jump, and is removed from the time. The date is that of the first section between jumps whose
-    clock had a possible civil date; without one, that of the first section.
-    """
-
-    def __init__(self) -> None:
-        self.jumps: list[ClockJump] = []
-        self._begins: list[int] = []
-        self._shifts_us: list[int] = []
-        self._first_us = 0
-        self._last_us: int | None = None
-        self._date_shift_us: int | None = None
-
-    def add(self, batch: Batch) -> None:
-        """Add the recorded times of the next batch of the file."""
-        if not len(batch):
-            return
-        times_us = batch.time_us
-        if self._last_us is None:
-            self._first_us = int(times_us[0])
-            self._begin(batch, 0, 0)
-            self._last_us = self._first_us
-        steps_us = np.diff(times_us, prepend=self._last_us)
-        for record in np.flatnonzero((steps_us > DAY_US) | (steps_us < -BACK_US)).tolist():
-            if len(self.jumps) == MAX_JUMPS:
-                break
-            step_us, shift_us = int(steps_us[record]), self._shifts_us[-1]
-            now_us = int(times_us[record]) - step_us + shift_us
-            self.jumps.append(ClockJump(now_us - self._first_us, step_us))
-            self._begin(batch, record, shift_us - step_us)
-        self._last_us = int(times_us[-1])
-
-    def _begin(self, batch: Batch, record: int, shift_us: int) -> None:
-        self._begins.append(batch.offset + int(batch.starts[record]))
-        self._shifts_us.append(shift_us)
-        if self._date_shift_us is None and int(batch.time_us[record]) >= FIRST_CIVIL_US:
-            self._date_shift_us = shift_us
-
-    def apply(self, batch: Batch) -> Batch:
-        """Return a batch of the same file with corrected times."""
-        if not self.jumps or not len(batch):
-            return batch
-        shifts_us = np.array(self._shifts_us) - (self._date_shift_us or 0)
-        at = np.searchsorted(self._begins, batch.starts + batch.offset, side="right") - 1
-        corrected: IntArray = batch.time_us + shifts_us[np.maximum(at, 0)]
-        return replace(batch, time_us=corrected)
-
-
-class CivilClock:
-    """The best estimate of civil time: from GPS if available, else from the machine's clock."""
-
-    def __init__(self) -> None:
-        self._offset_us: int | None = None
-        self._from_gps = False
-        self._gps = GpsTime()
-
-    @property
-    def offset_us(self) -> int | None:
-        """Civil time at gateway time zero, µs since 1970; None before any time is known."""
-        return self._offset_us
-
-    def update_machine(self, unix_us: int, now_us: int) -> None:
-        """Process the machine's civil time, which is used until GPS time is known."""
-        if not self._from_gps:
-            self._offset_us = unix_us - now_us
-
-    def update_gps(self, vehicle_id: int, utc_us: int, time_us: int) -> None:
-        """Process the time of an aircraft's fix and its time of arrival.
-
-        If the machine's time agrees within `JUMP_US`, it is kept, as it is more precise.
-        """
-        offset_us = self._gps.update(vehicle_id, utc_us, time_us)
-        if offset_us is None:
-            return
-        if self._offset_us is None or abs(offset_us - self._offset_us) > JUMP_US:
-            self._offset_us = offset_us
-            self._from_gps = True
-
-
-class Stamper:
-    """Timestamps of one file, which increase and have a constant offset to the gateway clock."""
-
-    def __init__(self, offset_us: int) -> None:
-        self.offset_us = offset_us
-        self._last_us = 0
-
-    def stamp(self, now_us: int) -> int:
-        """Return the civil time of a moment, greater than all timestamps before."""
-        wanted_us = max(now_us + self.offset_us, 0) & ~_LINK_BITS
-        self._last_us = max(wanted_us, self._last_us + STEP_US)
-        return self._last_us
-
-    def stamp_several(self, now_us: int, count: int) -> int:
-        """Return the first timestamp of `count` frames of one moment, `STEP_US` apart."""
-        first_us = self.stamp(now_us)
-        self._last_us += STEP_US * (count - 1)
-        return first_us
-
-    def has_jumped(self, clock: CivilClock) -> bool:
-        """Return whether the clock now has a time that differs too much from this file's."""
-        offset_us = clock.offset_us
-        return offset_us is not None and abs(offset_us - self.offset_us) > JUMP_US

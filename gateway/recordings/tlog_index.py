@@ -6,7 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from gateway.recordings.tlog import STRIDE, Timeline
+from gateway.recordings.recorded_clock import Timeline
+from gateway.recordings.tlog import STRIDE
 from gateway.units import counted
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.frame_scan import TIME_SIZE

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from gateway.geometry.quaternion import from_euler, normalise
-from gateway.recordings.tlog import FIRST_CIVIL_US
+from gateway.recordings.recorded_clock import FIRST_CIVIL_US
 from gateway.records import Quat
 from gateway.vehicle_state.positions import ORIGIN_ID, Position, named_position, position_of
 from gateway.vehicle_state.senders import MODES_ID, RecordedSender, Senders, is_station

@@ -8,17 +8,16 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.clock import GatewayClock
-from gateway.recordings.tlog import (
+from gateway.recordings.recorded_clock import (
     DAY_US,
     JUMP_US,
     ORDER_US,
-    STRIDE,
     CivilClock,
     Stamper,
-    TlogScanner,
     is_damaged,
 )
-from gateway.recordings.tlog import STEP_US as STAMP_STEP_US
+from gateway.recordings.recorded_clock import STEP_US as STAMP_STEP_US
+from gateway.recordings.tlog import STRIDE, TlogScanner
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_splitter import message_id_of
 from gateway.wire.recorded_frames import Batch, Damage, IntArray, RecordedFrame

@@ -23,7 +23,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.geometry.quaternion import from_euler_array
 from gateway.recordings.columns import BARO, COLUMNS, GPS, LARGEST_WHOLE, NAV, SI, FloatArray
 from gateway.recordings.formats.csv import level_velocity
-from gateway.recordings.tlog import FIRST_CIVIL_US
+from gateway.recordings.recorded_clock import FIRST_CIVIL_US
 from gateway.records import NAN, UNKNOWN_VEC3, GpsFixType, ImuFlags, NavFlags, NavState, Quat, Vec3
 from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S, UT_PER_GAUSS
 from gateway.vehicle_state.positions import is_located

@@ -41,8 +41,8 @@ from gateway.recordings.files import (
     temporary_copy,
 )
 from gateway.recordings.formats.mavlink import VELOCITY_AGE_US, autopilot_state
+from gateway.recordings.recorded_clock import FIRST_CIVIL_US
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, table_of_rows
-from gateway.recordings.tlog import FIRST_CIVIL_US
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,

@@ -37,10 +37,10 @@ from gateway.recordings.reading import (
     open_record,
     open_rows,
 )
+from gateway.recordings.recorded_clock import Stamper
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, aircraft_of
 from gateway.recordings.table import encode_block, encode_head
-from gateway.recordings.tlog import Stamper
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.recordings.workshop.joining import joined_tables
 from gateway.recordings.workshop.merging import batched

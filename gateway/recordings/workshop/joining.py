@@ -8,9 +8,9 @@ import msgspec
 
 from gateway.recordings.columns import TIMES
 from gateway.recordings.files import FlightError
+from gateway.recordings.recorded_clock import JUMP_US
 from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader, TableNote
-from gateway.recordings.tlog import JUMP_US
 from gateway.recordings.workshop.trimming import first_true
 from gateway.records import FusionState, NodeStatus
 from gateway.units import counted

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.printable import UNKNOWN, figure, printable
 from gateway.recordings.formats.message_csv import csv_lines, data_cell
 from gateway.recordings.moment import iso_time
-from gateway.recordings.tlog import DAY_US
+from gateway.recordings.recorded_clock import DAY_US
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.records import NAN
 from gateway.units import DEGE7_PER_DEG, US_PER_S

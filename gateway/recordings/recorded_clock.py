@@ -1,0 +1,221 @@
+"""The clocks of recorded MAVLink: which times are damaged, steps of a clock, dates, timestamps.
+
+| clock        | rule                                                                           |
+| ------------ | ------------------------------------------------------------------------------ |
+| `is_damaged` | a time that is not between those of its neighbours, by more than `ORDER_US`    |
+| `Timeline`   | the time of a tlog whose clock was set while it was written: steps are removed |
+| `FrameClock` | the time of a capture without time stamps, from the times in its messages      |
+| `CivilClock` | civil time of the running gateway: GPS if available, else the machine's clock  |
+| `Stamper`    | the increasing timestamps of a file that is written                            |
+
+A step of more than `DAY_US`, or back by more than `BACK_US`, is a change of a clock. Times from
+`FIRST_CIVIL_US` to `LAST_CIVIL_US` are civil; earlier ones count from the start of a clock.
+
+Ground stations consider a tlog corrupt if its times are in the future or do not increase. So the
+offset from the gateway clock to civil time is constant while a file is open, and a clock jump
+requires a new file.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import DEFINITIONS
+from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from gateway.wire.recorded_frames import Batch, IntArray, fields_of
+from gateway.wire.timesync import GpsTime
+
+Times = TypeVar("Times", int, NDArray[np.int64])
+
+DAY_US: Final = 86_400 * US_PER_S
+"""Records further apart are of different days: the time between them is not counted."""
+ORDER_US: Final = 2 * US_PER_S
+"""A time before that of the previous record, or after that of the next, by more is damaged."""
+
+BACK_US: Final = 60 * US_PER_S
+"""Maximum backward step from reordering of two links' frames; more means a clock change."""
+FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
+"""The year 2000; an earlier time counts from the start of a clock."""
+MAX_JUMPS: Final = 1000
+LINE_BPS: Final = 57_600
+"""Bit rate assumed for captures without times, that of usual telemetry radios; 10 bits per byte."""
+LAST_CIVIL_US: Final = 4_102_444_800 * US_PER_S
+"""The year 2100; later times are not civil time."""
+_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "time_unix_usec": 1}
+"""Fields with the sender's time, and their unit in µs."""
+_TIMES: Final = {
+    message_id: names
+    for message_id, kind in DEFINITIONS.items()
+    if (names := [name for name in _UNITS_US if name in kind.fieldnames])
+}
+"""Names of the time fields, by message id, of all messages that have some."""
+JUMP_US: Final = 2 * US_PER_S
+"""Minimum error of the assumed civil time that requires a new file. The arrival of GPS time lags
+by up to a second, and NTP slews smaller errors away."""
+STEP_US: Final = 4
+"""Minimum difference of two timestamps: readers use the low two bits as a link number."""
+_LINK_BITS: Final = 3
+
+
+def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDArray[np.bool_]:
+    """Return whether a time is not between its neighbours, which are in order."""
+    gap_us = after_us - before_us
+    is_in_order = (gap_us >= -ORDER_US) & (gap_us <= DAY_US)
+    is_outside = (time_us < before_us - ORDER_US) | (time_us > after_us + ORDER_US)
+    return is_in_order & is_outside
+
+
+@dataclass(frozen=True, slots=True)
+class ClockJump:
+    """A step of a recording's clock that the timeline removes."""
+
+    offset_us: int
+    """Time of the step since the first record."""
+    step_us: int
+
+
+class Timeline:
+    """A continuous time for a tlog whose clock was set while it was written.
+
+    A step of the clock between two records by more than a day, or back by more than a minute, is
+    a jump, and is removed from the time. The date is that of the first section between jumps whose
+    clock had a possible civil date; without one, that of the first section.
+    """
+
+    def __init__(self) -> None:
+        self.jumps: list[ClockJump] = []
+        self._begins: list[int] = []
+        self._shifts_us: list[int] = []
+        self._first_us = 0
+        self._last_us: int | None = None
+        self._date_shift_us: int | None = None
+
+    def add(self, batch: Batch) -> None:
+        """Add the recorded times of the next batch of the file."""
+        if not len(batch):
+            return
+        times_us = batch.time_us
+        if self._last_us is None:
+            self._first_us = int(times_us[0])
+            self._begin(batch, 0, 0)
+            self._last_us = self._first_us
+        steps_us = np.diff(times_us, prepend=self._last_us)
+        for record in np.flatnonzero((steps_us > DAY_US) | (steps_us < -BACK_US)).tolist():
+            if len(self.jumps) == MAX_JUMPS:
+                break
+            step_us, shift_us = int(steps_us[record]), self._shifts_us[-1]
+            now_us = int(times_us[record]) - step_us + shift_us
+            self.jumps.append(ClockJump(now_us - self._first_us, step_us))
+            self._begin(batch, record, shift_us - step_us)
+        self._last_us = int(times_us[-1])
+
+    def _begin(self, batch: Batch, record: int, shift_us: int) -> None:
+        self._begins.append(batch.offset + int(batch.starts[record]))
+        self._shifts_us.append(shift_us)
+        if self._date_shift_us is None and int(batch.time_us[record]) >= FIRST_CIVIL_US:
+            self._date_shift_us = shift_us
+
+    def apply(self, batch: Batch) -> Batch:
+        """Return a batch of the same file with corrected times."""
+        if not self.jumps or not len(batch):
+            return batch
+        shifts_us = np.array(self._shifts_us) - (self._date_shift_us or 0)
+        at = np.searchsorted(self._begins, batch.starts + batch.offset, side="right") - 1
+        corrected: IntArray = batch.time_us + shifts_us[np.maximum(at, 0)]
+        return replace(batch, time_us=corrected)
+
+
+class CivilClock:
+    """The best estimate of civil time: from GPS if available, else from the machine's clock."""
+
+    def __init__(self) -> None:
+        self._offset_us: int | None = None
+        self._from_gps = False
+        self._gps = GpsTime()
+
+    @property
+    def offset_us(self) -> int | None:
+        """Civil time at gateway time zero, µs since 1970; None before any time is known."""
+        return self._offset_us
+
+    def update_machine(self, unix_us: int, now_us: int) -> None:
+        """Process the machine's civil time, which is used until GPS time is known."""
+        if not self._from_gps:
+            self._offset_us = unix_us - now_us
+
+    def update_gps(self, vehicle_id: int, utc_us: int, time_us: int) -> None:
+        """Process the time of an aircraft's fix and its time of arrival.
+
+        If the machine's time agrees within `JUMP_US`, it is kept, as it is more precise.
+        """
+        offset_us = self._gps.update(vehicle_id, utc_us, time_us)
+        if offset_us is None:
+            return
+        if self._offset_us is None or abs(offset_us - self._offset_us) > JUMP_US:
+            self._offset_us = offset_us
+            self._from_gps = True
+
+
+class Stamper:
+    """Timestamps of one file, which increase and have a constant offset to the gateway clock."""
+
+    def __init__(self, offset_us: int) -> None:
+        self.offset_us = offset_us
+        self._last_us = 0
+
+    def stamp(self, now_us: int) -> int:
+        """Return the civil time of a moment, greater than all timestamps before."""
+        wanted_us = max(now_us + self.offset_us, 0) & ~_LINK_BITS
+        self._last_us = max(wanted_us, self._last_us + STEP_US)
+        return self._last_us
+
+    def stamp_several(self, now_us: int, count: int) -> int:
+        """Return the first timestamp of `count` frames of one moment, `STEP_US` apart."""
+        first_us = self.stamp(now_us)
+        self._last_us += STEP_US * (count - 1)
+        return first_us
+
+    def has_jumped(self, clock: CivilClock) -> bool:
+        """Return whether the clock now has a time that differs too much from this file's."""
+        offset_us = clock.offset_us
+        return offset_us is not None and abs(offset_us - self.offset_us) > JUMP_US
+
+
+class FrameClock:
+    """Times of frames, counted from the first one, derived from times in their messages."""
+
+    def __init__(self, *, by_size: bool = False) -> None:
+        self._by_size = by_size
+        self.civil_us_at_zero: int | None = None
+        """Civil time of the first frame; None until a message contains civil time."""
+        self.is_timed = False
+        """Whether any message contained a time."""
+        self._now_us = 0
+        self._line_us = 0.0
+        self._bases_us: dict[tuple[int | str, ...], tuple[int, int]] = {}
+        """Time at zero of the sender's clock, and its newest time, by sender and field."""
+
+    def time_us(self, frame: bytes) -> int:
+        """Return the time of the next frame."""
+        self._line_us += len(frame) * 10 * US_PER_S / LINE_BPS
+        message_id = message_id_of(frame)
+        if names := _TIMES.get(message_id):
+            fields = fields_of(frame)
+            for name in names:
+                if own_us := fields[name] * _UNITS_US[name]:
+                    self._update(own_us, (*origin_of(frame), message_id, name))
+        return round(self._line_us) if self._by_size else self._now_us
+
+    def _update(self, own_us: int, key: tuple[int | str, ...]) -> None:
+        is_civil = FIRST_CIVIL_US < own_us < LAST_CIVIL_US
+        if is_civil and self.civil_us_at_zero is None:
+            self.civil_us_at_zero = own_us - self._now_us
+        self.is_timed = True
+        base_us, newest_us = self._bases_us.get(key, (self._now_us - own_us, own_us))
+        if not -US_PER_S <= own_us - newest_us <= DAY_US:
+            base_us = self._now_us - own_us
+        self._now_us = max(self._now_us, base_us + own_us)
+        self._bases_us[key] = (base_us, own_us)
