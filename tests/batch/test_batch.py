@@ -14,6 +14,7 @@ import msgspec
 import pandas as pd
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
+from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.reporting.ground_track import ground_track
@@ -30,7 +31,10 @@ from gateway.batch.tasks import (
 )
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.cli import run
+from tests.kit.mavlink import packed
+from tests.kit.recordings import SECOND_US, START_US, make_tlog
 
 pytestmark = pytest.mark.io
 
@@ -204,6 +208,22 @@ def test_report_folder_contains_page_and_figures(
     assert "Flight report: alpha" in (folder / "index.html").read_text()
     assert (folder / "ground_track.svg").exists()
     assert "flight_map.svg" in {file.name for file in folder.iterdir()}
+
+
+def test_recording_without_samples_has_figures_and_is_no_failure(
+    season: Path, tmp_path: Path
+) -> None:
+    fix = mavlink.MAVLink_gps_raw_int_message(0, 3, 470_000_000, 80_000_000, *(0,) * 5, 9)
+    records = [RecordedFrame(START_US + n * SECOND_US, packed(fix, 7)) for n in range(9)]
+    (tmp_path / "fixes.tlog").write_bytes(make_tlog(records))
+    report(tmp_path / "fixes.tlog", season / FLIGHTS[0], "-o", tmp_path / "out")
+    flights = pd.read_csv(tmp_path / "out" / "flights.csv").set_index("recording")
+    assert flights.loc["fixes.tlog", ["aircraft", "duration, s", "distance, m"]].tolist() == [
+        7,
+        8,
+        0,
+    ]
+    assert flights["failed"].isna().all()
 
 
 def test_two_recordings_with_equal_names_are_kept_apart(season: Path, tmp_path: Path) -> None:

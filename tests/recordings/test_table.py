@@ -51,9 +51,7 @@ NOTE = TableNote(1234, 'over the "gate", # 2')
 STATUS = NodeStatus(5, NodeId(3, 1), 4, (1, 2), 1, 8, 0, 3, 2, 1, 900, 5, 3290)
 
 
-@pytest.mark.parametrize(
-    ("event", "prefix"), [(NOTE, "# note: "), (NOTE, "# mark: "), (STATUS, "# node: ")]
-)
+@pytest.mark.parametrize(("event", "prefix"), [(NOTE, "# note: "), (STATUS, "# node: ")])
 def test_comments_are_read_between_rows(event: TableNote | NodeStatus, prefix: str) -> None:
     rows = make_rows(2, 4)
     line = encode_line(event).replace("# note: ", prefix)
