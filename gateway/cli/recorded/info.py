@@ -98,6 +98,8 @@ def info(
         if len(files) > 1:
             refuse(f"{folder}: is a folder; give one folder, or recordings")
         folder = (folder or recordings_folder()).expanduser()
+        if not folder.is_dir():
+            refuse(f"no recordings in {folder}")
         _list_flights(folder, columns, where, geojson=geojson, json=json)
         return
     refuse_unused("recordings: give their folder", {"--where": where, "--geojson": geojson})
