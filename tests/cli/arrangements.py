@@ -35,6 +35,24 @@ from tests.recordings.flights import flown_table, read
 NAMES = "time_s,ax,ay,az,gx,gy,gz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m"
 NUMBERS = ("0", "0", "-9.8", "0", "0", "0", "100", "0.1", "47", "8", "500")
 RECORDS = make_records(500)
+AC31 = """\
+FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns
+FMT, 129, 23, PARM, Nf, Name,Value
+FMT, 130, 45, GPS, BIHBcLLeeEefI, Status,TimeMS,Week,NSats,HDop,Lat,Lng,RelAlt,Alt,Spd,GCrs,VZ,T
+FMT, 131, 31, IMU, Iffffff, TimeMS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ
+PARM, SYSID_THISMAV, 3.0"""
+RECENT = """\
+FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns
+FMT, 129, 31, PARM, QNff, TimeUS,Name,Value,Default
+FMT, 130, 51, GPS, QBBIHBcLLeffffB, TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U
+FMT, 131, 48, IMU, QBffffffIIfBBHH, TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ,EG,EA,T,GH,AH,GHz,AHz
+PARM, 10000000, MAV_SYSID, 7, 1"""
+EMPTY = {
+    "formats": b"\x83\x30",
+    "imu": b"\x80\x83\x27IMU\0fffffffff" + bytes(7) + b"AccX,AccY,AccZ,GyroX,GyroY",
+    "rows": b"\x80\x83\x1bIMU\0Qffffff" + bytes(9) + b"TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ",
+}
+"""Formats of DataFlash logs without a sample."""
 
 
 def log(folder: Path, name: str = "log.csv", **odd: str) -> Path:
@@ -130,6 +148,78 @@ def future(folder: Path) -> None:
     (folder / "future.tlog").write_bytes(b"".join(records))
 
 
+def old_log() -> list[str]:
+    lines = [AC31]
+    for ms in range(60_000, 72_000, 20):
+        lines.append(f"IMU, {ms}, 0.001, 0.002, 0.003, 0.01, -0.02, -9.8")
+        if ms % 200 == 0:
+            week_ms = 345_540_000 + ms
+            lines.append(f"GPS, 3, {week_ms}, 1770, 10, 1.2, 47.1, 8.5, 0.1, 500, 5, 90, 0, {ms}")
+    return lines
+
+
+def recent_log(
+    begin_us: int = 10_000_000, gps: int = 0, imu: int = 0, week: int = 2300
+) -> list[str]:
+    lines = []
+    for ms in range(0, 12_000, 20):
+        head, axes = f"{begin_us + 1000 * ms}", "0.001, 0.002, 0.003, 0.01, -0.02, -9.8"
+        lines.append(f"IMU, {head}, {imu}, {axes}, 0, 0, 25, 1, 1, 400, 400")
+        if ms % 200 == 0:
+            location = "12, 0.8, 47.1, 8.5, 500, 5, 90, 0, 0, 1"
+            lines.append(f"GPS, {head}, {gps}, 3, {345_600_000 + ms}, {week}, {location}")
+    return lines
+
+
+def dataflash(folder: Path, kind: str) -> None:
+    """Write a DataFlash log of text: of old or recent firmware, or with a fault."""
+    first = recent_log()
+    lines = {
+        "old": lambda: old_log(),
+        "titled": lambda: ["", "ArduCopter V3.1.2 (abc)", "Free RAM: 990", "", *old_log()],
+        "second": lambda: [RECENT, *recent_log(gps=1, imu=2)],
+        "both": lambda: [RECENT, *first, *recent_log(gps=1)[1::11]],
+        "rolled": lambda: [RECENT, *recent_log(week=2300 - 1024)],
+        "boots": lambda: [RECENT, *first, *first],
+        "late": lambda: [RECENT, *first, *recent_log(10_040_000)],
+        "short": lambda: [RECENT, *first, *first[:20]],
+    }[kind]()
+    (folder / "a.log").write_text("\n".join([*lines, ""]))
+
+
+def empty_dataflash(folder: Path, kind: str) -> None:
+    data = b"\xa3\x95" + EMPTY[kind].ljust(87, b"\0") + bytes(600)
+    (folder / "a.bin").write_bytes(data)
+
+
+def samples(delimiter: str, *, comma: bool = False, step: int = 1) -> str:
+    """Return a log with samples at 100 Hz, or with some of them."""
+    lines = ["time_s ax ay az gx gy gz"]
+    lines += [f"{n / 100:.2f} 0.01 -0.02 -9.80 0.001 0.002 0.003" for n in range(0, 500, step)]
+    text = "\n".join([*lines, ""])
+    return (text.replace(".", ",") if comma else text).replace(" ", delimiter)
+
+
+def dialect(folder: Path, kind: str) -> None:
+    """Write `log.csv` with another delimiter, decimal mark or encoding, or 2 Hz."""
+    (folder / "log.csv").write_bytes(
+        {
+            "commas": samples(",").encode(),
+            "blanks": samples(", ").encode(),
+            "semicolons": samples(";").encode(),
+            "semicolons, decimal": samples(";", comma=True).encode(),
+            "tabs": samples("\t").encode(),
+            "tabs, decimal": samples("\t", comma=True).encode(),
+            "utf-16": samples(",").replace("\n", "\r\n").encode("utf-16"),
+            "utf-16-le": samples(",").encode("utf-16-le"),
+            "utf-16-be": samples(",").encode("utf-16-be"),
+            "title": b"MPU6050 connection successful\nInitializing...\n" + samples(",").encode(),
+            "lacking": samples(";").replace("gz", "gyro_z").encode("utf-16"),
+            "slow": samples(",", step=50).encode(),
+        }[kind]
+    )
+
+
 def images(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Write images of one program, on a machine without serial ports."""
     for name, block in (("imu", NRF24_BLOCK), ("imu_sx1276", BLOCK)):
@@ -146,7 +236,7 @@ MAKE: dict[str, Callable[..., object]] = {
     made.__name__: made
     for made in (
         log, odd_log, table, flight, half_minute, recordings, zipped, endless, introduced,
-        future, images,
+        future, images, dataflash, empty_dataflash, dialect,
     )
 }  # fmt: skip
 
