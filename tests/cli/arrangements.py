@@ -19,6 +19,7 @@ from gateway.recordings.columns import TableRow
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import TableHeader
 from tests.analysis.test_flight import rows
+from tests.cli.recorded import test_extract as extracts
 from tests.flashing.test_settings_block import BLOCK, NRF24_BLOCK, image_with, with_crc
 from tests.kit.mavlink import Sender
 from tests.kit.recordings import (
@@ -143,6 +144,11 @@ def introduced(folder: Path) -> None:
     write_tlog(folder / "a.tlog", records_of(map(Sender().pack, sent), 100_000))
 
 
+def mission(folder: Path) -> None:
+    """Write `flight.tlog` with parameters, mission, fence, texts and images."""
+    extracts.written(folder, extracts.flight())
+
+
 def future(folder: Path) -> None:
     records = (struct.pack(">Q", 10**18) + frame for frame in make_frames(20))
     (folder / "future.tlog").write_bytes(b"".join(records))
@@ -236,7 +242,7 @@ MAKE: dict[str, Callable[..., object]] = {
     made.__name__: made
     for made in (
         log, odd_log, table, flight, half_minute, recordings, zipped, endless, introduced,
-        future, images, dataflash, empty_dataflash, dialect,
+        future, mission, images, dataflash, empty_dataflash, dialect,
     )
 }  # fmt: skip
 

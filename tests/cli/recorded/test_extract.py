@@ -94,14 +94,6 @@ def test_parameters_are_read_by_pymavlink(tlog: Path, tmp_path: Path) -> None:
     assert "ATC_RAT_RLL_P,0.135\n" in out.read_text()
 
 
-def test_parameters_of_qgroundcontrol_have_five_columns(tlog: Path, tmp_path: Path) -> None:
-    out = tmp_path / "flight.params"
-    run("extract", tlog, "--params", out)
-    rows = [line.split("\t") for line in out.read_text().splitlines() if line[0] != "#"]
-    assert ["1", "1", "ARMING_CHECK", "1", "6"] in rows
-    assert all(len(row) == 5 for row in rows)
-
-
 def test_integers_that_px4_sends_bytewise_are_read_as_integers(tmp_path: Path) -> None:
     (value,) = struct.unpack("<f", struct.pack("<i", 123_456))
     messages = [
@@ -152,20 +144,6 @@ def test_plan_follows_the_rules_of_qgroundcontrol(tlog: Path, tmp_path: Path) ->
     (circle,) = plan["geoFence"]["circles"]
     assert circle["circle"] == {"center": pytest.approx([LAT, LON]), "radius": 120.0}
     assert plan["rallyPoints"]["points"] == [[pytest.approx(LAT), pytest.approx(LON), 30.0]]
-
-
-def test_texts_events_and_images_are_rows_of_csv(tlog: Path, tmp_path: Path) -> None:
-    outs = [tmp_path / f"{name}.csv" for name in ("texts", "events", "images")]
-    run("extract", tlog, "--texts", outs[0], "--events", outs[1], "--images", outs[2])
-    texts, events, images = (list(csv.DictReader(out.read_text().splitlines())) for out in outs)
-    assert [row["text"] for row in texts] == ['Höhe, 5 "m"']
-    assert texts[0]["time"].endswith("Z")
-    assert [(row["event"], row["value"]) for row in events] == [
-        ("armed", "yes"), ("mode", "LOITER"), ("reached", "2"), ("armed", "no"), ("mode", "RTL"),
-    ]  # fmt: skip
-    assert [(row["image"], row["file"]) for row in images] == [("7", ""), ("8", "DCIM/8.jpg")]
-    assert float(images[1]["lat_deg"]) == pytest.approx(LAT)
-    assert float(images[1]["alt_home_m"]) == 50.0
 
 
 def captured(number: int, utc_us: int, lat: int = E7[0], name: bytes = b"") -> Any:
@@ -267,15 +245,3 @@ def test_recording_from_time_zero_begins_at_its_first_record(
     recording = VehicleRecording([path], OPTIONS)
     recording.read()
     assert recording.first_us == 0
-
-
-def test_subtitles_of_chosen_fields_as_ass(tlog: Path, tmp_path: Path) -> None:
-    out = tmp_path / "flight.ass"
-    video = tmp_path / "DJI_20251009-085321.mp4"
-    video.touch()
-    words = ("--fields", "height,mode", "--rate", 30, "--video", video)
-    text = run("extract", tlog, "--subtitles", out, *words)
-    assert "begins at 2025-10-09T08:53:21.000Z" in text
-    lines = [line for line in out.read_text().splitlines() if line.startswith("Dialogue")]
-    assert lines[-1].endswith("Default,50.0 m  LOITER")
-    assert re.match(r"Dialogue: 0,\d:\d\d:\d\d\.\d\d,\d:\d\d:\d\d\.\d\d,", lines[0])

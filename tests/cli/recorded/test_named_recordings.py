@@ -1,12 +1,10 @@
 """Every command on recordings accepts the names that `info` lists."""
 
-import json
 import socket
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from gateway.cli.live.demo import recorded_line
@@ -16,62 +14,21 @@ from gateway.cli.support.recording_options import files_of, load_flight
 from gateway.config import load
 from gateway.player import PlayerDaemon
 from gateway.recordings.files import FlightError
+from tests.cli.arrangements import recordings
 from tests.kit.cli import invoke
-from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, write_table, write_tlog
-from tests.recordings.flights import flown_table, read
 
 pytestmark = pytest.mark.io
-
-COUNT = 4000
 
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    """Recordings `alps` (tlog and tables of two parts) and `lake` (a tlog of system 7)."""
-    folder = tmp_path / "recordings"
-    folder.mkdir()
-    write_tlog(folder / "alps_01.tlog", make_records(COUNT))
-    header, rows = read(flown_table(12))
-    header = msgspec.structs.replace(header, unix_us_at_zero=START_US)
-    half = len(rows) // 2
-    write_table(folder / "alps_01_v1.csv", header, rows[:half])
-    write_table(folder / "alps_02_v1.csv", header, rows[half:])
-    write_tlog(folder / "lake_01.tlog", make_records(30, system_id=7))
-    file = tmp_path / "gateway.toml"
-    file.write_text(f'[recording]\nfolder = "{folder}"\n')
-    return file
+    """Settings with the folder of `recordings`."""
+    recordings(tmp_path)
+    return tmp_path / "gateway.toml"
 
 
 def run(*arguments: object, code: int = 0) -> str:
     return invoke(*arguments, code=code).output
-
-
-def test_list_contains_length_vehicles_size_and_path(config: Path) -> None:
-    lines = run("info", "--config", config).splitlines()
-    (alps,) = (line.split() for line in lines if line.strip().startswith("alps"))
-    assert alps[1:3] == ["0:01:20", "1"]
-    assert alps[-1] == str(config.parent / "recordings" / "alps_*")
-    (lake,) = (line.split() for line in lines if line.strip().startswith("lake"))
-    assert lake[1:3] == ["0:00:01", "7"]
-    assert lake[-1].endswith("lake_01.tlog")
-    listed = {one["name"]: one for one in json.loads(run("info", "--json", "-c", config))}
-    assert listed["lake"]["vehicles"] == [7]
-    assert listed["alps"]["duration_s"] == pytest.approx((COUNT - 1) * STEP_US / 1e6)
-
-
-@pytest.mark.parametrize("name", ["alps", "last"])
-def test_info_fuse_and_convert_accept_a_name(config: Path, tmp_path: Path, name: str) -> None:
-    for file in (config.parent / "recordings").glob("lake*"):
-        file.unlink()
-    found = run("info", name, "--config", config)
-    assert found.count("by mavgate") + found.count("tlog, ") >= 2
-    assert len(run("info", name, "--json", "--config", config).splitlines()) == 3
-    states, table, joined = (tmp_path / name for name in ("states.csv", "again.csv", "again.tlog"))
-    run("fuse", name, "-o", states, "--config", config)
-    run("convert", name, "-o", table, "--config", config)
-    assert sum(not line.startswith("#") for line in table.read_text().splitlines()) > 500
-    run("convert", name, "-o", joined, "--config", config)
-    assert joined.stat().st_size == len(make_tlog(make_records(COUNT)))
 
 
 def test_play_accepts_a_name(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
