@@ -19,6 +19,7 @@ from gateway.recordings.columns import TableRow
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import TableHeader
 from tests.analysis.test_flight import rows
+from tests.cli.recorded import test_diff
 from tests.cli.recorded import test_extract as extracts
 from tests.flashing.test_settings_block import BLOCK, NRF24_BLOCK, image_with, with_crc
 from tests.kit.mavlink import Sender
@@ -144,6 +145,11 @@ def introduced(folder: Path) -> None:
     write_tlog(folder / "a.tlog", records_of(map(Sender().pack, sent), 100_000))
 
 
+def compared(folder: Path) -> None:
+    """Write `a.tlog` and `b.tlog` with other parameters, missions and texts."""
+    test_diff.write_both(folder)
+
+
 def mission(folder: Path) -> None:
     """Write `flight.tlog` with parameters, mission, fence, texts and images."""
     extracts.written(folder, extracts.flight())
@@ -242,13 +248,13 @@ MAKE: dict[str, Callable[..., object]] = {
     made.__name__: made
     for made in (
         log, odd_log, table, flight, half_minute, recordings, zipped, endless, introduced,
-        future, mission, images, dataflash, empty_dataflash, dialect,
+        future, compared, mission, images, dataflash, empty_dataflash, dialect,
     )
 }  # fmt: skip
 
 
 def change(path: Path, how: str) -> None:
-    """Do `A => B`, `cut BYTES`, `insert AT COUNT`, `blank LINE`, `bom` or `latin TEXT`."""
+    """Do `OLD => NEW`, `cut N`, `insert AT N`, `blank LINE`, `bom`, `encode X` or `latin X`."""
     data = path.read_bytes()
     word, *numbers = how.split()
     match word:
@@ -263,6 +269,8 @@ def change(path: Path, how: str) -> None:
             data = b"\n".join(lines)
         case "bom":
             data = b"\xef\xbb\xbf" + data
+        case "encode":
+            data = data.decode().encode(numbers[0])
         case "latin":
             data = how.removeprefix("latin ").encode("latin-1") + b"\n" + data
         case _:

@@ -41,6 +41,10 @@ def mission(alt: float) -> list[Any]:
 
 @pytest.fixture
 def flights(tmp_path: Path) -> tuple[Path, Path]:
+    return write_both(tmp_path)
+
+
+def write_both(folder: Path) -> tuple[Path, Path]:
     def version(patch: int) -> Any:
         number = 4 << 24 | 5 << 16 | patch << 8
         hashes = [[0] * 8] * 3
@@ -53,7 +57,7 @@ def flights(tmp_path: Path) -> tuple[Path, Path]:
     ]
     one = [param(b"A", 0.1), param(b"B", 2), *mission(50), version(1), text(3, b"Bad gyro")]
     two = [param(b"A", 0.2), param(b"C", 3), *mission(60), version(2), text(6, b"Ready")]
-    return written(tmp_path / "a.tlog", [*one, *battery]), written(tmp_path / "b.tlog", two, lost=3)
+    return written(folder / "a.tlog", [*one, *battery]), written(folder / "b.tlog", two, lost=3)
 
 
 def test_recordings_are_compared_by_section(flights: tuple[Path, Path]) -> None:
@@ -67,44 +71,11 @@ def test_recordings_are_compared_by_section(flights: tuple[Path, Path]) -> None:
     assert found["texts"] == {"Bad gyro": ["Bad gyro", ""], "Ready": ["", "Ready"]}
 
 
-def test_equal_recordings_have_no_differences(flights: tuple[Path, Path], tmp_path: Path) -> None:
-    copy = tmp_path / "copy.tlog"
-    copy.write_bytes(flights[0].read_bytes())
-    assert "no differences" in run("diff", flights[0], copy)
-
-
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
-@pytest.mark.parametrize(
-    "content",
-    [
-        *("A,0.1\nB,5\n", "A 0.1\nB 5\n", "# x\n1\t1\tA\t0.1\t9\n1\t1\tB\t5\t9\n"),
-        *("A 0.100000\nB 5.000000\n", "A,0.1000004 # text\n#NOTE: x\nB,5\n"),
-    ],
-)
-def test_recording_is_compared_with_a_parameter_file(
-    flights: tuple[Path, Path], tmp_path: Path, content: str, encoding: str
-) -> None:
-    path = tmp_path / "x.param"
-    path.write_text(content.replace("0.1000004", "0.10000000149"), encoding)
-    found = json.loads(run("diff", flights[0], path, "--json"))
-    assert found["parameters"] == {"B": ["2", "5"]}
-    assert found["figures"] == found["texts"] == {}
-
-
 def test_page_escapes_texts(flights: tuple[Path, Path], tmp_path: Path) -> None:
     other = written(tmp_path / "c.tlog", [mavlink.MAVLink_statustext_message(6, b"<script>")])
     run("diff", flights[0], other, "--html", tmp_path / "diff.html")
     text = (tmp_path / "diff.html").read_text()
     assert ("&lt;script&gt;" in text, "<script>" in text) == (True, False)
-
-
-def test_files_without_parameters_or_vehicle_are_refused(
-    flights: tuple[Path, Path], tmp_path: Path
-) -> None:
-    path = tmp_path / "x.param"
-    path.write_bytes(b"nothing\xff\n")
-    assert "contains no parameters" in run("diff", flights[0], path, code=2)
-    assert "no vehicle 9" in run("diff", *flights, "--system", 9, code=2)
 
 
 async def test_running_aircraft_is_compared_with_its_parameters_and_their_meaning(
