@@ -44,7 +44,7 @@ from gateway.live.serial_port import AUTO, SerialPort
 from gateway.live.service import LoopLag, ServiceNotifier, set_realtime_priority
 from gateway.live.session import SessionState
 from gateway.live.source_port import SourcePort, read_map
-from gateway.live.vehicle_watch import RECEIVER, VehicleWatch
+from gateway.live.vehicle_watch import VehicleWatch
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.printable import NO_RECEIVER, reason_of, without_folders
 from gateway.recordings.recorded_table import header_for
@@ -289,11 +289,12 @@ class Daemon:
         )
 
     def _vehicle_rows(self) -> tuple[VehicleRow, ...]:
-        link = ", ".join(source.url for source in self._pipeline.report.sources)
         own = {key: one.vehicle.telemetry.mode[1] for key, one in self._pipeline.aircraft.items()}
-        return self._watch_vehicles().rows(
-            self.now_us(), own, self._hub.clients(), link or RECEIVER
-        )
+        sources: dict[int, str] = {}
+        for source in self._pipeline.sources:
+            for key in source.vehicles:
+                sources[key] = ", ".join(filter(None, (sources.get(key), source.url.name)))
+        return self._watch_vehicles().rows(self.now_us(), own, self._hub.clients(), sources)
 
     def _serve_metrics(self) -> None:
         port = self._settings.hub.metrics_port

@@ -7,6 +7,7 @@ numbers; with several links to one system, only frames that all of them lost cou
 
 import math
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -79,19 +80,21 @@ class VehicleWatch:
         now_us: int,
         own: Mapping[int, str],
         clients: Iterable[ClientStats],
-        link: str = RECEIVER,
+        sources: Mapping[int, str] = MappingProxyType({}),
     ) -> tuple[VehicleRow, ...]:
         """Return the status of each vehicle.
 
-        `own` are the modes of the gateway's own vehicles by system id, and `link` is their link.
+        `own` are the modes of the gateway's own vehicles by system id, and `sources` are the links
+        of those that do not come from the receiver.
         """
         links = {system_id: client.name for client in clients for system_id, _ in client.systems}
+        links |= {system_id: sources.get(system_id, RECEIVER) for system_id in own}
         return tuple(
             self._row(
                 (system_id, state),
                 now_us,
                 own.get(system_id) or state.mode(),
-                link if system_id in own else links.get(system_id, ""),
+                links.get(system_id, ""),
             )
             for system_id, state in self.present(now_us).items()
         )

@@ -109,6 +109,8 @@ def test_row_of_a_vehicle_has_mode_position_link_and_loss() -> None:
     assert row.loss == pytest.approx(1 / 9)
     (own,) = systems.rows(2 * US_PER_S, {9: "Tracking"}, [client])
     assert (own.mode, own.link) == ("Tracking", "receiver")
+    (own,) = systems.rows(2 * US_PER_S, {9: ""}, [client], {9: "crsf:stdin", 2: "lines:stdin"})
+    assert own.link == "crsf:stdin"
 
 
 def test_messages_of_one_kind_are_decoded_at_intervals() -> None:
