@@ -19,5 +19,5 @@ buildah add "$made" "$work/root.tar" / >/dev/null
 buildah config --user mavgate --volume /var/lib/mavgate --env PYTHONUNBUFFERED=1 \
     --env XDG_STATE_HOME=/var/lib/mavgate --entrypoint '["mavgate"]' --cmd 'run --plain' \
     --label org.opencontainers.image.version="$version" --label org.opencontainers.image.licenses=Apache-2.0 "$made"
-buildah commit --quiet --timestamp "${SOURCE_DATE_EPOCH:-$(date +%s)}" "$made" \
+buildah commit --quiet --disable-compression=false --timestamp "${SOURCE_DATE_EPOCH:-$(date +%s)}" "$made" \
     "oci-archive:$output/mavgate-${version%+*}-oci.tar:localhost/mavgate:latest"

@@ -12,7 +12,7 @@ trials=${*:-bookworm trixie arm64 tests}
 python=$PWD/.venv/bin/python
 roots=$PWD/build/roots
 wheels=$PWD/build/wheels
-test_packages=" pytest pytest-asyncio pytest-xdist execnet pluggy iniconfig hypothesis sortedcontainers packaging pygments crsf-parser crc construct "
+test_packages=" pytest pytest-asyncio pytest-xdist execnet pluggy iniconfig hypothesis sortedcontainers packaging pygments crsf-parser construct-typing typing-extensions "
 mkdir -p "$roots" "$wheels"
 
 skip() {
@@ -28,8 +28,9 @@ download() {
     for oldest in 2_34 2_31 2_28 2_27 2_26 2_24 2_17 2_12 2_5; do
         platforms="$platforms --platform manylinux_${oldest}_$1"
     done
+    # Two have no wheel.
     awk '/^[A-Za-z]/ { other = !/^cobs==/ } other' requirements.lock >"$folder/wheels.lock"
-    awk '/^[A-Za-z]/ { other = !/^cobs==/ } !other' requirements.lock >"$folder/sources.lock"
+    awk '/^[A-Za-z]/ { on = /^(cobs|construct)==/ } on' requirements-dev.lock >"$folder/sources.lock"
     awk '/^[A-Za-z]/ { on = /^setuptools==/ } on' requirements-build.lock >>"$folder/wheels.lock"
     awk -v names="$test_packages" '/^[A-Za-z]/ { name = $0; sub(/==.*/, "", name); on = index(names, " " name " ") } on' \
         requirements-dev.lock >>"$folder/wheels.lock"
@@ -105,7 +106,12 @@ try_package() {
         $as_service mavgate doctor --config /etc/mavgate/gateway.toml >/doctor.log 2>&1 ||
             { cat /doctor.log; exit 1; }
         mavgate record start >/dev/null
-        sleep 2
+        python3 -c "import socket, sys, time; sys.path.insert(0, \"/\"); import try_installed as trial
+vehicle = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+for number in range(20):
+    vehicle.sendto(trial.heartbeat(), (\"127.0.0.1\", 14551))
+    vehicle.sendto(trial.numbered(number), (\"127.0.0.1\", 14551))
+    time.sleep(0.1)"
         mavgate record stop >/dev/null
         kill -TERM $service
         wait $service || { echo "the service ended with exit code $?"; cat /service.log; exit 1; }
@@ -165,7 +171,7 @@ for trial in $trials; do
             cp -r tests tools config docs firmware pyproject.toml README.md Makefile "$roots/arm64/source/"
             in_root "$roots/arm64" sh -ec '
                 /opt/mavgate/bin/pip --disable-pip-version-check install --quiet --no-index --no-deps \
-                    --find-links /wheels --no-compile $0
+                    --find-links /wheels --no-compile $0 construct
                 cd /source
                 /opt/mavgate/bin/python -m pytest -q -n 2 -m "not slow" -p no:cacheprovider \
                     tests/wire tests/geometry tests/sensing tests/estimation tests/vehicle tests/sources tests/hub
