@@ -50,8 +50,8 @@ mv "$lib/share" "$work/"
 rm -rf "$lib/bin" "$lib"/mavgate-*.dist-info/direct_url.json
 if [ -n "$lock" ]; then
     # There is no wheel of cobs. Without its compiled part, which is that of this machine, it is Python.
-    awk '/^[A-Za-z]/ { other = !/^cobs==/ } other' "$lock" >"$work/wheels.lock"
-    awk '/^[A-Za-z]/ { other = !/^cobs==/ } !other' "$lock" >"$work/sources.lock"
+    "$python" -m tools.locked_for "$lock" "$minor" "$machine" --without cobs >"$work/wheels.lock"
+    "$python" -m tools.locked_for "$lock" "$minor" "$machine" --only cobs >"$work/sources.lock"
     step "$(grep -c '^[A-Za-z]' "$work/wheels.lock") packages of $lock" \
         install --require-hashes --requirement "$work/wheels.lock"
     step "and cobs" "$python" -m pip install --disable-pip-version-check --no-compile --no-deps \

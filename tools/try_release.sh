@@ -29,11 +29,13 @@ download() {
         platforms="$platforms --platform manylinux_${oldest}_$1"
     done
     # Two have no wheel.
-    awk '/^[A-Za-z]/ { other = !/^cobs==/ } other' requirements.lock >"$folder/wheels.lock"
-    awk '/^[A-Za-z]/ { on = /^(cobs|construct)==/ } on' requirements-dev.lock >"$folder/sources.lock"
-    awk '/^[A-Za-z]/ { on = /^setuptools==/ } on' requirements-build.lock >>"$folder/wheels.lock"
-    awk -v names="$test_packages" '/^[A-Za-z]/ { name = $0; sub(/==.*/, "", name); on = index(names, " " name " ") } on' \
-        requirements-dev.lock >>"$folder/wheels.lock"
+    # shellcheck disable=SC2086 # the list is meant to be split
+    {
+        "$python" -m tools.locked_for requirements.lock "$2" "$1" --without cobs
+        "$python" -m tools.locked_for requirements-build.lock "$2" "$1" --only setuptools
+        "$python" -m tools.locked_for requirements-dev.lock "$2" "$1" --only $test_packages
+    } >"$folder/wheels.lock"
+    "$python" -m tools.locked_for requirements-dev.lock "$2" "$1" --only cobs construct >"$folder/sources.lock"
     # shellcheck disable=SC2086 # the list is meant to be split
     "$python" -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \
         --implementation cp --python-version "$2" $platforms --platform "manylinux2014_$1" \
