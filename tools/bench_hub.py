@@ -18,8 +18,9 @@ the machine affects them equally; all receive from the same port, and run on a s
 there are two. The median of the rounds counts.
 
 "WebSocket" is the hub with its clients at a WebSocket port, "packed" the hub whose clients get
-several frames in one datagram. With `--systems N` the source is a link to N vehicles, and the first
-client sends each of them a command.
+several frames in one datagram. With `--vehicles N` the source is a link to N vehicles, the bare hub
+is compared with `mavgate run`, with and without a recording, and the first client sends each of the
+vehicles a command.
 """
 
 import argparse
@@ -33,6 +34,7 @@ import statistics
 import struct
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -47,6 +49,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gateway.compiled.system_calls import receive_many, send_many
+from gateway.wire.mavlink_messages import CRC_EXTRA, TARGET_OFFSETS, base_size
 
 CLIENTS = (1, 4, 16, 64)
 RATE_HZ = 1000
@@ -62,6 +65,12 @@ START_LIMIT_S = 20.0
 SO_TIMESTAMPNS = 35
 CORES = sorted(os.sched_getaffinity(0))
 """Processor cores: the forwarder runs on the last one, source and clients on the first."""
+KINDS = 20
+"""Kinds of frame of each of several vehicles."""
+PAYLOAD_BYTES = 32
+WARM_UP_S = 2.0
+HUB_NAME, RUN, RECORDING = "mavgate", "mavgate run", "recording"
+"""Names of the bare hub, and of the whole gateway without and with a recording."""
 WEB = "WebSocket"
 """Name of the hub with its clients at a WebSocket port."""
 PACKED = "packed"
@@ -188,19 +197,48 @@ def hub_command(*endpoints: str, event_loop: str = "asyncio") -> list[str]:
     return [sys.executable, "-c", HUB, event_loop, *endpoints]
 
 
-def source_frames(systems: int = 1) -> list[bytes]:
-    """Encode the frames that the source sends, of some vehicles in turn."""
-    links = [mavlink.MAVLink(None, SOURCE_SYSTEM + n, 1) for n in range(systems)]
+def daemon(mode: str) -> Command:
+    """Return the command line of `mavgate run` without a receiver, which records in a mode."""
+
+    def build(port: int, clients: list[int]) -> list[str]:
+        folder = Path(tempfile.mkdtemp(prefix="bench_hub_"))
+        urls = [f"udp-listen:127.0.0.1:{port}", *(f"udp:127.0.0.1:{each}" for each in clients)]
+        settings = folder / "gateway.toml"
+        settings.write_text(
+            f'aircraft_folder = "{folder}"\n[hub]\nendpoints = {json.dumps(urls)}\n'
+            f'[recording]\nmode = "{mode}"\nfolder = "{folder}"\n'
+        )
+        program = str(Path(sys.executable).with_name("mavgate"))
+        at = ["--config", str(settings), "--socket", str(folder / "run.sock")]
+        return [program, *at, "run", "--plain", "--port", "none"]
+
+    return build
+
+
+def source_frames(vehicles: int = 1) -> list[bytes]:
+    """Make the frames that the source sends: of one vehicle one kind, of several `KINDS` each."""
+    kinds = [mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION] if vehicles == 1 else _kinds()
     frames = []
     for number in range(FRAMES):
-        link = links[number % systems]
-        link.seq = number // systems % 256
-        angle = number / FRAMES
-        message = mavlink.MAVLink_attitude_quaternion_message(
-            number, 1.0, angle, -angle, angle, 0.1, 0.2, 0.3
-        )
-        frames.append(bytes(message.pack(link)))
+        turn, vehicle = divmod(number, vehicles)
+        payload = number.to_bytes(PAYLOAD_BYTES, "little").replace(b"\0", b"\1")
+        header = bytes((PAYLOAD_BYTES, 0, 0, turn % 256, *vehicle_ids(vehicle)))
+        message_id = kinds[turn % len(kinds)]
+        content = header + message_id.to_bytes(3, "little") + payload
+        crc = mavlink.x25crc(content + CRC_EXTRA[message_id]).crc
+        frames.append(b"\xfd" + content + crc.to_bytes(2, "little"))
     return frames
+
+
+def _kinds() -> list[int]:
+    """Return telemetry whose frames may all have the same size."""
+    sizes = {key: base_size(key) or 0 for key in CRC_EXTRA if key not in TARGET_OFFSETS}
+    return [key for key, size in sorted(sizes.items()) if size >= PAYLOAD_BYTES][:KINDS]
+
+
+def vehicle_ids(number: int) -> tuple[int, int]:
+    """Return system and component of a vehicle: 100 systems, of several components each."""
+    return SOURCE_SYSTEM + number % 100, 1 + number // 100
 
 
 def heartbeat() -> bytes:
@@ -357,30 +395,29 @@ class Bench:
             / 1000,
         )
 
-    def commanded(self, systems: int) -> int:
+    def commanded(self, vehicles: int) -> int:
         """Send a command to each of some vehicles; return the number that arrived."""
-        for number in range(2 * systems):
-            self._send(self._frames[number])
+        self._send(self._frames[0])
         self._sinks[0].setblocking(True)
         _, forwarder = self._sinks[0].recvfrom(2048)
         self._sinks[0].setblocking(False)
         self._settle()
         station = mavlink.MAVLink(None, 255, 190)
-        for number in range(systems):
+        for number in range(vehicles):
             ask = mavlink.MAVLink_command_long_message(
-                SOURCE_SYSTEM + number, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *(0,) * 7
+                *vehicle_ids(number), mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *(0,) * 7
             )
             self._sinks[0].sendto(ask.pack(station), forwarder)
             station.seq = (station.seq + 1) % 256
-            time.sleep(0.005)
-        reached: set[int] = set()
+            time.sleep(0.002)
+        reached: set[tuple[int, int]] = set()
         end_s = time.monotonic() + COMMANDED_S
         reader = mavlink.MAVLink(None)
-        while time.monotonic() < end_s and len(reached) < systems:
+        while time.monotonic() < end_s and len(reached) < vehicles:
             if select.select([self._source], (), (), 0.1)[0]:
                 for message in reader.parse_buffer(self._source.recv(2048)) or []:
                     if message.get_type() == "COMMAND_LONG":
-                        reached.add(message.target_system)
+                        reached.add((message.target_system, message.target_component))
         return len(reached)
 
     def run_until(self, delivered: int) -> Iterator[tuple[int, int]]:
@@ -586,35 +623,55 @@ def show(report: dict[str, dict[str, dict[str, dict[str, float]]]]) -> None:
     print("in brackets: times the plain forwarder, times mavlink-router")
 
 
-def measure_systems(
-    forwarders: dict[str, Start], systems: int, clients: int, seconds: float
-) -> dict[str, dict[str, float]]:
-    """Command some vehicles behind one link, and measure the cost of each of their frames."""
-    found: dict[str, dict[str, float]] = {}
-    table = Table(title=f"{systems} vehicles behind one link", box=box.SIMPLE_HEAD)
-    for column in ("forwarder", "commanded", "CPU µs/msg", "of one vehicle"):
-        table.add_column(column, justify="right")
-    for name, start in forwarders.items():
-        if name in (WEB, "plain"):
-            continue
-        costs: dict[int, float] = {}
-        for behind in (1, systems):
-            bench = start(clients, source_frames(behind))
-            try:
-                runs = [bench.throughput(seconds, WINDOWS[-1]) for _ in range(3)]
-                costs[behind] = min(run.cpu_us_per_message for run in runs)
-                reached = bench.commanded(behind)
-            finally:
-                bench.close()
-        found[name] = {
-            "commanded": reached,
-            "cpu_us_per_message": costs[systems],
-            "cpu_us_of_one_vehicle": costs[1],
+def measure_vehicles(
+    forwarders: dict[str, Start], vehicles: list[int], clients: int, rounds: int, seconds: float
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Measure the cost of frames of some vehicles behind one link, and command each of them."""
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for count in vehicles:
+        frames, runs = (
+            source_frames(count),
+            {name: list[tuple[float, float]]() for name in forwarders},
+        )
+        reached = dict.fromkeys(forwarders, 0)
+        for _ in range(rounds):
+            for name, start in forwarders.items():
+                bench = start(clients, frames)
+                try:
+                    # The first frame of each kind is routed.
+                    bench.throughput(WARM_UP_S, WINDOWS[0])
+                    fast = bench.throughput(seconds, WINDOWS[0])
+                    late = bench.latency(seconds, RATE_HZ)
+                    runs[name].append((fast.cpu_us_per_message, late.cpu_percent))
+                    reached[name] = bench.commanded(count) if name != "plain" else 0
+                finally:
+                    bench.close()
+        found[str(count)] = {
+            name: {
+                "cpu_us_per_message": statistics.median(fast for fast, _ in figures),
+                "cpu_percent": statistics.median(late for _, late in figures),
+                "commanded": reached[name],
+            }
+            for name, figures in runs.items()
         }
-        figures = [f"{value:.2f}" for value in list(found[name].values())[1:]]
-        table.add_row(name, f"{found[name]['commanded']} of {systems}", *figures)
-    Console(width=120).print(table)
+    show_vehicles(found)
     return found
+
+
+def show_vehicles(found: dict[str, dict[str, dict[str, float]]]) -> None:
+    """Print the figures of vehicles behind one link, with their ratios to the bare hub."""
+    table = Table(title=f"Vehicles of {KINDS} kinds of frame behind one link", box=box.SIMPLE_HEAD)
+    for column in ("vehicles", "forwarder", "CPU µs/msg", f"CPU % @{RATE_HZ}/s", "commanded"):
+        table.add_column(column, justify="right")
+    for count, by_name in found.items():
+        for name, figures in by_name.items():
+            cells = [
+                f"{figures[key]:.2f} ({figures[key] / by_name[HUB_NAME][key]:.2f})"
+                for key in ("cpu_us_per_message", "cpu_percent")
+            ]
+            table.add_row(count, name, *cells, f"{figures['commanded']:.0f}")
+    Console(width=120).print(table)
+    print("in brackets: times the bare hub")
 
 
 def watch_memory(messages: int) -> dict[str, int]:
@@ -644,7 +701,9 @@ def main() -> None:
         "--router", action="append", default=[], metavar="NAME=COMMAND",
         help="compare another router: its command with {in} and {out} for ports",
     )  # fmt: skip
-    parser.add_argument("--systems", type=int, help="only command this many vehicles of one link")
+    parser.add_argument(
+        "--vehicles", type=int, nargs="+", help="measure these numbers of vehicles of one link"
+    )
     parser.add_argument(
         "--memory", type=int, metavar="MESSAGES", help="only measure memory over this many messages"
     )
@@ -653,7 +712,7 @@ def main() -> None:
     report: dict[str, object] = {"load_before": os.getloadavg(), "cores": os.cpu_count()}
     forwarders: dict[str, Start] = {
         "plain": partial(Bench, plain),
-        "mavgate": partial(Bench, hub()),
+        HUB_NAME: partial(Bench, hub()),
         PACKED: partial(Bench, hub("?pack=1100")),
         WEB: WebBench,
     }
@@ -667,9 +726,15 @@ def main() -> None:
         forwarders[name] = partial(Bench, router(command))
     if options.memory:
         report["memory"] = watch_memory(options.memory)
-    elif options.systems:
-        report["systems"] = measure_systems(
-            forwarders, options.systems, options.clients[0], options.seconds
+    elif options.vehicles:
+        for name in (PACKED, WEB):
+            del forwarders[name]
+        forwarders |= {
+            RUN: partial(Bench, daemon("manual")),
+            RECORDING: partial(Bench, daemon("always")),
+        }
+        report["vehicles"] = measure_vehicles(
+            forwarders, options.vehicles, options.clients[0], options.rounds, options.seconds
         )
     else:
         figures = {

@@ -28,7 +28,7 @@ import tempfile
 import time
 import tty
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -187,6 +187,8 @@ class Line:
         self._waiting: dict[int, deque[float | None]] = {}
         """Times of unanswered frames, by system; None for frames that are not measured."""
         self._latencies_us: list[float] = []
+        self.unanswered = 0
+        """Frames of the last exchange without an answer."""
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sock.bind(("127.0.0.1", 0))
         self._sock.setblocking(False)
@@ -220,7 +222,11 @@ class Line:
         raise SystemExit(f"no answer from {self.process.args!r}")
 
     def exchange(self, rate_hz: int, seconds: float) -> list[float]:
-        """Send at a rate, match IMU frames with their answers in order; return latencies in µs."""
+        """Send at a rate, match IMU frames with their answers in order; return latencies in µs.
+
+        Frames without an answer are counted: on a busy machine the gateway drops telemetry that has
+        waited for 0.15 s. The latencies after one are too long by an interval, up to the end.
+        """
         self._latencies_us = []
         begin = time.perf_counter()
         count, total = 0, round(seconds * rate_hz)
@@ -234,8 +240,8 @@ class Line:
             # A sleep to the end would end too late at 1000 frames/s, so the last part is polled.
             if select.select([self._sock], [], [], max(0.0, due - now - 2e-4))[0]:
                 self._receive()
-        if missing := self._unanswered():
-            raise SystemExit(f"{missing} frames of {total} were not answered")
+        self.unanswered = self._unanswered()
+        self._waiting.clear()
         return self._latencies_us
 
     def _unanswered(self) -> int:
@@ -284,6 +290,7 @@ def measure(
         "p99_us": float(p99),
         "max_us": max(latencies_us),
         "cpu_percent": 100 * share,
+        "unanswered": line.unanswered,
     }
 
 
@@ -304,10 +311,10 @@ def programs(folder: Path, options: argparse.Namespace) -> dict[str, list[str]]:
 
 
 def summed_up(rounds: list[dict[str, float]]) -> dict[str, float]:
-    """Return the median round of each figure, and the longest pause of all."""
+    """Return the median round of each figure, the longest pause, and all unanswered frames."""
+    ways: dict[str, Callable[[list[float]], float]] = {"max_us": max, "unanswered": sum}
     return {
-        key: (max if key == "max_us" else statistics.median)([one[key] for one in rounds])
-        for key in rounds[0]
+        key: ways.get(key, statistics.median)([one[key] for one in rounds]) for key in rounds[0]
     }
 
 
@@ -345,11 +352,13 @@ def show(results: dict[tuple[int, str], dict[str, float]], options: argparse.Nam
     """Print the figures as a table, and the longest pauses."""
     title = f"serial byte in to datagram out, {options.vehicles} aircraft"
     table = Table(title=title, box=box.SIMPLE_HEAD)
-    for column in ("IMU/s", "program", "p50 µs", "p99 µs", "max µs", "CPU %"):
+    for column in ("IMU/s", "program", "p50 µs", "p99 µs", "max µs", "CPU %", "unanswered"):
         table.add_column(column, justify="left" if column == "program" else "right")
     for (rate_hz, name), row in results.items():
         latencies = (f"{row[key]:.0f}" for key in ("p50_us", "p99_us", "max_us"))
-        table.add_row(str(rate_hz), name, *latencies, f"{row['cpu_percent']:.1f}")
+        table.add_row(
+            str(rate_hz), name, *latencies, f"{row['cpu_percent']:.1f}", f"{row['unanswered']:.0f}"
+        )
     console = Console()
     console.print(table)
     # At the highest rate, a frame waits for almost all of a pause, so the maximum is the longest.
