@@ -65,6 +65,8 @@ class ImuFlags(IntFlag):
     GYRO_UNCALIBRATED = 1 << 9
     ACCEL_UNCALIBRATED = 1 << 10
     """Set by the gateway: the bias of the sensor is not removed."""
+    MEANS = 1 << 11
+    """Set by the gateway: rate and force are means since the last sample, as nodes send them."""
 
     __and__ = int.__and__  # type: ignore[assignment]
     """Return a plain int, to test a bit: creating a flag would take six times as long."""

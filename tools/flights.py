@@ -16,6 +16,7 @@ from gateway.estimation.columns import (
     GPS_DIP,
     GPS_LAT,
     IMU_COLUMNS,
+    MEANS,
     gps_row,
     imu_row,
     nav_row,
@@ -89,6 +90,7 @@ def as_increments(flight: Flight, rate_hz: float) -> Flight:
         row[0:3] = half_way.inv().apply(velocity) / span_s
         row[3:6] = turned.as_rotvec() / span_s
         fields = log.imu[part, 6:size]
+        row[MEANS] = 1.0
         row[6:size] = next((field for field in fields[::-1] if np.isfinite(field[0])), np.nan)
     return replace(
         flight,

@@ -34,7 +34,9 @@ ACCEL_UNCALIBRATED: Final = 12
 ACCEL_FILTERED: Final = 13
 GYRO_FILTERED: Final = 14
 """1 where the node has filtered the sensor of each column, else 0."""
-IMU_COLUMNS: Final = 15
+MEANS: Final = 15
+"""1 where rate and force are means since the previous sample, else 0."""
+IMU_COLUMNS: Final = 16
 
 GPS_USABLE: Final = 0
 """1 for a fix that may be fused, else 0."""
@@ -74,6 +76,7 @@ ROW_FLAGS: Final = (
     int(ImuFlags.ACCEL_UNCALIBRATED),
     int(ImuFlags.ACCEL_FILTERED),
     int(ImuFlags.GYRO_FILTERED),
+    int(ImuFlags.MEANS),
 )
 """Names of the columns."""
 

@@ -84,6 +84,8 @@ LASTING_VIBRATION: Final = 1.5
 """Factors for slow errors, which are noise to a fading filter but not to averages over minutes: the
 smoother counts fewer fixes as independent, and more of the vibration, which aliases to slow
 errors."""
+SMOOTHED_IRON: Final = 1.0 / 3.0
+"""Share of the initial hard iron: smoothing would also attribute the errors of soft iron to it."""
 AXES_RAD: Final = 0.005
 """Error of the sensor axes, half a per cent, which averages do not reduce."""
 LEAST_VAR: Final = 1e-24
@@ -293,7 +295,10 @@ def smooth(estimator: KernelEstimator, log: SampleLog) -> tuple[FloatArray, floa
     gains.gps_latency_s = latency_s = estimator.latency_of(log)
     gains.gps_correlation_s = max(gains.gps_correlation_s, LASTING_CORRELATION_S)
     gains.gyro_vibration_sq *= LASTING_VIBRATION
+    gains.hard_iron_var *= SMOOTHED_IRON**2
     state = estimator.state
+    if state.started == 0:
+        state.P[HARD_IRON : HARD_IRON + 3] *= SMOOTHED_IRON**2
     begin_certain(state, latency_s)
     states = np.zeros(2, np.asarray(state).dtype)
     states[0] = state

@@ -80,7 +80,7 @@ class SensorChain:
         self._accel = Correction(cal.mounting, cal.accel_matrix, cal.accel_bias_mps2)
         self._gyro = Correction(cal.mounting, IDENTITY3, cal.gyro_bias_radps)
         self._mag = Correction(cal.mag_mounting, cal.mag_soft_iron, cal.mag_hard_iron_ut)
-        self._added_flags = cal.missing
+        self._added_flags = cal.missing | ImuFlags.MEANS
         self._flags: dict[int, ImuFlags] = {}
 
     def imu(self, raw: ImuRaw) -> ImuSample:

@@ -5,8 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gateway.estimation.columns import MEANS
 from tools.flights import Flight, as_increments, read_flight
-from tools.score_estimators import attitude_scores, position_errors_m, rms, run_eskf
+from tools.score_estimators import attitude_scores, position_errors_m, rms, run_eskf, share_scores
+from tools.spoil_flight import cut
 
 RATE_HZ = 10.0
 MOST_WORSE = 1.2
@@ -33,6 +35,14 @@ def ratios(flight: Flight) -> dict[str, float]:
 @pytest.mark.slow
 def test_simulated_flight_loses_little_by_increments(flight: Flight) -> None:
     assert max(ratios(flight).values()) < MOST_WORSE
+
+
+@pytest.mark.slow
+def test_standard_deviations_contain_the_vibration_of_slow_samples(flight: Flight) -> None:
+    slow = cut(flight, np.arange(len(flight.log.imu)) % 10 == 0)
+    slow.log.imu[:, MEANS] = 0.0
+    shares = share_scores(slow, run_eskf(slow))
+    assert min(shares["tilt_2s"], shares["heading_2s"]) > 0.85
 
 
 @pytest.mark.slow

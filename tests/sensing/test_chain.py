@@ -27,14 +27,17 @@ def test_sample_of_a_level_board_is_in_si_and_body_axes(chain: SensorChain) -> N
 
 
 def test_sensors_without_a_calibration_are_marked(chain: SensorChain) -> None:
-    missing = chain.imu(LEVEL).flags ^ ImuFlags.MAG_NEW
+    missing = chain.imu(LEVEL).flags ^ (ImuFlags.MAG_NEW | ImuFlags.MEANS)
     marks = {
         ImuFlags.MAG_UNCALIBRATED: NodeCalibration(mag_hard_iron_ut=(3.0, 0.0, 0.0)),
         ImuFlags.GYRO_UNCALIBRATED: NodeCalibration(gyro_bias_radps=(0.0, 0.0, 0.01)),
         ImuFlags.ACCEL_UNCALIBRATED: NodeCalibration(accel_bias_mps2=(0.0, 0.1, 0.0)),
     }
     for mark, calibration in marks.items():
-        assert missing ^ SensorChain(calibration).imu(LEVEL).flags == mark | ImuFlags.MAG_NEW
+        assert (
+            missing ^ SensorChain(calibration).imu(LEVEL).flags
+            == mark | ImuFlags.MAG_NEW | ImuFlags.MEANS
+        )
     assert missing == functools.reduce(operator.or_, marks)
 
 

@@ -22,6 +22,7 @@ from gateway.estimation.columns import (
     HEADING_VALID_RAD,
     IMU_COLUMNS,
     MAG_UNCALIBRATED,
+    MEANS,
     NAV_ALT,
     NAV_ATTITUDE_STD,
     NAV_COLUMNS,
@@ -171,6 +172,7 @@ def update_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
     A late sample is ignored; a clock that has gone back far counts as restarted.
     """
     gyro, accel, mag = imu_vectors(row)
+    s.means = 1 if row[MEANS] != 0.0 else 0
     check_calibration(s, p, row)
     if s.started == 0:
         begin(s, p, time_us, gyro, accel)

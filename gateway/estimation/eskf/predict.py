@@ -93,7 +93,7 @@ BLEND_S: Final = 1.0
 STEP_LIMIT: Final = 1e4
 """Squared change from sample to sample above which it is a fault; NaN compares false."""
 MEANS_S: Final = 0.05
-"""Interval above which samples are means without vibration, which differ by the motion."""
+"""Interval of means above which they contain no vibration, but differ by the motion."""
 HISTORY_INTERVAL_S: Final = 0.005
 """Interval of the stored integrals, which are interpolated; faster samples share a slot."""
 CLIMB_DENSITY: Final = 4.0
@@ -170,7 +170,8 @@ def add_vibration(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> Non
         accel_sq += (change - s.imu_change[3 + k]) ** 2
         s.imu_change[3 + k] = change
         s.imu_before[k], s.imu_before[3 + k] = gyro[k], accel[k]
-    if dt < MEANS_S and gyro_sq < STEP_LIMIT and accel_sq < STEP_LIMIT:
+    vibrating = dt < MEANS_S or s.means == 0
+    if vibrating and gyro_sq < STEP_LIMIT and accel_sq < STEP_LIMIT:
         share = dt * dt / 18.0
         s.pending_noise[0] += p.gyro_vibration_sq * share * gyro_sq
         s.pending_noise[1] += p.accel_vibration_sq * share * accel_sq
@@ -334,8 +335,7 @@ def symmetrise(P: FloatArray) -> None:
 def unexpected_density(s: State, k: int) -> float:
     """Return the process noise of a watched state beyond the model, its unit squared per s.
 
-    That of the accelerometer grows with its variance, since a new error of its scale moves the
-    height by metres within seconds.
+    The accelerometer's grows with its variance, to follow a new scale error within seconds.
     """
     chance_sq = ACCEL_CHANCE_SQ if 3 <= k < 6 else BIAS_CHANCE_SQ
     excess = max(s.bias_sum[k] ** 2 / chance_sq - s.bias_sum_var[k], 0.0)

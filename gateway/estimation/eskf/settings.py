@@ -26,54 +26,32 @@ class EskfSettings(Settings, frozen=True):
     ] = 0.066
     gyro_vibration: Annotated[
         float,
-        setting(
-            "Share of the measured sample-to-sample noise of the angular rate that counts as white "
-            "noise.",
-            ge=0.0,
-            le=10.0,
-        ),
+        setting("Share of the measured noise of the rate that is white noise.", ge=0.0, le=10.0),
     ] = 1.4
     gyro_scale: Annotated[
         float, setting("Relative scale error of each gyroscope axis.", ge=0.0, le=0.1)
     ] = 0.03
     gyro_turn_deg: Annotated[
-        float,
-        setting(
-            "Attitude error after a turn of 1 rad due to axes that are not orthogonal.",
-            "deg",
-            ge=0.0,
-            le=10.0,
-        ),
+        float, setting("Attitude error by skewed axes, per rad of turn.", "deg", ge=0.0, le=10.0)
     ] = 0.25
     gyro_bias_degps: Annotated[
         float, setting("Initial gyroscope bias.", "deg/s", ge=0.01, le=20.0)
     ] = 0.6
     gyro_bias_uncalibrated_degps: Annotated[
-        float,
-        setting("Initial bias of a gyroscope without calibration.", "deg/s", ge=0.01, le=20.0),
+        float, setting("Initial bias without calibration.", "deg/s", ge=0.01, le=20.0)
     ] = 3.0
     gyro_bias_walk_degpsprs: Annotated[
         float, setting("Random walk of the gyroscope bias.", "deg/s/sqrt(s)", ge=0.0, le=1.0)
     ] = 0.0055
     gyro_bias_change_degps: Annotated[
-        float,
-        setting(
-            "Change of the gyroscope bias between rest and motion due to heat and vibration.",
-            "deg/s",
-            ge=0.0,
-            le=5.0,
-        ),
+        float, setting("Change of the bias from rest to motion, by heat.", "deg/s", ge=0.0, le=5.0)
     ] = 0.15
     accel_noise_mpsprs: Annotated[
         float, setting("Accelerometer noise, without vibration.", "m/s/sqrt(s)", ge=1e-4, le=10.0)
     ] = 0.1
     accel_vibration: Annotated[
         float,
-        setting(
-            "Share of the measured sample-to-sample noise of the force that counts as white noise.",
-            ge=0.0,
-            le=10.0,
-        ),
+        setting("Share of the measured noise of the force that is white noise.", ge=0.0, le=10.0),
     ] = 0.46
     accel_scale: Annotated[
         float, setting("Relative error of the force beyond gravity.", ge=0.0, le=0.2)
@@ -82,8 +60,7 @@ class EskfSettings(Settings, frozen=True):
         float, setting("Initial accelerometer bias.", "m/s2", ge=0.001, le=2.0)
     ] = 0.04
     accel_bias_uncalibrated_mps2: Annotated[
-        float,
-        setting("Initial bias of an accelerometer without calibration.", "m/s2", ge=0.001, le=2.0),
+        float, setting("Initial bias without calibration.", "m/s2", ge=0.001, le=2.0)
     ] = 0.3
     accel_bias_walk_mps2prs: Annotated[
         float, setting("Random walk of the accelerometer bias.", "m/s2/sqrt(s)", ge=0.0, le=1.0)
@@ -97,19 +74,13 @@ class EskfSettings(Settings, frozen=True):
             ge=0.1,
             le=20.0,
         ),
-    ] = 1.0
+    ] = 1.3
     gravity_noise_mps2: Annotated[
-        float,
-        setting("Acceleration in the low-pass filtered gravity.", "m/s2", ge=0.001, le=5.0),
+        float, setting("Acceleration in the low-pass filtered gravity.", "m/s2", ge=0.001, le=5.0)
     ] = 0.1
     gravity_motion: Annotated[
-        float,
-        setting(
-            "Share of the difference of the two low-passes that counts as error of gravity.",
-            ge=0.0,
-            le=2.0,
-        ),
-    ] = 0.8
+        float, setting("Share of the difference of the low-passes that is error.", ge=0.0, le=2.0)
+    ] = 0.6
     gps_position_m: Annotated[
         float, setting("Noise of a fix, horizontal.", "m", ge=0.01, le=50.0)
     ] = 1.2
@@ -138,13 +109,7 @@ class EskfSettings(Settings, frozen=True):
         float, setting("Correlation time of that error.", "s", ge=1.0, le=3600.0)
     ] = 50.0
     gps_correlation_s: Annotated[
-        float,
-        setting(
-            "Correlation time of the velocity noise: faster fixes add no information.",
-            "s",
-            ge=0.0,
-            le=10.0,
-        ),
+        float, setting("Correlation time of the velocity noise.", "s", ge=0.0, le=10.0)
     ] = 0.4
     gps_jitter_s: Annotated[
         float, setting("Variation of the latency from fix to fix.", "s", ge=0.0, le=0.5)
@@ -168,8 +133,7 @@ class EskfSettings(Settings, frozen=True):
         float, setting("Random walk of the hard iron.", "uT/sqrt(s)", ge=0.0, le=10.0)
     ] = 0.005
     field_norm_tolerance: Annotated[
-        float,
-        setting("Maximum relative difference from the usual field strength.", ge=0.01, le=1.0),
+        float, setting("Largest relative difference of the field strength.", ge=0.01, le=1.0)
     ] = 0.1
     field_dip_tolerance_deg: Annotated[
         float, setting("Maximum difference from the usual dip.", "deg", ge=1.0, le=90.0)
@@ -181,25 +145,16 @@ class EskfSettings(Settings, frozen=True):
         float, setting("Random walk of the barometer's offset.", "m/sqrt(s)", ge=0.0, le=5.0)
     ] = 0.5
     baro_dynamic: Annotated[
-        float,
-        setting("Share of the dynamic pressure that acts on the barometer.", ge=0.0, le=1.0),
+        float, setting("Share of the dynamic pressure in the static one.", ge=0.0, le=1.0)
     ] = 0.2
     dead_reckoning_s: Annotated[
-        float,
-        setting("Longest dead reckoning without GPS.", "s", ge=1.0, le=600.0),
+        float, setting("Longest dead reckoning without GPS.", "s", ge=1.0, le=600.0)
     ] = 60.0
     gate_sigma: Annotated[
-        float,
-        setting("Standard deviations above which innovations have less weight.", ge=2.0, le=20.0),
+        float, setting("Standard deviations at which weights fall.", ge=2.0, le=20.0)
     ] = 5.0
     gate_m: Annotated[
-        float,
-        setting(
-            "Distance of a fix below which it has less weight but is never rejected.",
-            "m",
-            ge=0.0,
-            le=100.0,
-        ),
+        float, setting("Distance below which a fix is never rejected.", "m", ge=0.0, le=100.0)
     ] = 10.0
     rest_gyro_degps: Annotated[
         float, setting("Maximum deviation of the rate at rest.", "deg/s", ge=0.01, le=10.0)

@@ -92,6 +92,8 @@ class State:
     time_s: float
     imu_s: float
     """Newest IMU sample that was used."""
+    means: int
+    """1 if the samples are means over their intervals."""
     usual_step_s: float
     """Average interval of IMU samples; 0 before the second."""
     sound_s: float
