@@ -1,7 +1,13 @@
 """The log workshop: a stream of frames, a chain of edits, a writer.
 
-`selection` chooses vehicles, messages and times, `trimming` states the times at which a cut begins
-and ends, `merging` and `joining` make one stream of several files, `tlog_editing` edits frames on
-their way, `anonymising` shifts locations and times; `convert` writes the stream in another format.
-`extracts` and `timed_extracts` write single contents of a recording, and `comparison` compares two.
+| step           | modules                                                                        |
+| -------------- | ------------------------------------------------------------------------------ |
+| stream         | `merging`, `joining`: one stream of batches or rows from several files         |
+| chain          | `trimming`, `selection`: which records; `editing`, `anonymising`: their frames |
+|                | `tlog_editing` applies the chain, `private_fields` is a table of fields        |
+| writer         | `convert`: one writer per format, chosen by the ending of the file             |
+| single content | `extracts`, `timed_extracts`; `comparison` of two recordings                   |
+
+A link of the chain takes batches and returns batches, or takes a frame and returns it edited, or
+None. So the memory needed does not depend on the size of the files.
 """
