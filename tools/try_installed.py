@@ -79,7 +79,6 @@ def fly(words: list[str], folder: Path) -> None:
         rate = received / FLOWN_S
         print(f"attitudes_per_s {rate:.1f}")
         print(f"cpu_percent {100 * (cpu_s(process.pid) - begin_cpu_s) / FLOWN_S:.1f}")
-        print(f"memory_mb {memory_mb(process.pid):.0f}")
         expect(rate > 40, "the demo sends 50 attitudes a second")
 
 
@@ -130,7 +129,8 @@ def forward(words: list[str], folder: Path) -> None:
     with socket_of_station() as station, socket_of_station() as vehicle:
         vehicle_url = f"udp-listen:127.0.0.1:{free_port()}"
         ends = ("--endpoint", vehicle_url, "--endpoint", url_of(station))
-        with running(words, folder, "run", "--plain", *ends, config='[serial]\nport = "none"\n'):
+        config = '[serial]\nport = "none"\n'
+        with running(words, folder, "run", "--plain", *ends, config=config) as process:
             vehicle.connect(("127.0.0.1", int(vehicle_url.rpartition(":")[2])))
             vehicle.settimeout(None)
             deadline_s, got = time.monotonic() + LIMIT_S, list[int]()
@@ -147,6 +147,7 @@ def forward(words: list[str], folder: Path) -> None:
                     while len(received) < number and (more := numbers_in(station, 5.0, once=True)):
                         received += more
             received += numbers_in(station, 1.0)
+            print(f"memory_of_router_mb {memory_mb(process.pid):.0f}")
     in_order = received == sorted(received)
     print(f"forwarded {len(received)} of {FRAMES}{'' if in_order else ', not in order'}")
     expect(received == [*range(1, FRAMES + 1)], "each frame is forwarded, in order")
