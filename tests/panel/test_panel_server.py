@@ -31,7 +31,7 @@ def test_panel_of_a_gateway_takes_another_port_if_its_own_is_in_use(
 
 
 def test_standalone_panel_reports_the_port_in_use(taken: PanelSettings) -> None:
-    with pytest.raises(PanelError, match=f"{taken.port}: Address already in use; --port"):
+    with pytest.raises(PanelError, match=f"{taken.port}: Address already in use; --tcp-port"):
         panel_server.run_panel(taken, Path(), None, None, print, attached=False)
 
 

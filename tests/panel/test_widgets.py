@@ -219,5 +219,5 @@ def test_angles_of_a_parameter_are_shown_in_degrees() -> None:
 
 def test_unknown_figures_of_a_recording_are_dashes() -> None:
     assert _facts_cells(FlightFigures(61.2)) == ("0:01:01", "—", "—", ("—", ""))
-    figures = FlightFigures(3601.0, distance=math.nan, highest=7.4, loss=0.1)
-    assert _facts_cells(figures) == ("1:00:01", "—", "7 m", ("10.0%", "warn"))
+    figures = FlightFigures(3601.0, distance=math.nan, highest=7.4, height_above="home", loss=0.1)
+    assert _facts_cells(figures) == ("1:00:01", "—", "7 m above home", ("10.0%", "warn"))
