@@ -269,7 +269,7 @@ def _move_in_time(page: Page, row: Locator) -> None:
         expect(slider).to_be_visible()
     expect(page.get_by_role("button", name=re.compile("Back to live"))).to_be_visible()
     expect(page.get_by_title("Show the present")).to_be_hidden()
-    expect(page.locator("[data-view='map'] [data-role=path]")).to_have_text(["fused", "recorded"])
+    expect(page.locator("[data-view='map'] [data-role=path]")).to_have_text(["live", "recorded"])
     view.get_by_label("Play or pause").click()
     expect(view.get_by_label("Play or pause")).to_have_text("play_arrow")
     length_s = float(slider.get_attribute("aria-valuemax") or 0)

@@ -85,6 +85,7 @@ export default {
       this.steppedAt = now;
       this.advance(now, dt);
       this.draw(now);
+      mavgate.show_numbers?.();
       if (this.moving) this.frame = requestAnimationFrame((t) => this.step(t));
       else this.steppedAt = undefined;
     },

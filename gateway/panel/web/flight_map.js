@@ -17,7 +17,7 @@ const AIRCRAFT = {
   copter: "M16 3l4 7h-8zM8 8a5 5 0 1 1-.1 0zM24 8a5 5 0 1 1-.1 0zM8 19a5 5 0 1 1-.1 0zM24 19a5 5 0 1 1-.1 0zM13 12h6v9h-6z",
   none: "M16 3l9 25-9-6-9 6z",
 };
-const ORIGINS = { live: ["track", "fused"], recorded: ["recorded", "recorded"], "fused again": ["fused-again", "fused again"] };
+const ORIGINS = { live: ["track", "live"], recorded: ["recorded", "recorded"], "fused again": ["fused-again", "fused again"] };
 const look_of = (state) => (ORIGINS[state.origin] ?? ORIGINS.live)[0];
 const icon = (html, size) => L.divIcon({ html, className: "map-icon", iconSize: [size, size], iconAnchor: [size / 2, size / 2] });
 const at = (spot) => [spot.lat_deg, spot.lon_deg];
@@ -179,12 +179,12 @@ export default {
         <button type="button" v-if="asked.has_mark" @click="act('clear')">Clear the mark</button>
         <button type="button" @click="asked = null">Cancel</button>
       </div>
-      <div class="map-legend" v-if="full">
+      <div class="map-legend" v-if="full || paths.length > 1">
         <span v-for="[look, name] in paths" :key="look" class="key" :class="look" data-role="path">{{ paths.length > 1 ? name : "path" }}</span>
-        <span v-if="has_fixes" class="key fix">GPS</span>
-        <span class="key circle" v-if="circle">95 % within {{ circle }}</span>
-        <span class="key mark" v-if="way" data-role="way">{{ way }}</span>
-        <span class="key home" v-if="sight" data-role="sight">{{ sight }}</span>
+        <span v-if="full && has_fixes" class="key fix">GPS</span>
+        <span class="key circle" v-if="full && circle">95 % within {{ circle }}</span>
+        <span class="key mark" v-if="full && way" data-role="way">{{ way }}</span>
+        <span class="key home" v-if="full && sight" data-role="sight">{{ sight }}</span>
       </div>
     </div>`,
   props: { styles: Array, full: Boolean, may_mark: Boolean, base: String },

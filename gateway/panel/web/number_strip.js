@@ -16,24 +16,34 @@ export default {
     </dl>`,
   data: () => ({ items: [], limit: OLD_S }),
   mounted() {
-    // At most that often, and always once after the last change.
+    let updated_ms = 0;
     const update = () => {
       this.timer = undefined;
-      this.items = mavgate.state ? items_of(mavgate.state) : [];
+      updated_ms = performance.now();
+      this.items = mavgate.state ? items_of(displayed(mavgate.state)) : [];
     };
+    // The flight display calls this after each of its frames, so that both show one moment.
+    mavgate.show_numbers = () => performance.now() - updated_ms >= EVERY_MS && update();
+    // At most that often, and always once after the last change.
     this.stop = mavgate.subscribe(() => (this.timer ??= setTimeout(update, EVERY_MS)));
   },
   unmounted() {
     this.stop?.();
+    mavgate.show_numbers = null;
     clearTimeout(this.timer);
   },
 };
 
+// The state with the attitude, speeds and heights that the flight display shows.
+function displayed(state) {
+  const shown = mavgate.displayed;
+  return shown?.fresh === state.system_id ? { ...state, ...shown, q_nb: shown.q ?? state.q_nb } : state;
+}
+
 function items_of(state) {
   const past = mavgate.past_us !== null;
   const age = (name) => (past ? 0 : (state[name] ?? 0));
-  const displayed = mavgate.displayed;
-  const q = displayed?.fresh === state.system_id && displayed.q ? displayed.q : state.q_nb;
+  const q = state.q_nb;
   const angles = q && q[0] !== null ? mavgate.euler_deg(q) : [null, null, null];
   const angle = (value, digits = 1) => (Number.isFinite(value) ? value.toFixed(digits) : "—");
   const heading = Number.isFinite(angles[2]) ? angles[2] : state.heading_deg;
