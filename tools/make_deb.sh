@@ -41,7 +41,7 @@ done
 install() {
     # shellcheck disable=SC2086 # the list is meant to be split
     "$python" -m pip install --disable-pip-version-check --no-compile --no-deps --target "$lib" \
-        --only-binary=:all: --implementation cp --python-version "$minor" $platforms \
+        --only-binary=:all: --ignore-requires-python --implementation cp --python-version "$minor" $platforms \
         --platform manylinux2014_"$machine" --platform linux_"$machine" "$@"
 }
 
