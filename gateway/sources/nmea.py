@@ -22,6 +22,7 @@ SENTENCE: Final = re.compile(r"[$!](\w{2})(\w{3})((?:,[^*]*)?)(?:\*([0-9A-Fa-f]{
 KNOTS_MPS: Final = 1852.0 / 3600.0
 KMH_MPS: Final = 1.0 / 3.6
 DEG_MIN: Final = re.compile(r"(\d{0,3}?)(\d{1,2}(?:\.\d*)?)")
+LIMITS_DEG: Final = {"N": 90.0, "S": 90.0, "E": 180.0, "W": 180.0}
 FIRST_CENTURY: Final = 80
 """Years of two digits from this one on are before 2000: the epoch of GPS is in 1980."""
 UERE_M: Final = 4.0
@@ -103,7 +104,8 @@ class NmeaReader:
         pdop = _number(gsa[14]) if len(gsa) > 14 else NAN
         h_acc, v_acc = self._accuracies(hdop, pdop, arrival_us)
         valid = gga[5] not in ("", "0") if gga else rmc[1] == "A"
-        if rmc and rmc[1] == "V":
+        if rmc and (rmc[1] == "V" or rmc[11:12] == ["N"]):
+            # NMEA 2.3 adds a mode, of which N means that the data is not valid.
             valid = False
         fix_type = FIX_TYPES.get(gsa[1]) if len(gsa) > 1 and valid else None
         return fix_at(
@@ -152,9 +154,11 @@ def _degrees(text: str, side: str) -> float:
     if not text:
         return NAN
     found = DEG_MIN.fullmatch(text)
-    if found is None or side not in ("N", "S", "E", "W"):
+    if found is None or side not in LIMITS_DEG or float(found[2]) >= 60.0:
         raise ValueError(text)
     value = int(found[1] or 0) + float(found[2]) / 60.0
+    if value > LIMITS_DEG[side]:
+        raise ValueError(text)
     return -value if side in ("S", "W") else value
 
 

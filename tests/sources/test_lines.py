@@ -250,8 +250,9 @@ def test_accuracies_come_from_gst_or_else_from_the_dilution() -> None:
         nmea("RMC", "100000.00", "A", "0000.0000", "N", "00000.0000", "E", "0", "0", "010626", ""),
         "$GPRMC,000000.00,A,0.000,N,0.000,E,0.0,0.0,050525,0.0,E\n",
         json_line(lat=0, lon=0, alt_m=50, satellites=7),
+        nmea("RMC", *RMC, "", "", "N"),
     ],
-    ids=["empty fields", "zeros", "short zeros", "json"],
+    ids=["empty fields", "zeros", "short zeros", "json", "mode N"],
 )
 def test_lines_without_a_position_are_no_fix(text: str) -> None:
     (fix,) = decode(text)
@@ -289,6 +290,8 @@ def test_true_heading_is_reported_without_an_attitude() -> None:
         ('{"pressure_hpa": 1' + "0" * 400 + "}", "json", "valid value"),
         ("$GPGGA,101530.20,4807.038*00", "nmea checksum", "checksum"),
         ("$GPGGA,x,y", "nmea", "cannot be read"),
+        (nmea("GGA", "101530.20", "4775.84", *GGA[2:]).strip(), "nmea", "cannot be read"),
+        (nmea("GGA", "101530.20", "9923.84", *GGA[2:]).strip(), "nmea", "cannot be read"),
         ("$PUBX,00", "nmea", "not an NMEA sentence"),
         ("x" * 5000, "too long", "longer"),
     ],

@@ -24,6 +24,7 @@ from gateway.recordings.recorded_clock import DAY_US, LAST_CIVIL_US
 from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.recordings.workshop.editing import FrameEdit
 from gateway.recordings.workshop.private_fields import (
+    TICKS,
     Pair,
     Treatment,
     is_private,
@@ -169,13 +170,13 @@ class MovedLocations:
         """Return whether a number may be a latitude or longitude of a group, in usual units."""
         if not math.isfinite(value) or not value:
             return False
-        degrees = (value / DEGE7_PER_DEG, value, math.degrees(value))
+        degrees = (value / DEGE7_PER_DEG, value / 1e6, value, math.degrees(value))
         is_round = abs(value - round(value, 2)) < 1e-6 * abs(value)
         return any(
             abs(known) >= 1.0 and abs(each - known) < NEAR_DEG
             for group in self._groups
             for known in group
-            for each in degrees[: 1 if is_round else None]
+            for each in degrees[: 2 if is_round else None]
         )
 
 
@@ -269,7 +270,8 @@ class Anonymiser(FrameEdit):
             numbers += struct.unpack("<i", struct.pack("<f", value))
         return (
             text_of(label)
-            if is_private(label) or any(map(self._locations.includes, numbers))
+            if is_private(label)
+            or any(self._locations.includes(each) or self._is_date(each) for each in numbers)
             else ""
         )
 
@@ -329,6 +331,7 @@ class Anonymiser(FrameEdit):
                 changes |= self._moved(fields, Pair(name, names[number + 1], per_deg))
             is_cleared = (
                 (treatment == "0" and not math.isnan(value))
+                or (name not in changes and self._locations.includes(value))
                 or (treatment == "a" and abs(value) > FULL_TURN_DEG)
                 or (treatment == "T" and abs(value) * US_PER_S > GPS_EPOCH_UNIX_US)
             )
@@ -348,6 +351,13 @@ class Anonymiser(FrameEdit):
         number = self._number(original.rstrip(b"\0"))
         return np.frombuffer(number.to_bytes(len(original), "little"), np.uint8)
 
+    def _is_date(self, value: float) -> bool:
+        """Return whether a number, in s since 1970, is within a year of the recording's dates."""
+        if not GPS_EPOCH_UNIX_US < value * US_PER_S < LAST_CIVIL_US:
+            return False
+        clocks = (self._dates, self._records)
+        return any(clock.nearest(round(value * US_PER_S), YEAR_US) for clock in clocks)
+
     def _number(self, original: bytes) -> int:
         """Return the number of an identifier, from 1; 0 for an empty one."""
         if not original:
@@ -358,10 +368,15 @@ class Anonymiser(FrameEdit):
 
     def _moved_date(self, value: int, per_s: int, zero_s: int, message_id: int, field: str) -> int:
         """Move a time, if it is a date; 0 if the moved date does not fit the field."""
-        time_us = value * US_PER_S // per_s + zero_s * US_PER_S
-        is_date = GPS_EPOCH_UNIX_US < time_us < LAST_CIVIL_US
-        if not value or not is_date:
+        if not value:
             return value
+        time_us = value * US_PER_S // per_s + zero_s * US_PER_S
+        if not GPS_EPOCH_UNIX_US < time_us < LAST_CIVIL_US:
+            # Some programs send another unit.
+            units = (each for each in TICKS.values() if self._is_date(value / each))
+            if (per_s := next(units, 0)) == 0:
+                return value
+            time_us = value * US_PER_S // per_s
         shift_s = self._dates.shift_us(time_us, like=self._records) // US_PER_S
         moved = value + shift_s * per_s
         limit = np.iinfo(layout_of(message_id)[field]).max

@@ -31,8 +31,8 @@ from gateway.vehicle_state.senders import RecordedSender
 from gateway.wire.recorded_frames import fields_of
 
 END_US: Final = 1 << 62
-UNKNOWN_INT: Final = (1 << 31) - 1
-"""An unknown coordinate of MISSION_ITEM_INT."""
+UNKNOWN_INTS: Final = ((1 << 31) - 1, -(1 << 31))
+"""Unknown coordinates of MISSION_ITEM_INT: that of the specification, and a converted NaN."""
 _NOT_IN_NAMES: Final = re.compile(r"[^\x21-\x7e]|[,#]|^[=+@-]")
 _INTEGERS: Final = {1: "<Bxxx", 2: "<bxxx", 3: "<Hxx", 4: "<hxx", 5: "<I", 6: "<i"}
 """Encoding of an integer in the four bytes of a value, by MAV_PARAM_TYPE."""
@@ -179,7 +179,7 @@ def _known(value: float) -> float | None:
 def _numbers(item: Item) -> list[float | None]:
     """Return the seven parameters of an item; None for those that are unknown."""
     *params, x, y, z = map(_known, item.numbers)
-    at = (None if raw == UNKNOWN_INT else value for raw, value in ((item.x, x), (item.y, y)))
+    at = (None if raw in UNKNOWN_INTS else value for raw, value in ((item.x, x), (item.y, y)))
     return [*params, *at, z]
 
 

@@ -177,7 +177,7 @@ def test_unknown_numbers_and_hostile_names_stay_data(tmp_path: Path) -> None:
         mavlink.MAVLink_param_value_message(b"=C", 2.0, 9, 2, 1),
         mavlink.MAVLink_statustext_message(6, b"=cmd()"),
         mavlink.MAVLink_mission_count_message(255, 190, 1, 0),
-        item(0, 0, 16, (unknown, unknown), nan),
+        item(0, 0, 16, (unknown, -unknown - 1), nan),
         mavlink.MAVLink_mission_count_message(255, 190, 1, 2),
         item(0, 2, 5100, E7, nan),
     ]

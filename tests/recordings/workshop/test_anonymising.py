@@ -300,6 +300,8 @@ def integer(command: int, frame: int, *params: float) -> Any:
         (integer(201, 99, 3, 0, 0, 0, *E7, 0), "x y", INT_ZERO),
         (integer(16, 2, 3, 0, 0, 0, 2**31 - 1, E7[1], 0), "x y", (2**31 - 1, 0)),
         (integer(16, 1, 0, 0, 0, 0, 250_000, 380_000, 0), "x y", (250_000, 380_000)),
+        (integer(192, 1, 0, 0, 0, 0, *E7, 0), "x y", (0, 0)),
+        (long(203, 1, 0, LAT, LON, 0, 0, 0), "param1 param3 param4", (1, 0, 0)),
         (mavlink.MAVLink_mission_item_message(1, 1, 0, 3, 16, 0, 1, 0, 0, 0, 0, LAT, LON, 9),
          "x y", ZERO),
         (mavlink.MAVLink_safety_allowed_area_message(3, LAT, LON, 0, LAT, LON, 99),
@@ -435,6 +437,21 @@ def test_first_date_in_messages_is_moved_to_the_day_whatever_the_clock_of_the_re
 )
 def test_times_at_the_ends_of_their_types_are_no_dates(message: Any, field: str) -> None:
     assert edited(message)[field] == getattr(message, field)
+
+
+def test_dates_in_another_unit_or_of_any_name_are_of_the_same_clock() -> None:
+    ms, s = START_US // 1000, START_US // 1_000_000
+    image = mavlink.MAVLink_camera_image_captured_message(
+        9, ms, 1, 0, 0, 0, 0, [1, 0, 0, 0], 1, 1, b""
+    )
+    named = mavlink.MAVLink_named_value_int_message(0, b"X", s)
+    first, moved, left_out = anonymised(
+        [packed(mavlink.MAVLink_system_time_message(START_US, 9)), *map(packed, (image, named))]
+    )
+    assert first is not None
+    assert moved is not None
+    assert fields_of(moved)["time_utc"] == fields_of(first)["time_unix_usec"] // 1000
+    assert left_out is None
 
 
 def test_dates_that_no_longer_fit_their_field_become_unknown() -> None:
