@@ -30,16 +30,16 @@ WORDS: Final = ("text", "id", "label", "week", "command")
 """Treatments other than coordinates, dates and fixed values."""
 _HARMLESS: Final = re.compile(
     r"^OSD\d.*|LATENCY|LATERAL|LATCH|PLAT(FORM)?|FLAT|RELAT|TRANSLAT|ISOLAT|ALONG|LONGITUDINAL|"
-    r"FS_LONG|COLON|CPLNG|LNGTH|SERIAL_?PASS\d|SLCAN_SERNUM|DECL_(TYPE|A)$|RALLY_INCL|UPDATE|"
+    r"FS_LONG|COLON|CPLNG|LNGTH|SERIAL_?PASS\d|SLCAN_SERNUM|DECL_(TYPE|A)$|RALLY_INCL|UPDATE|VALIDATE|CANDIDATE|"
     r"GUID(?!$)|MACRO|MACH|RSSI"
 )
 """Parts of names that contain a part of a private name by chance."""
 _PRIVATE: Final = re.compile(
     # Location, also by the magnetic field and by the time zone.
     r"LAT|LON|LNG|LONG|COORD|ECEF|EASTING|NORTHING|UTM|MGRS|GEOHASH|DECL|(MAG|COMPASS)_?DEC$|INCLIN"
-    r"|MAG_?INC|(?<![A-Z])(DIP|INCL)(?![A-Z])|SIH_LOC|TIME_?ZONE|UTC|_TZ|QNH|COUNTRY|"
+    r"|MAG_?INC|(?<![A-Z])(DIP|INCL)(?![A-Z])|SIH_LOC|TIME_?ZONE|UTC|(?<![A-Z])TZ(?![A-Z])|QNH|COUNTRY|"
     # Date.
-    r"(?<![A-Z])DATE|EPOCH|UNIX|^STAT_|LND_FLIGHT_T|FLIGHT_?UUID|"
+    r"DATE|(YY|DD)MM(YY|DD)|EPOCH|UNIX|^STAT_|LND_FLIGHT_T|FLIGHT_?UUID|"
     # Device, network, owner.
     r"MAC_?(ADDR|$|\d)|IP_?ADDR|GW_?ADDR|(?<![A-Z])(IP|GW|DNS)\d*$|(?<![A-Z])HOST|GATEWAY|SSID|WIFI"
     r"|PASSW|PASS_?(PHRASE|KEY)|(?<![A-Z])PASS\d*$|PWD|PSK|(?<!PARAM\d_)(?<![A-Z])KEY|SECRET|TOKEN|"

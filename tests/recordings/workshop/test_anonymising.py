@@ -359,10 +359,12 @@ def test_dates_are_moved_by_whole_days_and_times_since_boot_stay() -> None:
 
 PRIVATE_NAMES = (b"HOME_LAT", b"SIM_OPOS_LNG", b"ADSB_ICAO_ID", b"BATT_SERIAL_NUM", b"gpslat",
                  b"HOMELAT", b"EKF2_MAG_DECL", b"NET_MACADDR0", b"COMPASS_DEC", b"NAV_AH_LON",
-                 b"BRD_RTC_TZ_MIN", b"WIFI_PASSWORD1", b"STAT_RESET", b"lonE7")  # fmt: skip
+                 b"BRD_RTC_TZ_MIN", b"WIFI_PASSWORD1", b"STAT_RESET", b"lonE7",
+                 b"GPSDATE", b"ddmmyy", b"TZ_OFFSET")  # fmt: skip
 OTHERS = (b"PLAT_MAX", b"ATC_LATENCY", b"FLIGHT_ID", b"WPNAV_SPEED", b"COMPASS_OFS_X",
           b"COMPASS_USE", b"RC_PASSTHRU", b"SERIAL_PASS1", b"OSD1_GPSLAT_X", b"FS_LONG_ACTN",
-          b"GUID_TIMEOUT", b"BATT_CAPACITY", b"EKF2_DECL_TYPE")  # fmt: skip
+          b"GUID_TIMEOUT", b"BATT_CAPACITY", b"EKF2_DECL_TYPE",
+          b"UPDATE_RATE")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", PRIVATE_NAMES + OTHERS)
