@@ -221,7 +221,9 @@ class CrsfDecoder(CheckedFrames):
     def _gps(self, payload: bytes, arrival_us: int) -> GpsFix | None:
         lat, lon, speed, course, height, satellites = struct.unpack_from(">iiHHHB", payload)
         course -= 0x10000 if course > FULL_TURN else 0
-        vel, fix_type = velocity(speed * KMH10_MPS, course / 100.0), None
+        vel = velocity(speed * KMH10_MPS, course / 100.0)
+        # Without satellites it is the position before the receiver lost them.
+        fix_type = None if satellites else GpsFixType.NONE
         h_acc = v_acc = speed_acc = NAN
         if self._velocity is not None and arrival_us - self._velocity[0] <= EXTRA_AGE_US:
             kind, north, east, up, speed_cm, _, _, h_cm, v_cm = self._velocity[1]

@@ -127,6 +127,8 @@ def test_gps_frame_is_a_fix() -> None:
     assert fix.vel_n_mps[1] == pytest.approx(speed * math.sin(math.radians(270.5)))
     west = one(0x02, struct.pack(">iiHhHB", 481173000, -115167000, 360, -9000, 1545, 11))
     assert west.vel_n_mps[:2] == pytest.approx((0.0, -10.0), abs=1e-9), "a signed course of PX4"
+    lost = one(0x02, GPS[:-1] + bytes(1))
+    assert (lost.fix_type, lost.fix_ok) == (GpsFixType.NONE, False), "the last position"
 
 
 def test_extended_gps_and_time_belong_to_the_next_fix() -> None:
