@@ -62,12 +62,12 @@ for lock; do
     case $lock in
         # The demo uses neither the fleet's package nor a second event loop.
         requirements.lock) size="96 MB" skipped="eclipse-zenoh uvloop" ;;
-        *) size="500 MB" skipped= ;;
+        *) size="420 MB" skipped= ;;
     esac
     # shellcheck disable=SC2086 # the list is meant to be split
     entries -v $skipped <"$lock" >"$lock_of_step"
     step "$(grep -c '^[A-Za-z]' "$lock_of_step") packages of $lock: $size" \
-        install ${compiler:+--no-compile} --require-hashes --requirement "$lock_of_step"
+        install --require-hashes --requirement "$lock_of_step"
 done
 # Only here: pip would not install again what it finds in the folder of the compiler.
 [ $# = 0 ] || PYTHONPATH=$compiler step "mavgate itself" install --no-build-isolation --editable .

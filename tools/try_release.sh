@@ -67,7 +67,7 @@ in_root() {
     # shellcheck disable=SC2016 # expanded by the inner shell
     unshare --mount --net --pid --fork sh -c '
         ip link set lo up && mount -t proc proc "$0/proc" && mount --rbind /dev "$0/dev" &&
-        exec chroot "$0" env HOME=/root PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin "$@"
+        exec chroot "$0" env -i HOME=/root PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin "$@"
     ' "$root" "$@"
 }
 
