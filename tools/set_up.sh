@@ -67,8 +67,15 @@ for lock; do
     # shellcheck disable=SC2086 # the list is meant to be split
     entries -v $skipped <"$lock" >"$lock_of_step"
     step "$(grep -c '^[A-Za-z]' "$lock_of_step") packages of $lock: $size" \
-        install --require-hashes --requirement "$lock_of_step"
+        install --no-compile --require-hashes --requirement "$lock_of_step"
 done
+# Not of tests, and of few dialects: they would be a third of the environment. A file of another version of
+# Python, which no program imports, is no failure.
+compile_bytecode() {
+    .venv/bin/python -m compileall -q -j 0 .venv/lib \
+        -x '/tests?/|pymavlink/(tools|generator|dialects/v[01]|dialects/v20/(?!all|common|ardupilotmega|minimal|standard))' || :
+}
+[ $# = 0 ] || step "bytecode" compile_bytecode
 # Only here: pip would not install again what it finds in the folder of the compiler.
 [ $# = 0 ] || PYTHONPATH=$compiler step "mavgate itself" install --no-build-isolation --editable .
 
