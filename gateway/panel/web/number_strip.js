@@ -68,7 +68,7 @@ function items_of(state) {
     // Directly above home the direction is unknown.
     if (distance_m < LEAST_SIGHT_M) return [item("From home", "—", "", "position_s")];
     const elevation = (Math.atan2(rise_m, distance_m) - distance_m / 2 / EARTH_M) / rad;
-    return [item("From home", `${Math.round(mavgate.bearing_deg(from, here)) % 360}°`, `${Math.round(elevation)}° up`, "position_s")];
+    return [item("From home", `${Math.round(mavgate.bearing_deg(from, here)) % 360}°`, `${elevation.toFixed(1)}°↑`, "position_s")];
   };
   return [
     item("Roll", angle(angles[0]), "°", "attitude_s"),
