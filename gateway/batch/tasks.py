@@ -211,7 +211,7 @@ class ReadFlight:
 def read_batch_flight(files: Sequence[Path], options: ReadOptions, name: str) -> ReadFlight:
     """Read the parts of a recording as one flight; raises as `FlightTask.do`."""
     flight, table, aircraft = flight_of_files(
-        files, options, name=name, description="One of a season."
+        files, options, name=name, description="One recording of a batch."
     )
     known = table.header
     header = header_of_states(known, aircraft)
