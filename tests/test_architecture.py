@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent / "gateway"
 
-FOUNDATION = {"records", "units", "gps_time", "settings", "compiled", "geometry"}
+FOUNDATION = {"records", "units", "gps_time", "settings", "token_bucket", "compiled", "geometry"}
 STAGES = {"wire", "sensing", "estimation", "vehicle", "simulator"}
 JOINED = {"aircraft", "pipeline"}
 BELOW = FOUNDATION | STAGES | JOINED | {"vehicle_state"}
@@ -24,6 +24,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "units": set(),
     "gps_time": {"units"},
     "settings": set(),
+    "token_bucket": {"units"},
     "compiled": set(),
     "output": set(),
     "toml_file": set(),

@@ -15,7 +15,6 @@ from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout, OnRun
 from gateway.hub.forwarding import Forwarding
 from gateway.hub.forwarding_step import MOST
-from gateway.hub.limits import TokenBucket
 from gateway.hub.round_trip import RoundTrip
 from gateway.hub.router import Router
 from gateway.hub.routing_table import FrameStream, Origin, OwnVehicles
@@ -39,6 +38,7 @@ from gateway.hub.transports.base import (
 )
 from gateway.hub.transports.registry import CLIENTS, LISTENERS
 from gateway.records import ClientInterval, Incoming, Outgoing
+from gateway.token_bucket import TokenBucket
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
@@ -119,7 +119,7 @@ class Hub:
         self.recordings = recordings
         self.signer = signer = signer or FrameSigner()
         self.now_us = now_us
-        self.untrusted_reads = TokenBucket(UNTRUSTED_READ_RATE, *[UNTRUSTED_READ_BURST] * 2)
+        self.untrusted_reads = TokenBucket(UNTRUSTED_READ_RATE, UNTRUSTED_READ_BURST)
         self._on_gone, self._on_foreign, self._on_alert = on_gone, on_foreign, on_alert
         self._alerts = ClientAlerts()
         self._connections = LogRateLimiter(CONNECTIONS_IN_FULL, CONNECTIONS_NOT_LOGGED)

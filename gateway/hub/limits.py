@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.records import Incoming
-from gateway.units import US_PER_S
+from gateway.token_bucket import TokenBucket
 
 REQUEST_COST: Final = 200
 """Cost of a request, bytes: reading and answering it takes as long as sending this many."""
@@ -30,30 +30,6 @@ MAX_WAITING: Final = 64
 """Maximum waiting requests of a client; one that waits for its answers has one or two."""
 SLACK_SHIFT: Final = 2
 """A limited frame may be a quarter of its interval early, or jitter would halve the rate."""
-
-
-@dataclass(slots=True)
-class TokenBucket:
-    """A token bucket, in bytes: a negative level blocks until the bucket has refilled."""
-
-    rate: int
-    """Bytes a second added."""
-    burst: int
-    """Capacity, bytes."""
-    level: float
-    """Present content, bytes; may be negative."""
-    filled_us: int = 0
-    """Time of the last refill."""
-
-    def refill(self, now_us: int) -> None:
-        """Add the tokens since the last refill."""
-        gain = (now_us - self.filled_us) * self.rate / US_PER_S
-        self.level = min(self.burst, self.level + gain)
-        self.filled_us = now_us
-
-    def wait_us(self) -> int:
-        """Return the time until the level is positive; 0 is now."""
-        return 0 if self.level > 0 else round((1 - self.level) * US_PER_S / self.rate)
 
 
 @dataclass(slots=True, eq=False)
@@ -71,7 +47,7 @@ class RequestQueue:
         self._lines: dict[int, _Line] = {}
         self._turns: dict[int, _Line] = {}
         """Clients with waiting requests; the first was served longest ago."""
-        self._untrusted = TokenBucket(UNTRUSTED_RATE, UNTRUSTED_BURST, UNTRUSTED_BURST)
+        self._untrusted = TokenBucket(UNTRUSTED_RATE, UNTRUSTED_BURST)
 
     def offer(self, incoming: Incoming, now_us: int) -> bool:
         """Queue a request; return whether there was room."""
@@ -79,7 +55,7 @@ class RequestQueue:
         if line is None or (line.bucket is self._untrusted) == incoming.trusted:
             bucket = self._untrusted
             if incoming.trusted:
-                bucket = TokenBucket(CLIENT_RATE, CLIENT_BURST, CLIENT_BURST, now_us)
+                bucket = TokenBucket(CLIENT_RATE, CLIENT_BURST, now_us)
             line = self._lines[incoming.client_id] = _Line(bucket)
             self._turns.pop(incoming.client_id, None)
         if len(line.waiting) >= MAX_WAITING:

@@ -13,9 +13,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from gateway.token_bucket import TokenBucket
+from gateway.units import US_PER_S
+
 BURST: Final = 20
 """Maximum lines of a kind at once: a start with many endpoints writes one for each."""
-REFILL_S: Final = 1.0
+LINES_PER_S: Final = 1.0
 MAX_KINDS: Final = 1024
 """Maximum code positions; there are fewer, so none is discarded in practice."""
 
@@ -24,8 +27,7 @@ Kind = tuple[str, int, str]
 
 @dataclass(slots=True)
 class _Kind:
-    since_s: float
-    """Since when another line is allowed."""
+    bucket: TokenBucket
     suppressed: int = 0
 
 
@@ -41,13 +43,10 @@ class LogLimit(logging.Filter):
         """Return whether a line is written; the first after a gap gets the number of suppressed."""
         if len(self._kinds) >= MAX_KINDS:
             self._kinds.clear()
-        now_s = self._clock()
-        kind = self._kinds.setdefault(_kind_of(record), _Kind(now_s - BURST * REFILL_S))
-        kind.since_s = max(kind.since_s, now_s - BURST * REFILL_S)
-        if now_s - kind.since_s < REFILL_S:
+        kind = self._kinds.setdefault(_kind_of(record), _Kind(TokenBucket(LINES_PER_S, BURST)))
+        if not kind.bucket.take(round(self._clock() * US_PER_S)):
             kind.suppressed += 1
             return False
-        kind.since_s += REFILL_S
         if kind.suppressed:
             record.msg = f"{record.getMessage()} (and {kind.suppressed} more like it, not logged)"
             record.args = None

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from gateway.hub.limits import TokenBucket
+from gateway.token_bucket import TokenBucket
 
 TRUSTED_RATE: Final = 64_000
 """Bytes a second for each trusted client: more than any ground station sends."""
@@ -16,7 +16,7 @@ class RecordingBudget:
     """Quotas of recorded bytes for each client; an unknown client is untrusted."""
 
     def __init__(self) -> None:
-        self._untrusted = _bucket(UNTRUSTED_RATE, 0)
+        self._untrusted = TokenBucket(UNTRUSTED_RATE, UNTRUSTED_RATE * BURST_S)
         self._trusted: dict[int, TokenBucket] = {}
 
     def note(self, client_id: int, now_us: int, *, trusted: bool) -> None:
@@ -24,7 +24,7 @@ class RecordingBudget:
         if not trusted:
             self._trusted.pop(client_id, None)
         elif client_id not in self._trusted:
-            self._trusted[client_id] = _bucket(TRUSTED_RATE, now_us)
+            self._trusted[client_id] = TokenBucket(TRUSTED_RATE, TRUSTED_RATE * BURST_S, now_us)
 
     def remove_client(self, client_id: int) -> None:
         """Discard the quota of a client that has gone."""
@@ -32,13 +32,4 @@ class RecordingBudget:
 
     def allows(self, client_id: int, size: int, now_us: int) -> bool:
         """Return whether a frame from a client, or to it alone, is recorded."""
-        bucket = self._trusted.get(client_id, self._untrusted)
-        bucket.refill(now_us)
-        if bucket.level < size:
-            return False
-        bucket.level -= size
-        return True
-
-
-def _bucket(rate: int, now_us: int) -> TokenBucket:
-    return TokenBucket(rate, rate * BURST_S, rate * BURST_S, now_us)
+        return self._trusted.get(client_id, self._untrusted).take(now_us, size)

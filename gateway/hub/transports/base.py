@@ -17,13 +17,14 @@ from gateway.compiled import address_of
 from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import OPEN_TO_ALL, Endpoint, EndpointKind, is_loopback
 from gateway.hub.forwarding import Forwarding, Words, new_client_words
-from gateway.hub.limits import RateLimit, TokenBucket
+from gateway.hub.limits import RateLimit
 from gateway.hub.routing_table import Origin, SystemPath
 from gateway.hub.send_queue import RADIO_STATUS
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientCounters, ClientStats, ListenerStats
 from gateway.hub.systems import SystemTranslation
 from gateway.printable import reason_of
+from gateway.token_bucket import TokenBucket
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS
 from gateway.wire.mavlink_signing import FrameSigner

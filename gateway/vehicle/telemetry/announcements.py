@@ -20,6 +20,7 @@ from typing import Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ImuFlags, ImuSample, LinkReport, NavFlags, NavState
+from gateway.token_bucket import TokenBucket
 from gateway.units import US_PER_S
 from gateway.vehicle.service import CRITICAL, INFO, NOTICE, WARNING, Answer, Reply, StatusText
 from gateway.vehicle.telemetry.health import GPS, Finding, Health, status_text
@@ -99,9 +100,7 @@ class Announcer:
         self._topics: dict[str, _Topic] = {}
         self._pending: dict[str, _Topic] = {}
         """Topics whose state is not announced yet."""
-        self._bucket = self._tokens = bucket
-        self._refill_us = refill_us
-        self._refilled_us = 0
+        self._bucket = TokenBucket(US_PER_S / refill_us, bucket)
         self._next_id = 0
 
     def track(self, finding: Finding, now_us: int) -> list[Answer]:
@@ -124,11 +123,7 @@ class Announcer:
 
     def say(self, text: StatusText, now_us: int) -> list[Answer]:
         """Announce a single event, unless there were too many recently."""
-        self._refill(now_us)
-        if self._tokens == 0:
-            return []
-        self._tokens -= 1
-        return chunks(text, self._number())
+        return chunks(text, self._number()) if self._bucket.take(now_us) else []
 
     def poll(self, now_us: int) -> list[Answer]:
         """Return the states that changed while their topics were held."""
@@ -159,12 +154,6 @@ class Announcer:
     def _number(self) -> int:
         self._next_id = self._next_id % 0xFFFF + 1
         return self._next_id
-
-    def _refill(self, now_us: int) -> None:
-        fresh = (now_us - self._refilled_us) // self._refill_us
-        if fresh > 0:
-            self._tokens = min(self._bucket, self._tokens + fresh)
-            self._refilled_us += fresh * self._refill_us
 
 
 def utf8(text: str, size: int) -> bytes:
