@@ -2,25 +2,17 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Final
 
 from msgspec.structs import asdict
 
 from gateway.aircraft import Aircraft
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, HubCounters, ListenerStats
-from gateway.printable import UNKNOWN, figure, printable, receiver_state, source_state
+from gateway.printable import figure, receiver_state, source_state
 from gateway.records import GpsFix, LinkReport, LoggedRequest, NavState, NodeStatus, board_name
 from gateway.units import counted
 from gateway.vehicle.plan import Location, distance_and_bearing
-
-VEHICLE_HEADS: Final = (
-    *("vehicle", "type", "mode", "armed", "position", "AMSL m", "battery", "link", "age s"),
-    "loss",
-)
-FIX_2D: Final = 2
-SILENT_S: Final = 5.0
-"""Age of the newest message from which the log line states it."""
+from gateway.vehicle_row import VehicleRow, vehicle_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,31 +58,6 @@ class AircraftStatus:
     """The newest report of each node."""
     origins: dict[str, str] = field(default_factory=dict)
     """Origin of attitude and position: the samples, the vehicle's own autopilot, its fixes."""
-
-
-@dataclass(frozen=True, slots=True)
-class VehicleRow:
-    """Status of one vehicle of the hub, own or foreign, from its MAVLink; None is unknown."""
-
-    system_id: int
-    kind: str
-    """Its MAV_TYPE in words."""
-    mode: str
-    """Name of its flight mode; empty if unknown."""
-    armed: bool
-    lat_deg: float | None
-    lon_deg: float | None
-    alt_amsl_m: float | None
-    fix_type: int | None
-    """A GPS_FIX_TYPE."""
-    battery_v: float | None
-    battery_percent: float | None
-    link: str
-    """The receiver, the sources, or the name of the client behind which it is."""
-    age_s: float
-    """Time since its newest message."""
-    loss: float | None
-    """Share of its frames that were lost on the way here; None for an own vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,36 +117,6 @@ def _seen_from(here: Location | None, there: Location | None) -> RelativeLocatio
     return RelativeLocation(*location, distance_m, math.degrees(bearing_rad) % 360.0)
 
 
-def vehicle_cells(row: VehicleRow) -> tuple[str, ...]:
-    """Return the cells of `VEHICLE_HEADS`."""
-    position = "no fix" if row.fix_type is not None and row.fix_type < FIX_2D else UNKNOWN
-    if row.lat_deg is not None and row.lon_deg is not None:
-        position = f"{row.lat_deg:.6f}, {row.lon_deg:.6f}"
-    battery = [figure(row.battery_v, ".1f", "V"), figure(row.battery_percent, ".0f", "%")]
-    return (
-        str(row.system_id),
-        printable(row.kind).replace("_", " ") or UNKNOWN,
-        printable(row.mode) or UNKNOWN,
-        "armed" if row.armed else "no",
-        position,
-        figure(row.alt_amsl_m, ".0f"),
-        " ".join(text for text in battery if text != UNKNOWN) or UNKNOWN,
-        printable(row.link) or UNKNOWN,
-        f"{row.age_s:.1f}",
-        figure(row.loss, ".1%"),
-    )
-
-
-def _vehicle_text(row: VehicleRow) -> str:
-    """Describe a foreign vehicle for the log."""
-    _, kind, mode, armed, position, *_, link, age, loss = vehicle_cells(row)
-    words = [f"vehicle {row.system_id} ({kind})", mode, "armed" if armed == "armed" else "disarmed"]
-    words += [f"at {position}" if row.lat_deg is not None else position, f"on {link}"]
-    words += [f"silent for {age} s"] if row.age_s > SILENT_S else []
-    words += [f"{loss} lost"] if row.loss else []
-    return " ".join(word for word in words if word != UNKNOWN)
-
-
 def summary_line(snapshot: Snapshot) -> str:
     """Summarise a snapshot in one line for the log."""
     report = snapshot.report
@@ -201,6 +138,6 @@ def summary_line(snapshot: Snapshot) -> str:
             f"yaw {figure(yaw % 360.0, '.0f')}"
         )
     own = {one.vehicle_id for one in snapshot.aircraft}
-    parts += [_vehicle_text(row) for row in snapshot.vehicles if row.system_id not in own]
+    parts += [vehicle_text(row) for row in snapshot.vehicles if row.system_id not in own]
     parts.append(counted(len(snapshot.clients), "client"))
     return "; ".join(filter(None, parts))

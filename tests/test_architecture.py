@@ -41,7 +41,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "sources": FOUNDATION | {"wire", "printable", "hub.endpoint", *COLUMN_CODEC},
     "aircraft": FOUNDATION | {"wire", "sensing", "estimation", "vehicle"},
     "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft", "sources"},
-    "status": FOUNDATION | {"hub", "vehicle", "aircraft", "printable"},
+    "vehicle_row": {"printable"},
+    "status": FOUNDATION | {"hub", "vehicle", "aircraft", "printable", "vehicle_row"},
     "vehicle_state": FOUNDATION | {"wire"},
     "answers": FOUNDATION | {"wire", "vehicle", "vehicle_state"},
     "recordings": BELOW | {"answers", "output", "printable", "extras", "toml_file"},
@@ -51,13 +52,25 @@ MAY_IMPORT: dict[str, set[str]] = {
     "fleet": FOUNDATION | STAGES | {"output", "recordings"} | EDGES,
     "config": BELOW | EDGES | {"panel", "fleet", "output", "toml_file", "sources"},
     "flashing": FOUNDATION | {"wire", "live"},
-    "live": BELOW | EDGES | {"status", "config", "recordings", "output", "extras", "sources"},
+    "live": BELOW
+    | EDGES
+    | {"status", "vehicle_row", "config", "recordings", "output", "extras", "sources"},
     "extensions": {"printable"},
     "outputs": FOUNDATION | {"wire", "vehicle_state", "extras"} | EDGES,
     "player": BELOW | EDGES | {"answers", "recordings", "config"},
     "cli": BELOW
     | EDGES
-    | {"status", "answers", "recordings", "config", "player", "analysis", "output", "sources"}
+    | {
+        "status",
+        "vehicle_row",
+        "answers",
+        "recordings",
+        "config",
+        "player",
+        "analysis",
+        "output",
+        "sources",
+    }
     | {"extensions", "extras", "panel", "fleet", "flashing", "batch"},
 }
 """The law: a package may import itself and these packages, or modules of packages; `gateway` itself
@@ -67,7 +80,7 @@ PURE = (
     FOUNDATION - {"compiled"}
     | STAGES
     | JOINED
-    | {"status", "hub", "sources"}
+    | {"status", "vehicle_row", "hub", "sources"}
     | {"vehicle_state", "answers"}
 )
 IMPURE_PARTS = {

@@ -33,15 +33,9 @@ from gateway.records import (
     board_name,
     channel_name,
 )
-from gateway.status import (
-    VEHICLE_HEADS,
-    AircraftStatus,
-    RecorderStatus,
-    RelativeLocation,
-    Snapshot,
-    vehicle_cells,
-)
+from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot
 from gateway.units import MV_PER_V, US_PER_S, counted
+from gateway.vehicle_row import VEHICLE_HEADS, vehicle_cells
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 
 OUTAGE_US: Final = 2 * US_PER_S

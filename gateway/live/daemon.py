@@ -56,7 +56,7 @@ from gateway.simulator.timed_frame import TimedFrame
 from gateway.sources.kinds import make_sources
 from gateway.sources.settings import SourceSettings
 from gateway.sources.source import SourceInput
-from gateway.status import Snapshot, VehicleRow, status_of
+from gateway.status import Snapshot, status_of
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
 from gateway.vehicle.service import (
@@ -72,6 +72,7 @@ from gateway.vehicle.service import (
     StatusText,
 )
 from gateway.vehicle.telemetry.announcements import Announcer
+from gateway.vehicle_row import VehicleRow
 from gateway.wire.mavlink_messages import ids_of
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 

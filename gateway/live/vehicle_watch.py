@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.routing_table import FrameStream, Origin
 from gateway.hub.stats import ClientStats
-from gateway.status import VehicleRow
 from gateway.units import US_PER_S
+from gateway.vehicle_row import VehicleRow
 from gateway.vehicle_state.newest import STATE_IDS, NewestState, NewestVehicles
 from gateway.vehicle_state.senders import MODES_ID
 from gateway.wire.mavlink_splitter import MavFrame, frame_of

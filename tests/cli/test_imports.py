@@ -36,6 +36,12 @@ def test_small_commands_import_little(module: str) -> None:
     assert imported_by(module) & (NEVER | HEAVY | {"importlib.metadata"}) == set()
 
 
+def test_status_with_vehicles_imports_little() -> None:
+    code = "from gateway.cli.live.clients import _vehicles; _vehicles([]);"
+    code += "import json, sys; print(json.dumps([*sys.modules]))"
+    assert set(json.loads(python("-c", code).stdout)) & (NEVER | HEAVY) == set()
+
+
 def test_gateway_imports_no_optional_part() -> None:
     found = imported_by("gateway.cli.app", "gateway.cli.live.run")
     assert found & (NEVER | RUN_MAY_NOT) == set()

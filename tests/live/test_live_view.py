@@ -22,14 +22,8 @@ from gateway.records import (
     PipeCounters,
     ReceiverStatus,
 )
-from gateway.status import (
-    AircraftStatus,
-    RecorderStatus,
-    RelativeLocation,
-    Snapshot,
-    VehicleRow,
-    summary_line,
-)
+from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot, summary_line
+from gateway.vehicle_row import VehicleRow
 from tests.client_stats import TABLET
 from tests.kit.records import FIX, NOTHING
 

@@ -24,6 +24,7 @@ from gateway.live.other_gateways import Gateway, other_gateways
 from gateway.printable import UNKNOWN, figure, printable, receiver_state, source_state
 from gateway.records import NodeId, RadioState, board_name
 from gateway.units import MV_PER_V, US_PER_S, counted
+from gateway.vehicle_row import VEHICLE_HEADS, VehicleRow, vehicle_cells
 
 US_PER_MS: Final = 1000
 
@@ -250,9 +251,6 @@ def _requests(found: Sequence[Record], now_us: int) -> Table:
 
 def _vehicles(rows: Sequence[Record]) -> Table:
     """Show all vehicles, own and foreign."""
-    # Imported here: the status imports all stages, which a request need not wait for.
-    from gateway.status import VEHICLE_HEADS, VehicleRow, vehicle_cells
-
     table = table_of(*VEHICLE_HEADS, left=8)
     for row in rows:
         table.add_row(*vehicle_cells(VehicleRow(**row)))
