@@ -26,12 +26,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
-from gateway.vehicle.encoding import (
-    MAVLINK_MSG_ID_COMPONENT_METADATA,
-    MAVLINK_MSG_ID_PROTOCOL_VERSION,
-    Encoder,
-    protocol_version,
-)
+from gateway.vehicle.encoding import Encoder
 from gateway.vehicle.plan import KINDS, MISSION, read_item
 from gateway.vehicle.request_log import UNANSWERED
 from gateway.vehicle.request_reader import VEHICLE, RequestReader
@@ -58,6 +53,8 @@ from gateway.vehicle.services.missions import MissionService
 from gateway.vehicle.services.parameter_service import ReadOnlyParameters
 from gateway.vehicle.services.parameters import Metadata
 from gateway.vehicle.telemetry.announcements import Announcer
+from gateway.vehicle.telemetry.messages import protocol_version
+from gateway.wire.mavlink_messages import COMPONENT_METADATA, PROTOCOL_VERSION
 
 PARAM_VALUE: Final = mavlink.MAVLINK_MSG_ID_PARAM_VALUE
 AVAILABLE_MODES: Final = mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES
@@ -154,9 +151,9 @@ class _Commands(Service):
         frames = self._answers.frames(message_id)
         chosen = frames if message_id not in DISTINGUISHED_BY else self._chosen(frames, wanted)
         found: list[Answer] = [Outgoing(frame, message_id, request.client_id) for frame in chosen]
-        if message_id == MAVLINK_MSG_ID_COMPONENT_METADATA and self._metadata is not None:
-            found = [request.reply(self._metadata.announcement(0))]
-        elif message_id == MAVLINK_MSG_ID_PROTOCOL_VERSION and not frames:
+        if message_id == COMPONENT_METADATA.id and self._metadata is not None:
+            found = [request.reply(self._metadata.announcement(None, 0))]
+        elif message_id == PROTOCOL_VERSION.id and not frames:
             found = [request.reply(protocol_version())]
         if found:
             return [command.ack(ACCEPTED), *found]

@@ -20,12 +20,7 @@ from gateway.records import (
 )
 from gateway.settings import Settings
 from gateway.units import US_PER_S
-from gateway.vehicle import encoding
-from gateway.vehicle.encoding import (
-    MAVLINK_MSG_ID_COMPONENT_METADATA,
-    MAVLINK_MSG_ID_PROTOCOL_VERSION,
-    Encoder,
-)
+from gateway.vehicle.encoding import Encoder
 from gateway.vehicle.plan import Home, Location, StoredPlan, distance_and_bearing
 from gateway.vehicle.request_log import UNANSWERED, RequestLog
 from gateway.vehicle.request_reader import RequestReader
@@ -63,6 +58,7 @@ from gateway.vehicle.telemetry.announcements import Announcements, Announcer
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.telemetry.telemetry import IN_AIR, Telemetry
 from gateway.vehicle.vehicle_settings import VehicleSettings
+from gateway.wire.mavlink_messages import COMPONENT_METADATA, MESSAGE_IDS
 from gateway.wire.mavlink_signing import (
     SigningClock,
     SigningTimestamps,
@@ -134,53 +130,41 @@ class Vehicle:
         self._make_services({OWN_SECTION: settings, **(sections or {}), HOME_SECTION: home})
 
     def _make_services(self, sections: Mapping[str, Settings]) -> None:
-        self._intervals = IntervalService(self.system_id, self.telemetry)
+        """Make the services, and register those of each message and the polled ones."""
+        telemetry = self.telemetry
+        self._intervals = IntervalService(self.system_id, telemetry)
         self._parameters = ParameterService(self.system_id, ParameterTable(sections), self.plan)
         self.metadata = Metadata(self._parameters.table, self.system_id)
         """Descriptions of the parameters."""
-        self._ftp = FtpService({**self.metadata.files, PACKED_PATH: self._parameters.packed})
-        self._calibrator = Calibrator(lambda: self.in_flight, lambda: self.telemetry.state)
+        telemetry.add(COMPONENT_METADATA.id, self.metadata.announcement)
+        ftp = FtpService({**self.metadata.files, PACKED_PATH: self._parameters.packed})
+        self._calibrator = Calibrator(lambda: self.in_flight, lambda: telemetry.state)
         self._recording = RecordingService(self._explain)
         self._control = OperatorControl(
-            self._explain, exclusive=self.telemetry.settings.operator_control == "exclusive"
+            self._explain, exclusive=telemetry.settings.operator_control == "exclusive"
         )
-        self._add_identity()
-        commands = CommandService(self.telemetry, self._explain)
-        commands.register(mavlink.MAV_CMD_PREFLIGHT_STORAGE, self._parameters.store)
-        commands.register(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, self._calibrator.start)
-        commands.register(FIXED_MAG_CAL_YAW, self._calibrator.start_by_yaw)
-        self.plan.register(commands)
-        self._recording.register(commands)
-        self._intervals.register(commands)
-        commands.register(REQUEST_OPERATOR_CONTROL, self._control.command, changes_state=False)
-        self._route(commands)
-
-    def _add_identity(self) -> None:
-        """Add messages that clients may request: versions, modes and metadata of the vehicle."""
-        of, add = self.telemetry, self.telemetry.add
-        add(
-            mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-            lambda _: encoding.autopilot_version(
-                self.system_id, self.health.firmware, of.autopilot
-            ),
-        )
-        add(MAVLINK_MSG_ID_PROTOCOL_VERSION, lambda _: encoding.protocol_version())
-        add(mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES, lambda _: encoding.available_modes(of.mode))
-        add(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, lambda _: encoding.current_mode(of.mode))
-        add(MAVLINK_MSG_ID_COMPONENT_METADATA, self.metadata.announcement)
-
-    def _route(self, commands: CommandService) -> None:
-        """Register the services of each message, and the polled services."""
+        changing = {
+            mavlink.MAV_CMD_PREFLIGHT_STORAGE: self._parameters.store,
+            mavlink.MAV_CMD_PREFLIGHT_CALIBRATION: self._calibrator.start,
+            FIXED_MAG_CAL_YAW: self._calibrator.start_by_yaw,
+            **self.plan.commands,
+            **self._recording.commands,
+        }
+        reading = {**self._intervals.commands, REQUEST_OPERATOR_CONTROL: self._control.command}
         self._timed: tuple[Service, ...] = (
             self._intervals,
             self._parameters,
             self.plan.missions,
-            self._ftp,
+            ftp,
             self._calibrator,
             self._recording,
             self._control,
         )
-        services = (commands, QueryService(self.telemetry.build, self._explain), *self._timed)
+        services = (
+            CommandService(telemetry, self._explain, changing, reading),
+            QueryService(telemetry.build, self._explain),
+            *self._timed,
+        )
         self._services = {kind: service for service in services for kind in service.types}
 
     @property
@@ -321,13 +305,8 @@ class Vehicle:
         sequence numbers, so that no client counts a loss.
         """
         encoder = Encoder(self.system_id)
-        asked = (
-            mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-            MAVLINK_MSG_ID_PROTOCOL_VERSION,
-            mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES,
-            mavlink.MAVLINK_MSG_ID_HOME_POSITION,
-        )
-        built = [self.telemetry.build(number, 0) for number in asked]
+        asked = ("AUTOPILOT_VERSION", "PROTOCOL_VERSION", "AVAILABLE_MODES", "HOME_POSITION")
+        built = [self.telemetry.build(MESSAGE_IDS[name], 0) for name in asked]
         known = [message for message in built if message is not None]
         known += self._parameters.values()
         known += self.plan.missions.download()

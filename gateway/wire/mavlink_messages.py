@@ -30,9 +30,13 @@ class MissingMessage:
     Fields are in the order of the payload: name, type, and length of an array or 0.
     """
 
-    def __init__(self, name: str, crc_extra: int, *fields: tuple[str, str, int]) -> None:
+    def __init__(
+        self, number: int, name: str, crc_extra: int, *fields: tuple[str, str, int]
+    ) -> None:
         names, types, lengths = zip(*fields, strict=True)
-        self.msgname, self.crc_extra = name, crc_extra
+        self.id, self.msgname, self.crc_extra = number, name, crc_extra
+        sizes = (f"{n}s" if one == "char" else f"{n or 1}{_TYPES[one]}" for _, one, n in fields)
+        self.unpacker = struct.Struct("<" + "".join(sizes))
         self.fieldnames, self.ordered_fieldnames = list(names), list(names)
         self.fieldtypes, self.array_lengths = list(types), list(lengths)
         self.native_format = bytearray("<" + "".join(_TYPES[one] for one in types), "ascii")
@@ -40,21 +44,20 @@ class MissingMessage:
         self.fieldenums_by_name: dict[str, str] = {}
 
 
-MISSING: Final = {
-    300: MissingMessage(
-        "PROTOCOL_VERSION", 217, ("version", "uint16_t", 0), ("min_version", "uint16_t", 0),
-        ("max_version", "uint16_t", 0), ("spec_version_hash", "uint8_t", 8),
-        ("library_version_hash", "uint8_t", 8),
-    ),
-    397: MissingMessage(
-        "COMPONENT_METADATA", 182, ("time_boot_ms", "uint32_t", 0), ("file_crc", "uint32_t", 0),
-        ("uri", "char", 100),
-    ),
-    512: MissingMessage(
-        "CONTROL_STATUS", 21, ("flags", "uint8_t", 0), ("gcs_main", "uint8_t", 0),
-        ("gcs_secondary", "uint8_t", 10),
-    ),
-}  # fmt: skip
+PROTOCOL_VERSION: Final = MissingMessage(
+    300, "PROTOCOL_VERSION", 217, ("version", "uint16_t", 0), ("min_version", "uint16_t", 0),
+    ("max_version", "uint16_t", 0), ("spec_version_hash", "uint8_t", 8),
+    ("library_version_hash", "uint8_t", 8),
+)  # fmt: skip
+COMPONENT_METADATA: Final = MissingMessage(
+    397, "COMPONENT_METADATA", 182, ("time_boot_ms", "uint32_t", 0), ("file_crc", "uint32_t", 0),
+    ("uri", "char", 100),
+)  # fmt: skip
+CONTROL_STATUS: Final = MissingMessage(
+    512, "CONTROL_STATUS", 21, ("flags", "uint8_t", 0), ("gcs_main", "uint8_t", 0),
+    ("gcs_secondary", "uint8_t", 10),
+)  # fmt: skip
+MISSING: Final = {kind.id: kind for kind in (PROTOCOL_VERSION, COMPONENT_METADATA, CONTROL_STATUS)}
 """Messages that vehicles of the gateway send and the dialects lack."""
 
 DEFINITIONS: Final[dict[int, Any]] = {**dialect.mavlink_map, **MISSING}

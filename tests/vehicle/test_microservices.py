@@ -13,9 +13,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.dialects.v20 import development
 
 from gateway.records import RECORDED_ONLY
-from gateway.vehicle import encoding
-from gateway.vehicle.encoding import Encoder
+from gateway.vehicle.telemetry import messages
 from gateway.vehicle.vehicle import Vehicle
+from gateway.wire import mavlink_messages
 from tests.conftest import ManualClock
 from tests.kit.ground_station import (
     OWN_MESSAGES,
@@ -272,15 +272,14 @@ def test_versions_and_capabilities_are_reported(station: GroundStation) -> None:
     [("1.2.3", 0x010203FF), ("0.10.0", 0x000A00FF), ("2.0", 0x020000FF), ("1.2rc1.3", 0x010003FF)],
 )
 def test_software_version_is_encoded_in_four_bytes(text: str, number: int) -> None:
-    assert encoding.software_version(text) == number
+    assert messages.software_version(text) == number
 
 
-def test_modes_are_decoded_by_the_development_dialect() -> None:
-    parser, mode = development.MAVLink(None), (0, "Tracking")
-    modes, mode = (
-        parser.decode(bytearray(Encoder(1).encode(message).frame))
-        for message in (encoding.available_modes(mode), encoding.current_mode(mode))
-    )
+def test_modes_are_decoded_by_the_development_dialect(station: GroundStation) -> None:
+    for message_id in (435, 436):
+        station.request(message_id)
+    frames = [each.frame for each in station.frames if each.message_id in (435, 436)]
+    modes, mode = (development.MAVLink(None).decode(bytearray(frame)) for frame in frames)
     assert (modes.number_modes, modes.mode_index, modes.mode_name) == (1, 1, "Tracking")
     assert mode.custom_mode == 0
 
@@ -289,15 +288,22 @@ def test_modes_are_decoded_by_the_development_dialect() -> None:
     ("kind", "fields"),
     [
         (
-            encoding.ProtocolVersion,
+            mavlink_messages.PROTOCOL_VERSION,
             (
                 "uint16_t version/uint16_t min_version/uint16_t max_version/"
                 "uint8_t spec_version_hash/\x08uint8_t library_version_hash/\x08"
             ),
         ),
-        (encoding.ComponentMetadata, "uint32_t time_boot_ms/uint32_t file_crc/char uri/\x64"),
-        (encoding.ControlStatus, "uint8_t flags/uint8_t gcs_main/uint8_t gcs_secondary/\x0a"),
+        (
+            mavlink_messages.COMPONENT_METADATA,
+            "uint32_t time_boot_ms/uint32_t file_crc/char uri/\x64",
+        ),
+        (
+            mavlink_messages.CONTROL_STATUS,
+            "uint8_t flags/uint8_t gcs_main/uint8_t gcs_secondary/\x0a",
+        ),
     ],
+    ids=lambda kind: getattr(kind, "msgname", ""),
 )
 def test_crc_extra_follows_from_the_definition(kind: Any, fields: str) -> None:
     """CRC_EXTRA is the checksum of the message's own definition, in wire order."""

@@ -15,7 +15,7 @@ A start that failed stays pending: the recorder retries by itself, and announces
 """
 
 import math
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -34,6 +34,7 @@ from gateway.vehicle.requested_messages import (
 from gateway.vehicle.service import Answer, RecordingRequest, Reply, Request, Service
 from gateway.vehicle.telemetry.streams import OFF, Stream
 from gateway.vehicle.telemetry.telemetry import CARRIED_MESSAGES, Telemetry
+from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
 DENIED: Final[int] = mavlink.MAV_RESULT_DENIED
@@ -75,21 +76,17 @@ DEFAULT: Final = 0
 NONE: Final = -1
 HEARTBEAT: Final = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 _GROUPS: Final[dict[int, tuple[int, ...]]] = {
-    mavlink.MAV_DATA_STREAM_RAW_SENSORS: (
-        mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
-        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
-    ),
-    mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (
-        mavlink.MAVLINK_MSG_ID_SYS_STATUS,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
-        mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
-    ),
-    mavlink.MAV_DATA_STREAM_POSITION: (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,),
-    mavlink.MAV_DATA_STREAM_EXTRA1: (
-        mavlink.MAVLINK_MSG_ID_ATTITUDE,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
-    ),
-    mavlink.MAV_DATA_STREAM_EXTRA2: (mavlink.MAVLINK_MSG_ID_VFR_HUD,),
+    stream: tuple(MESSAGE_IDS[name] for name in names)
+    for stream, names in (
+        (mavlink.MAV_DATA_STREAM_RAW_SENSORS, ("HIGHRES_IMU", "SCALED_PRESSURE")),
+        (
+            mavlink.MAV_DATA_STREAM_EXTENDED_STATUS,
+            ("SYS_STATUS", "GPS_RAW_INT", "NAV_CONTROLLER_OUTPUT"),
+        ),
+        (mavlink.MAV_DATA_STREAM_POSITION, ("GLOBAL_POSITION_INT",)),
+        (mavlink.MAV_DATA_STREAM_EXTRA1, ("ATTITUDE", "ATTITUDE_QUATERNION")),
+        (mavlink.MAV_DATA_STREAM_EXTRA2, ("VFR_HUD",)),
+    )
 }
 DATA_STREAMS: Final = _GROUPS | {mavlink.MAV_DATA_STREAM_ALL: tuple(sum(_GROUPS.values(), ()))}
 """REQUEST_DATA_STREAM's groups, as autopilots fill them."""
@@ -170,6 +167,7 @@ class IntervalService(Service):
         self._telemetry = telemetry
         self._requested: dict[tuple[int, int], int] = {}
         self._fast: dict[tuple[int, int], Stream] = {}
+        self.commands: dict[int, Handler] = {SET_INTERVAL: self._set, GET_INTERVAL: self._get}
 
     def handle(self, request: Request, _now_us: int) -> list[Answer]:
         """Thin a group of messages by REQUEST_DATA_STREAM, which has no answer.
@@ -188,11 +186,6 @@ class IntervalService(Service):
             faster = 0 <= wanted_us <= common_us
             answers += self._apply(request.client_id, message_id, DEFAULT if faster else wanted_us)
         return answers
-
-    def register(self, commands: "CommandService") -> None:
-        """Register the commands that are carried out here."""
-        commands.register(SET_INTERVAL, self._set, changes_state=False)
-        commands.register(GET_INTERVAL, self._get, changes_state=False)
 
     def _set(self, command: Command, _now_us: int) -> Outcome:
         """Apply one client's requested interval."""
@@ -288,20 +281,23 @@ class CommandService(Service):
 
     types = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE")
 
-    def __init__(self, telemetry: Telemetry, explain: Explain) -> None:
+    def __init__(
+        self,
+        telemetry: Telemetry,
+        explain: Explain,
+        changing: Mapping[int, Handler],
+        reading: Mapping[int, Handler],
+    ) -> None:
+        """Let other services carry out commands: those that change something, and the others."""
         self._telemetry = telemetry
         self._explain = explain
         self._handlers: dict[int, Handler] = {
             **dict.fromkeys((REQUEST_MESSAGE, *SHORTHANDS), self._request_message),
             **dict.fromkeys(REFUSALS, self._decline),
+            **changing,
+            **reading,
         }
-        self._changing: set[int] = set(REFUSALS)
-
-    def register(self, number: int, handler: Handler, *, changes_state: bool = True) -> None:
-        """Let another service carry out a command."""
-        self._handlers[number] = handler
-        if changes_state:
-            self._changing.add(number)
+        self._changing = REFUSALS.keys() | changing.keys()
 
     def changes_state(self, request: Request) -> bool:
         """Return whether the command would change anything."""
@@ -350,11 +346,10 @@ class RecordingService(Service):
         self._waiting: dict[int, Command] = {}
         """The newest start command of each client that waits for the outcome."""
         self._due_us: int | None = None
-
-    def register(self, commands: CommandService) -> None:
-        """Register the commands that are carried out here."""
-        commands.register(mavlink.MAV_CMD_LOGGING_START, self._start)
-        commands.register(mavlink.MAV_CMD_LOGGING_STOP, self._stop)
+        self.commands: dict[int, Handler] = {
+            mavlink.MAV_CMD_LOGGING_START: self._start,
+            mavlink.MAV_CMD_LOGGING_STOP: self._stop,
+        }
 
     def update(self, trouble: str, now_us: int, *, recording: bool) -> list[Answer]:
         """Note the state of the recorder."""

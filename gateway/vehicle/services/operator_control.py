@@ -40,12 +40,14 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
-from gateway.vehicle.encoding import ControlStatus
+from gateway.vehicle.encoding import MessagePacker
 from gateway.vehicle.requested_messages import whole
 from gateway.vehicle.service import Answer, Reply, Request, Service
 from gateway.vehicle.services.commands import ACCEPTED, DENIED, FAILED, Command, Explain, Outcome
+from gateway.wire import mavlink_messages
 from gateway.wire.system_ids import RELEASE_CONTROL, REQUEST_OPERATOR_CONTROL, is_former_control
 
+CONTROL_STATUS: Final = MessagePacker(mavlink_messages.CONTROL_STATUS)
 SYSTEM_MANAGER: Final = 1
 TAKEOVER_ALLOWED: Final = 2
 """Values of GCS_CONTROL_STATUS_FLAGS."""
@@ -179,10 +181,9 @@ class OperatorControl(Service):
     def status(self) -> Any:
         """Encode CONTROL_STATUS."""
         operator = self._operator
-        if operator is None:
-            return ControlStatus(SYSTEM_MANAGER | TAKEOVER_ALLOWED, 0, b"")
-        takeover = TAKEOVER_ALLOWED if operator.allows_takeover else 0
-        return ControlStatus(SYSTEM_MANAGER | takeover, operator.request.system_id, b"")
+        is_free = operator is None or operator.allows_takeover
+        flags = SYSTEM_MANAGER | (TAKEOVER_ALLOWED if is_free else 0)
+        return CONTROL_STATUS(flags, operator.request.system_id if operator else 0, *[0] * 10)
 
     def _is_operator(self, request: Request) -> bool:
         if self._operator is None:

@@ -39,10 +39,12 @@ from gateway import __version__
 from gateway.geometry.rotation import Matrix3, euler_deg_from_matrix, matrix_from_euler_deg
 from gateway.records import Vec3
 from gateway.settings import Field, Settings, fields_of
-from gateway.vehicle.encoding import ComponentMetadata
+from gateway.vehicle.encoding import MessagePacker
 from gateway.vehicle.services.ftp import crc32
 from gateway.vehicle.telemetry.messages import boot_ms
+from gateway.wire import mavlink_messages
 
+COMPONENT_METADATA: Final = MessagePacker(mavlink_messages.COMPONENT_METADATA)
 MAX_NAME: Final = 16
 
 UNITS: Final = frozenset(
@@ -371,10 +373,10 @@ class Metadata:
             for name, one in self._table.parameters.items()
         }
 
-    def announcement(self, now_us: int) -> Any:
+    def announcement(self, _newest: Any, now_us: int) -> Any:
         """Encode COMPONENT_METADATA."""
         uri = f"mftp://{self._general}".encode()
-        return ComponentMetadata(boot_ms(now_us), crc32(self.files[self._general]), uri)
+        return COMPONENT_METADATA(boot_ms(now_us), crc32(self.files[self._general]), uri)
 
 
 def _named(path: str, system_id: int) -> str:

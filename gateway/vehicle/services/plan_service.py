@@ -35,14 +35,7 @@ from gateway.vehicle.plan import (
 )
 from gateway.vehicle.requested_messages import whole
 from gateway.vehicle.service import INFO, Answer, SavePlan, StatusText
-from gateway.vehicle.services.commands import (
-    ACCEPTED,
-    DENIED,
-    NOT_NOW,
-    Command,
-    CommandService,
-    Outcome,
-)
+from gateway.vehicle.services.commands import ACCEPTED, DENIED, NOT_NOW, Command, Handler, Outcome
 from gateway.vehicle.services.missions import MissionService
 from gateway.vehicle.telemetry.messages import has_position
 from gateway.vehicle.telemetry.telemetry import Telemetry
@@ -129,11 +122,18 @@ class PlanService:
             telemetry.set_home(Home(stored.home, 0, "operator"))
         telemetry.add(
             mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
-            lambda _: self.mark.nav_controller_output(telemetry.state),
+            lambda *_: self.mark.nav_controller_output(telemetry.state),
         )
         telemetry.add(
-            mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, lambda _: self.missions.mission_current()
+            mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, lambda *_: self.missions.mission_current()
         )
+        self.commands: dict[int, Handler] = {
+            mavlink.MAV_CMD_DO_SET_HOME: self._set_home,
+            mavlink.MAV_CMD_DO_SET_ROI: self._set_roi,
+            mavlink.MAV_CMD_DO_SET_ROI_LOCATION: self._set_roi_location,
+            mavlink.MAV_CMD_DO_SET_ROI_NONE: self._clear_roi,
+            mavlink.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_mission_current,
+        }
 
     def _empty_mission(self) -> tuple[Item, ...]:
         """Return the mission that is sent while none is stored: for ArduPilot, home as item 0.
@@ -147,14 +147,6 @@ class PlanService:
         x, y = round(at.lat_deg * DEGE7_PER_DEG), round(at.lon_deg * DEGE7_PER_DEG)
         kind = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_CMD_NAV_WAYPOINT, 1)
         return (Item(*kind, (0.0, 0.0, 0.0, 0.0), x, y, at.alt_amsl_m),)
-
-    def register(self, commands: CommandService) -> None:
-        """Register the commands that are carried out here."""
-        commands.register(mavlink.MAV_CMD_DO_SET_HOME, self._set_home)
-        commands.register(mavlink.MAV_CMD_DO_SET_ROI, self._set_roi)
-        commands.register(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, self._set_roi_location)
-        commands.register(mavlink.MAV_CMD_DO_SET_ROI_NONE, self._clear_roi)
-        commands.register(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, self._set_mission_current)
 
     def on_fix(self, fix: GpsFix, now_us: int) -> list[Answer]:
         """Announce once the distance of a stored home, which may be that of another field."""

@@ -364,7 +364,7 @@ class Health:
             errors_count4=overruns,
         )
 
-    def radio_status(self, _now_us: int) -> Any:
+    def radio_status(self) -> Any:
         """Encode RADIO_STATUS of the weakest link; None if no radio measures its signal.
 
         Signal and noise are in dBm as signed bytes, which QGroundControl expects of any radio but

@@ -1,19 +1,21 @@
 """Records to MAVLink messages, with the units, signs and values for unknown of the definitions.
 
-If a definition has no value for unknown, the function that builds the message documents the choice.
-Unknown floats are always NaN, as MAVLink requires.
+Each message has one builder, which works from the newest records of an aircraft at a time, and
+returns None if there is nothing to send. If a definition has no value for unknown, the builder
+documents the choice. Unknown floats are always NaN, as MAVLink requires.
 """
 
 import math
+from collections.abc import Callable
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway import __version__
 from gateway.geometry.quaternion import body_axes, rotate_inverse, to_euler
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,
-    BaroSample,
     GpsFix,
     GpsFixType,
     ImuSample,
@@ -23,16 +25,17 @@ from gateway.records import (
 )
 from gateway.units import DEGE7_PER_DEG, PA_PER_HPA, STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
 from gateway.vehicle import encoding
-from gateway.vehicle.encoding import CUSTOM_MODES
 from gateway.vehicle.plan import Home, Location, distance_and_bearing, is_3d
 from gateway.vehicle.telemetry.health import ACCEL, GPS, GYRO, MAG, PRESSURE, Health
+from gateway.vehicle.telemetry.streams import NewestRecords
+from gateway.vehicle.vehicle_settings import VehicleSettings
+from gateway.wire import mavlink_messages
 
 MIN_COURSE_SPEED_MPS: Final = 0.5
 """Speed below which the direction of a GPS velocity is only noise."""
 
 MM: Final = 1e3
 CM: Final = 1e2
-CENTI_DOP: Final = 1e2
 CENTI: Final = 1e2
 MILLI: Final = 1e3
 MIN_COS_SQ: Final = 1e-4
@@ -80,9 +83,11 @@ ATTITUDE_QUATERNION: Final = encoding.MessagePacker(mavlink.MAVLink_attitude_qua
 ATTITUDE: Final = encoding.MessagePacker(mavlink.MAVLink_attitude_message)
 GLOBAL_POSITION_INT: Final = encoding.MessagePacker(mavlink.MAVLink_global_position_int_message)
 VFR_HUD: Final = encoding.MessagePacker(mavlink.MAVLink_vfr_hud_message)
+PROTOCOL_VERSION: Final = encoding.MessagePacker(mavlink_messages.PROTOCOL_VERSION)
 HIGHRES_IMU: Final = encoding.MessagePacker(mavlink.MAVLink_highres_imu_message)
 SCALED_PRESSURE: Final = encoding.MessagePacker(mavlink.MAVLink_scaled_pressure_message)
-"""Packers of the messages of samples, which are sent most often."""
+"""Packers of the messages of samples, which are sent most often, and of one that pymavlink
+lacks."""
 FAILURES: Final = (
     (GPS, mavlink.HL_FAILURE_FLAG_GPS),
     (PRESSURE, mavlink.HL_FAILURE_FLAG_ABSOLUTE_PRESSURE),
@@ -90,12 +95,84 @@ FAILURES: Final = (
     (GYRO, mavlink.HL_FAILURE_FLAG_3D_GYRO),
     (MAG, mavlink.HL_FAILURE_FLAG_3D_MAG),
 )
+UNMEASURED: Final = dict.fromkeys(
+    (
+        *("target_altitude", "target_heading", "target_distance", "throttle", "airspeed_sp"),
+        *("windspeed", "wind_heading", "temperature_air", "wp_num"),
+        *("custom0", "custom1", "custom2"),
+    ),
+    0,
+)
+"""Fields of HIGH_LATENCY2 that are always zero."""
 HALF_DEGREES: Final = 2.0
 FIFTHS: Final = 5.0
 """Units of speed per metre a second."""
 TENTHS: Final = 10.0
 INT8_MAX: Final = 127
 UNKNOWN_PERCENT: Final = -1
+CAPABILITIES: Final = (
+    mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | mavlink.MAV_PROTOCOL_CAPABILITY_FTP
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_FENCE
+    | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
+)
+UID_PREFIX: Final = int.from_bytes(b"mavgate")
+MODE_NAME: Final = "Tracking"
+MAX_MODE_NAME: Final = 34
+AUTOPILOTS: Final[dict[str, tuple[int, int]]] = {
+    "generic": (mavlink.MAV_AUTOPILOT_GENERIC, 0),
+    "ardupilotmega": (mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 0),
+    "px4": (mavlink.MAV_AUTOPILOT_PX4, 1 << 16),
+}
+"""MAV_AUTOPILOT by the setting `autopilot`, and the mode in which a pilot flies manually: MANUAL or
+STABILIZE of ArduPilot, main mode 1 of PX4."""
+Builder = Callable[[Any, int], Any]
+"""Builds a message from the newest records, at a time; None if there is nothing to send."""
+
+
+class Newest(NewestRecords):
+    """The newest records of one aircraft, and all else that its messages are built from."""
+
+    def __init__(self, settings: VehicleSettings, health: Health) -> None:
+        self.settings = settings
+        self.health = health
+        self.home: Home | None = None
+        self.origin: Home | None = None
+        """Origin of the local frame: the first home; a later home does not move it."""
+        self.reference_alt_m = NAN
+        """Height of home, or of the first position."""
+        self.located_fix: GpsFix | None = None
+        """The newest fix with a position, which is repeated without a fix."""
+        self.mag_b_ut = UNKNOWN_VEC3
+        self.updated = 0
+        """Flags of the values that are new since the last HIGHRES_IMU."""
+        self.unix_offset_us: int | None = None
+
+    @property
+    def vehicle_type(self) -> int:
+        """The MAV_TYPE that is reported."""
+        kind: int = getattr(mavlink, f"MAV_TYPE_{self.settings.type.upper()}")
+        reported = self.health.reported.vehicle_type
+        return kind if reported is None else reported
+
+    @property
+    def autopilot(self) -> int:
+        """The MAV_AUTOPILOT that is reported."""
+        return AUTOPILOTS[self.settings.autopilot][0]
+
+    @property
+    def mode(self) -> tuple[int, str]:
+        """Number and name of the present mode."""
+        reported = self.health.reported
+        if reported.mode:
+            return reported.custom_mode, reported.mode
+        return AUTOPILOTS[self.settings.autopilot][1], MODE_NAME
+
+    def reported(self, name: str, now_us: int) -> Any:
+        """Return a field of the reports of the vehicle's own autopilot; None if it is unknown."""
+        return self.health.reported.value(name, now_us, self.health.silent_us)
 
 
 def boot_ms(time_us: int) -> int:
@@ -103,51 +180,63 @@ def boot_ms(time_us: int) -> int:
     return (time_us // MS_US) & encoding.UINT32_MAX
 
 
-def attitude_quaternion(state: NavState) -> Any:
+def attitude_quaternion(newest: Newest, _now_us: int) -> Any:
     """Encode the attitude; `repr_offset_q` is all zero: not supported."""
-    return ATTITUDE_QUATERNION(
-        boot_ms(state.time_us), *state.q_nb, *state.rate_b_radps, 0.0, 0.0, 0.0, 0.0
-    )
+    state = newest.state
+    if state is None or state.q_nb[0] != state.q_nb[0]:
+        return None
+    time_ms = boot_ms(state.time_us)
+    return ATTITUDE_QUATERNION(time_ms, *state.q_nb, *state.rate_b_radps, 0.0, 0.0, 0.0, 0.0)
 
 
-def attitude(state: NavState) -> Any:
+def attitude(newest: Newest, _now_us: int) -> Any:
     """Encode the attitude as Euler angles."""
+    state = newest.state
+    if state is None or state.q_nb[0] != state.q_nb[0]:
+        return None
     return ATTITUDE(boot_ms(state.time_us), *to_euler(state.q_nb), *state.rate_b_radps)
 
 
-def has_position(state: NavState) -> bool:
+def has_position(state: NavState | None) -> bool:
     """Return whether there is a position to report, even if dead-reckoned and old."""
-    return math.isfinite(state.lat_deg + state.lon_deg + state.alt_amsl_m)
+    return state is not None and math.isfinite(state.lat_deg + state.lon_deg + state.alt_amsl_m)
 
 
-def global_position_int(state: NavState, reference_alt_m: float) -> Any:
-    """Encode the fused position of a state that has one.
+def _coordinates(at: NavState | Location) -> tuple[int, int, int]:
+    """Return latitude and longitude in 1e-7 degrees and height in mm."""
+    return (
+        encoding.int32(at.lat_deg * DEGE7_PER_DEG),
+        encoding.int32(at.lon_deg * DEGE7_PER_DEG),
+        encoding.int32(at.alt_amsl_m * MM),
+    )
+
+
+def global_position_int(newest: Newest, now_us: int) -> Any:
+    """Encode the fused position.
 
     Latitude, longitude and heights have no value for unknown in this message, and 0, 0 is a valid
     position; so it is not sent before the first position, and always from then on: ESTIMATOR_STATUS
     reports the quality of the estimate. Velocities have no value for unknown either and are zero in
     the rare state that has a position but no velocity.
     """
-    heading = NAN
-    if state.flags & NavFlags.HEADING_VALID:
-        heading = to_euler(state.q_nb)[2]
+    state = newest.state
+    if state is None or not has_position(state):
+        return None
+    height_m = newest.reported("alt_home_m", now_us)
+    if height_m is None or newest.health.is_fused(now_us):
+        height_m = state.alt_amsl_m - newest.reference_alt_m
     return GLOBAL_POSITION_INT(
         boot_ms(state.time_us),
-        encoding.int32(state.lat_deg * DEGE7_PER_DEG),
-        encoding.int32(state.lon_deg * DEGE7_PER_DEG),
-        encoding.int32(state.alt_amsl_m * MM),
-        encoding.int32((state.alt_amsl_m - reference_alt_m) * MM),
+        *_coordinates(state),
+        encoding.int32(height_m * MM),
         *(encoding.int16(speed * CM) for speed in state.vel_n_mps),
-        encoding.compass_cdeg(heading),
+        encoding.compass_cdeg(
+            to_euler(state.q_nb)[2] if state.flags & NavFlags.HEADING_VALID else NAN
+        ),
     )
 
 
-def vfr_hud(
-    state: NavState,
-    heading_rad: float | None = None,
-    airspeed_mps: float | None = None,
-    throttle_percent: float | None = None,
-) -> Any:
+def vfr_hud(newest: Newest, now_us: int) -> Any:
     """Encode speed, heading, height and climb.
 
     Without an airspeed its field contains the ground speed, as in ArduPilot without such a sensor,
@@ -155,34 +244,45 @@ def vfr_hud(
     heading is the yaw of ATTITUDE; without an attitude it is the reported heading, or else the
     course over ground, or 0.
     """
+    state = newest.state
+    if state is None:
+        return None
     north, east, down = state.vel_n_mps
     speed = math.hypot(north, east)
     yaw = to_euler(state.q_nb)[2]
     if math.isnan(yaw):
-        yaw = math.atan2(east, north) if heading_rad is None else heading_rad
+        reported = newest.reported("heading_rad", now_us)
+        yaw = math.atan2(east, north) if reported is None else reported
     heading = encoding.compass_deg(yaw) if math.isfinite(yaw) else 0
-    airspeed = speed if airspeed_mps is None else airspeed_mps
-    throttle = 0 if throttle_percent is None else encoding.uint16(throttle_percent, 0)
-    return VFR_HUD(airspeed, speed, heading, throttle, state.alt_amsl_m, -down)
+    airspeed = newest.reported("airspeed_mps", now_us)
+    throttle = newest.reported("throttle_percent", now_us)
+    return VFR_HUD(
+        speed if airspeed is None else airspeed,
+        speed,
+        heading,
+        0 if throttle is None else encoding.uint16(throttle, 0),
+        state.alt_amsl_m,
+        -down,
+    )
 
 
-def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, updated: int) -> Any:
+def highres_imu(newest: Newest, _now_us: int) -> Any:
     """Encode the calibrated sensors.
 
     HIGHRES_IMU rather than SCALED_IMU: its floats keep the sensors' resolution, it contains the
     barometer, and `fields_updated` marks the new values, whereas SCALED_IMU would have to send a
-    plausible zero for an absent magnetometer. `updated` has the flags of the values that are new
-    since the previous message; an unknown field is NaN.
+    plausible zero for an absent magnetometer. An unknown field is NaN.
     """
-    x, y, z = mag_b_ut
+    sample, baro = newest.sample, newest.baro
+    if sample is None:
+        return None
+    updated, newest.updated = newest.updated, 0
     diff_pressure, imu_id = NAN, 0
     return HIGHRES_IMU(
         sample.time_us,
         *sample.accel_b_mps2,
         *sample.gyro_b_radps,
-        x / UT_PER_GAUSS,
-        y / UT_PER_GAUSS,
-        z / UT_PER_GAUSS,
+        *(part / UT_PER_GAUSS for part in newest.mag_b_ut),
         NAN if baro is None else baro.pressure_pa / PA_PER_HPA,
         diff_pressure,
         NAN if baro is None else baro.alt_pressure_m,
@@ -192,36 +292,45 @@ def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, upda
     )
 
 
-def local_position_ned(state: NavState, origin: Location) -> Any:
-    """Encode position and velocity in the local frame, of a state that has a position."""
+def local_position_ned(newest: Newest, _now_us: int) -> Any:
+    """Encode position and velocity in the local frame."""
+    state, position = newest.state, local_position_m(newest)
+    if state is None or position is None:
+        return None
     return mavlink.MAVLink_local_position_ned_message(
-        boot_ms(state.time_us), *local_position_m(state, origin), *state.vel_n_mps
+        boot_ms(state.time_us), *position, *state.vel_n_mps
     )
 
 
-def local_position_m(state: NavState, origin: Location) -> Vec3:
-    """Project a position onto the tangent plane of the ellipsoid at the origin.
+def local_position_m(newest: Newest) -> Vec3 | None:
+    """Project the position, if it is known, onto the tangent plane of the ellipsoid at the origin.
 
     The projection is azimuthal equidistant, as autopilots use: distance and bearing from the origin
     are exact.
     """
+    state, origin = newest.state, newest.origin
+    if state is None or origin is None or not has_position(state):
+        return None
     here = Location(state.lat_deg, state.lon_deg, state.alt_amsl_m)
-    distance_m, bearing_rad = distance_and_bearing(origin, here)
+    distance_m, bearing_rad = distance_and_bearing(origin.location, here)
     north_m, east_m = distance_m * math.cos(bearing_rad), distance_m * math.sin(bearing_rad)
-    return (north_m, east_m, origin.alt_amsl_m - state.alt_amsl_m)
+    return (north_m, east_m, origin.location.alt_amsl_m - state.alt_amsl_m)
 
 
-def odometry(state: NavState, origin: Location) -> Any:
+def odometry(newest: Newest, _now_us: int) -> Any:
     """Encode pose in the local frame and velocity in the body frame, with their variances.
 
     The state has no correlations, so these elements of the covariances are 0. The variances of the
     angular rates are not estimated and are NaN.
     """
+    state, position = newest.state, local_position_m(newest)
+    if state is None or position is None:
+        return None
     return mavlink.MAVLink_odometry_message(
         state.time_us,
         mavlink.MAV_FRAME_LOCAL_NED,
         mavlink.MAV_FRAME_BODY_FRD,
-        *local_position_m(state, origin),
+        *position,
         state.q_nb,
         *rotate_inverse(state.q_nb, state.vel_n_mps),
         *state.rate_b_radps,
@@ -269,61 +378,66 @@ def _body_velocity_variances(state: NavState) -> Vec3:
     return (x, y, z)
 
 
-def altitude(state: NavState, baro: BaroSample | None, home_alt_m: float, origin: Location) -> Any:
+def altitude(newest: Newest, _now_us: int) -> Any:
     """Encode the altitudes; terrain and clearance are unknown."""
+    state, origin, baro = newest.state, newest.origin, newest.baro
+    if state is None or origin is None or not has_position(state):
+        return None
     return mavlink.MAVLink_altitude_message(
         state.time_us,
         altitude_monotonic=state.alt_amsl_m if baro is None else baro.alt_pressure_m,
         altitude_amsl=state.alt_amsl_m,
-        altitude_local=state.alt_amsl_m - origin.alt_amsl_m,
-        altitude_relative=state.alt_amsl_m - home_alt_m,
+        altitude_local=state.alt_amsl_m - origin.location.alt_amsl_m,
+        altitude_relative=state.alt_amsl_m - newest.reference_alt_m,
         altitude_terrain=UNKNOWN_TERRAIN_M,
         bottom_clearance=-1.0,
     )
 
 
-def _milli_imu(sample: ImuSample, mag_b_ut: Vec3) -> tuple[int, ...]:
-    """Return accelerations in mG, rates in mrad/s and the field in mgauss, 0 if it is unknown."""
+def _milli_imu(sample: ImuSample, mag_b_ut: Vec3) -> tuple[tuple[int, ...], int]:
+    """Return accelerations in mG, rates in mrad/s and the field in mgauss, 0 if it is unknown.
+
+    With the temperature in 0.01 degrees; 0 means unknown, so 0 degrees is sent as 1.
+    """
     scales = (
         (sample.accel_b_mps2, MILLI / STANDARD_GRAVITY_MPS2),
         (sample.gyro_b_radps, MILLI),
         (mag_b_ut, MILLI / UT_PER_GAUSS),
     )
-    return tuple(encoding.int16(value * scale) for values, scale in scales for value in values)
+    values = tuple(encoding.int16(value * scale) for vector, scale in scales for value in vector)
+    degc = sample.temperature_degc
+    return values, 0 if math.isnan(degc) else encoding.int16(degc * CENTI) or 1
 
 
-def _temperature_cdegc(sample: ImuSample) -> int:
-    """Return the temperature in 0.01 degrees; 0 means unknown, so 0 degrees is sent as 1."""
-    temperature = sample.temperature_degc
-    return 0 if math.isnan(temperature) else encoding.int16(temperature * CENTI) or 1
-
-
-def scaled_imu(sample: ImuSample, mag_b_ut: Vec3) -> Any:
+def scaled_imu(newest: Newest, _now_us: int) -> Any:
     """Encode the calibrated sensors as the integers of SCALED_IMU."""
-    values = _milli_imu(sample, mag_b_ut)
-    return mavlink.MAVLink_scaled_imu_message(
-        boot_ms(sample.time_us), *values, _temperature_cdegc(sample)
-    )
+    if (sample := newest.sample) is None:
+        return None
+    values, temperature = _milli_imu(sample, newest.mag_b_ut)
+    return mavlink.MAVLink_scaled_imu_message(boot_ms(sample.time_us), *values, temperature)
 
 
-def raw_imu(sample: ImuSample, mag_b_ut: Vec3) -> Any:
+def raw_imu(newest: Newest, _now_us: int) -> Any:
     """Encode RAW_IMU in the units of SCALED_IMU, as ArduPilot does and clients expect."""
-    values = _milli_imu(sample, mag_b_ut)
-    return mavlink.MAVLink_raw_imu_message(sample.time_us, *values, 0, _temperature_cdegc(sample))
+    if (sample := newest.sample) is None:
+        return None
+    values, temperature = _milli_imu(sample, newest.mag_b_ut)
+    return mavlink.MAVLink_raw_imu_message(sample.time_us, *values, 0, temperature)
 
 
-def gps_global_origin(origin: Location, time_us: int) -> Any:
+def gps_global_origin(newest: Newest, _now_us: int) -> Any:
     """Encode the origin of the local frame."""
+    if (origin := newest.origin) is None:
+        return None
     return mavlink.MAVLink_gps_global_origin_message(
-        encoding.int32(origin.lat_deg * DEGE7_PER_DEG),
-        encoding.int32(origin.lon_deg * DEGE7_PER_DEG),
-        encoding.int32(origin.alt_amsl_m * MM),
-        time_us,
+        *_coordinates(origin.location), origin.set_time_us
     )
 
 
-def scaled_pressure(sample: BaroSample) -> Any:
+def scaled_pressure(newest: Newest, _now_us: int) -> Any:
     """Encode the barometer; the differential pressure is not measured and is NaN."""
+    if (sample := newest.baro) is None:
+        return None
     press_diff, temperature_of_press_diff = NAN, 0
     return SCALED_PRESSURE(
         boot_ms(sample.time_us),
@@ -339,8 +453,8 @@ def is_located(fix: GpsFix) -> bool:
     return fix.fix_ok and FIX_TYPES[fix.fix_type] != mavlink.GPS_FIX_TYPE_NO_FIX
 
 
-def gps_raw_int(fix: GpsFix, located: GpsFix | None = None) -> Any:
-    """Encode a fix.
+def gps_raw_int(newest: Newest, now_us: int) -> Any:
+    """Encode the newest fix, or "no GPS" so that a good fix does not stay on screen.
 
     While the receiver has no position, the last one is repeated with fix type NO_FIX, as autopilots
     do: 0, 0 is a valid position.
@@ -348,10 +462,22 @@ def gps_raw_int(fix: GpsFix, located: GpsFix | None = None) -> Any:
     The receiver reports only the position's DOP, whose square is the sum of the squares of HDOP and
     VDOP; it is divided in proportion to the accuracies. An unknown extension field is 0.
     """
+    fix, located = newest.fix, newest.located_fix
+    if fix is None or not newest.health.is_alive(GPS, now_us):
+        return mavlink.MAVLink_gps_raw_int_message(
+            time_usec=now_us,
+            fix_type=mavlink.GPS_FIX_TYPE_NO_GPS,
+            lat=0 if located is None else located.lat_dege7,
+            lon=0 if located is None else located.lon_dege7,
+            alt=0 if located is None else encoding.int32(located.alt_amsl_m * MM),
+            **dict.fromkeys(("eph", "epv", "vel", "cog"), encoding.UINT16_MAX),
+            satellites_visible=encoding.UINT8_MAX,
+        )
     north, east, _ = fix.vel_n_mps
-    speed = math.hypot(north, east)
-    moving = is_3d(fix) and speed >= MIN_COURSE_SPEED_MPS
-    hdop, vdop = dilutions(fix)
+    speed, is_good = math.hypot(north, east), is_3d(fix)
+    moving = is_good and speed >= MIN_COURSE_SPEED_MPS
+    accuracy_m = math.hypot(fix.h_acc_m, fix.v_acc_m)
+    per_m = fix.pdop * CENTI / accuracy_m if is_good and accuracy_m > 0.0 else NAN
     position = fix if located is None or is_located(fix) else located
     return mavlink.MAVLink_gps_raw_int_message(
         time_usec=fix.time_us,
@@ -359,9 +485,9 @@ def gps_raw_int(fix: GpsFix, located: GpsFix | None = None) -> Any:
         lat=position.lat_dege7,
         lon=position.lon_dege7,
         alt=encoding.int32(position.alt_amsl_m * MM),
-        eph=encoding.uint16(hdop * CENTI_DOP),
-        epv=encoding.uint16(vdop * CENTI_DOP),
-        vel=encoding.uint16(speed * CM) if is_3d(fix) else encoding.UINT16_MAX,
+        eph=encoding.uint16(fix.h_acc_m * per_m),
+        epv=encoding.uint16(fix.v_acc_m * per_m),
+        vel=encoding.uint16(speed * CM) if is_good else encoding.UINT16_MAX,
         cog=encoding.compass_cdeg(math.atan2(east, north)) if moving else encoding.UINT16_MAX,
         satellites_visible=encoding.uint8(fix.satellites),
         alt_ellipsoid=encoding.int32(position.alt_ellipsoid_m * MM),
@@ -372,32 +498,11 @@ def gps_raw_int(fix: GpsFix, located: GpsFix | None = None) -> Any:
     )
 
 
-def dilutions(fix: GpsFix) -> tuple[float, float]:
-    """Return HDOP and VDOP; NaN without a fix, or if the receiver reports too little for them."""
-    accuracy_m = math.hypot(fix.h_acc_m, fix.v_acc_m)
-    if not is_3d(fix) or not accuracy_m > 0.0:
-        return NAN, NAN
-    return fix.pdop * fix.h_acc_m / accuracy_m, fix.pdop * fix.v_acc_m / accuracy_m
-
-
-def gps_absent(now_us: int, located: GpsFix | None = None) -> Any:
-    """Encode "no GPS" at the last position, so that a good fix does not stay on screen."""
-    return mavlink.MAVLink_gps_raw_int_message(
-        time_usec=now_us,
-        fix_type=mavlink.GPS_FIX_TYPE_NO_GPS,
-        lat=0 if located is None else located.lat_dege7,
-        lon=0 if located is None else located.lon_dege7,
-        alt=0 if located is None else encoding.int32(located.alt_amsl_m * MM),
-        eph=encoding.UINT16_MAX,
-        epv=encoding.UINT16_MAX,
-        vel=encoding.UINT16_MAX,
-        cog=encoding.UINT16_MAX,
-        satellites_visible=encoding.UINT8_MAX,
-    )
-
-
-def estimator_status(state: NavState) -> Any:
-    """Encode which states the estimator considers valid; it computes no test ratios."""
+def estimator_status(newest: Newest, _now_us: int) -> Any:
+    """Encode which states our own estimator considers valid; it computes no test ratios."""
+    state = newest.state
+    if state is None or newest.sample is None:
+        return None
     flags = 0
     for ours, theirs in ESTIMATOR_FLAGS:
         if state.flags & ours:
@@ -406,81 +511,132 @@ def estimator_status(state: NavState) -> Any:
         flags |= mavlink.ESTIMATOR_CONST_POS_MODE
     north, east, down = state.pos_std_m
     return mavlink.MAVLink_estimator_status_message(
-        state.time_us, flags, NAN, NAN, NAN, NAN, NAN, NAN, math.hypot(north, east), down
+        state.time_us, flags, *[NAN] * 6, math.hypot(north, east), down
     )
 
 
-def home_position(home: Home) -> Any:
+def home_position(newest: Newest, _now_us: int) -> Any:
     """Encode home; its local position, the slope and the approach are unknown."""
+    if (home := newest.home) is None:
+        return None
+    unknown = (0.0, 0.0, 0.0, (NAN, NAN, NAN, NAN), *UNKNOWN_VEC3)
     return mavlink.MAVLink_home_position_message(
-        encoding.int32(home.location.lat_deg * DEGE7_PER_DEG),
-        encoding.int32(home.location.lon_deg * DEGE7_PER_DEG),
-        encoding.int32(home.location.alt_amsl_m * MM),
-        0.0,
-        0.0,
-        0.0,
-        (NAN, NAN, NAN, NAN),
-        *UNKNOWN_VEC3,
-        home.set_time_us,
+        *_coordinates(home.location), *unknown, home.set_time_us
     )
 
 
-def system_time(now_us: int, unix_us: int | None) -> Any:
+def system_time(newest: Newest, now_us: int) -> Any:
     """Encode the clocks; the Unix time is 0 until a GPS fix provides it."""
-    return mavlink.MAVLink_system_time_message(unix_us or 0, boot_ms(now_us))
+    offset_us = newest.unix_offset_us
+    unix_us = 0 if offset_us is None else now_us + offset_us
+    return mavlink.MAVLink_system_time_message(unix_us, boot_ms(now_us))
 
 
-def high_latency2(
-    kind: int,
-    autopilot: int,
-    state: NavState | None,
-    fix: GpsFix | None,
-    health: Health,
-    now_us: int,
-) -> Any:
+def high_latency2(newest: Newest, now_us: int) -> Any:
     """Encode the state of the vehicle in 42 bytes.
 
     Latitude, longitude and altitude have no value for unknown in this message, which is the only
     one on its link, so it is also sent before the first fix: as in PX4, with 0, 0, errors of
     UINT8_MAX and the GPS failure flag. Wind, airspeed and throttle are not measured.
     """
+    state, fix, health = newest.state, newest.fix, newest.health
     failures = sum(flag for sensor, flag in FAILURES if not health.is_alive(sensor, now_us))
     h_acc_m = v_acc_m = NAN
     if fix is None or not is_3d(fix):
         failures |= mavlink.HL_FAILURE_FLAG_GPS
     elif health.is_alive(GPS, now_us):
         h_acc_m, v_acc_m = fix.h_acc_m, fix.v_acc_m
-    known = state if state is not None and has_position(state) else None
+    lat, lon, _ = _coordinates(state) if state is not None and has_position(state) else (0, 0, 0)
     north, east, down = state.vel_n_mps if state is not None else (NAN, NAN, NAN)
     yaw_deg = math.degrees(to_euler(state.q_nb)[2]) if state is not None else NAN
     speed = encoding.uint8(math.hypot(north, east) * FIFTHS, unknown=0)
     return mavlink.MAVLink_high_latency2_message(
         timestamp=boot_ms(now_us),
-        type=kind,
-        autopilot=autopilot,
+        type=newest.vehicle_type,
+        autopilot=newest.autopilot,
         # The upper half of the mode, as PX4 sends it.
-        custom_mode=CUSTOM_MODES[autopilot] >> 16,
-        latitude=encoding.int32(known.lat_deg * DEGE7_PER_DEG) if known is not None else 0,
-        longitude=encoding.int32(known.lon_deg * DEGE7_PER_DEG) if known is not None else 0,
+        custom_mode=AUTOPILOTS[newest.settings.autopilot][1] >> 16,
+        latitude=lat,
+        longitude=lon,
         altitude=encoding.int16(state.alt_amsl_m) if state is not None else 0,
-        target_altitude=0,
         heading=encoding.uint8(yaw_deg % 360.0 / HALF_DEGREES, unknown=0),
-        target_heading=0,
-        target_distance=0,
-        throttle=0,
         airspeed=speed,
-        airspeed_sp=0,
         groundspeed=speed,
-        windspeed=0,
-        wind_heading=0,
         eph=encoding.uint8(h_acc_m * TENTHS),
         epv=encoding.uint8(v_acc_m * TENTHS),
-        temperature_air=0,
         climb_rate=encoding.whole(-down * TENTHS, -INT8_MAX, INT8_MAX, 0),
         battery=UNKNOWN_PERCENT,
-        wp_num=0,
         failure_flags=failures,
-        custom0=0,
-        custom1=0,
-        custom2=0,
+        **UNMEASURED,
     )
+
+
+def software_version(version: str) -> int:
+    """Pack major, minor and patch into the upper three bytes, and the type into the lowest one."""
+    parts = [int(part) if part.isdigit() else 0 for part in version.split(".")[:3]]
+    major, minor, patch = (*parts, 0, 0, 0)[:3]
+    kind: int = mavlink.FIRMWARE_VERSION_TYPE_OFFICIAL
+    return major << 24 | minor << 16 | patch << 8 | kind
+
+
+def autopilot_version(newest: Newest, _now_us: int) -> Any:
+    """Encode AUTOPILOT_VERSION; the uid is different for each vehicle of one gateway.
+
+    The version of the nodes' firmware is in the field of the operating system's version. All
+    parameters are floats, so that they have the same bytes in both encodings of integers; clients
+    of ArduPilot expect the C cast.
+    """
+    nothing = [0] * 8
+    encoding = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    if newest.autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
+        encoding = mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+    return mavlink.MAVLink_autopilot_version_message(
+        capabilities=CAPABILITIES | encoding,
+        flight_sw_version=software_version(__version__),
+        middleware_sw_version=0,
+        os_sw_version=newest.health.firmware,
+        board_version=0,
+        flight_custom_version=nothing,
+        middleware_custom_version=nothing,
+        os_custom_version=nothing,
+        vendor_id=0,
+        product_id=0,
+        uid=UID_PREFIX << 8 | newest.health.vehicle_id,
+    )
+
+
+def protocol_version(*_: Any) -> Any:
+    """Encode PROTOCOL_VERSION: both versions are read, version 2 is sent."""
+    return PROTOCOL_VERSION(200, 100, 200, *[0] * 16)
+
+
+def available_modes(newest: Newest, _now_us: int) -> Any:
+    """Encode AVAILABLE_MODES: the one mode that a tracker has, or that is reported."""
+    number, name = newest.mode
+    return mavlink.MAVLink_available_modes_message(
+        number_modes=1,
+        mode_index=1,
+        standard_mode=mavlink.MAV_STANDARD_MODE_NON_STANDARD,
+        custom_mode=number,
+        properties=mavlink.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE,
+        mode_name=name.encode()[:MAX_MODE_NAME],
+    )
+
+
+def current_mode(newest: Newest, _now_us: int) -> Any:
+    """Encode CURRENT_MODE."""
+    return mavlink.MAVLink_current_mode_message(
+        mavlink.MAV_STANDARD_MODE_NON_STANDARD, newest.mode[0], intended_custom_mode=0
+    )
+
+
+BUILDERS: Final[dict[int, Builder]] = {
+    mavlink_messages.MESSAGE_IDS[build.__name__.upper()]: build
+    for build in (
+        *(attitude_quaternion, attitude, global_position_int, vfr_hud, highres_imu),
+        *(local_position_ned, odometry, altitude, scaled_imu, raw_imu, gps_global_origin),
+        *(scaled_pressure, gps_raw_int, estimator_status, home_position, system_time),
+        *(high_latency2, autopilot_version, protocol_version, available_modes, current_mode),
+    )
+}
+"""Builders by message."""

@@ -109,14 +109,13 @@ class Stream:
         return True
 
 
-@dataclass(frozen=True, slots=True)
 class NewestRecords:
     """The newest records of one aircraft, each None until the first is received."""
 
-    state: NavState | None
-    sample: ImuSample | None
-    baro: BaroSample | None
-    fix: GpsFix | None
+    state: NavState | None = None
+    sample: ImuSample | None = None
+    baro: BaroSample | None = None
+    fix: GpsFix | None = None
 
 
 @dataclass(frozen=True, slots=True)

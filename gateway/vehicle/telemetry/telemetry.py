@@ -1,7 +1,6 @@
 """The telemetry of a vehicle, each message at its own rate; and the landed state.
 
-Every message has one builder, which works from the newest records; the streams and the answer to
-a request for a single message share it.
+The streams and the answer to a request for a single message share the message's builder.
 
 The landed state depends on the motion alone:
 
@@ -18,7 +17,7 @@ stall turn or a touch-and-go does not flip the state.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Iterable
 from typing import Any, Final
 
 import msgspec
@@ -26,33 +25,24 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import (
     NAN,
-    UNKNOWN_VEC3,
     BaroSample,
     GpsFix,
     ImuSample,
     NavFlags,
     NavState,
     NodeStatus,
-    Vec3,
     VehicleReport,
 )
 from gateway.units import US_PER_S
-from gateway.vehicle.encoding import AUTOPILOTS, CUSTOM_MODES, MODE_NAME
-from gateway.vehicle.plan import Home, Location, is_good_enough, location_of
+from gateway.vehicle.plan import Home, is_good_enough, location_of
 from gateway.vehicle.service import Answer, Reply
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.health import AHRS, GPS, Health
-from gateway.vehicle.telemetry.messages import high_latency2
+from gateway.vehicle.telemetry.messages import BUILDERS, Builder, Newest
 from gateway.vehicle.telemetry.reported import WITHOUT_IMU_US, battery_status, named_values
-from gateway.vehicle.telemetry.streams import (
-    ADDED_MESSAGES,
-    OFF,
-    NewestRecords,
-    Pace,
-    Stream,
-    interval_us,
-)
+from gateway.vehicle.telemetry.streams import ADDED_MESSAGES, OFF, Pace, Stream, interval_us
 from gateway.vehicle.vehicle_settings import VehicleSettings
+from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 UNDEFINED: Final[int] = mavlink.MAV_LANDED_STATE_UNDEFINED
 ON_GROUND: Final[int] = mavlink.MAV_LANDED_STATE_ON_GROUND
@@ -64,6 +54,9 @@ VELOCITY_VALID: Final = int(NavFlags.VELOCITY_VALID)
 ALTITUDE_VALID: Final = int(NavFlags.ALTITUDE_VALID)
 SLOW: Final = 0.5
 """Share of the take-off limits below which the vehicle is slow and low."""
+HEARTBEAT: Final = mavlink.MAVLINK_MSG_ID_HEARTBEAT
+GPS_RAW_INT: Final = mavlink.MAVLINK_MSG_ID_GPS_RAW_INT
+BATTERY_STATUS: Final = mavlink.MAVLINK_MSG_ID_BATTERY_STATUS
 STATE_MESSAGES: Final = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: 0,
@@ -73,49 +66,31 @@ STATE_MESSAGES: Final = {
 }
 """Messages sent with IMU samples, and the start of each after the first sample, us: at the usual
 rates no sample triggers more than two. The quaternion is first, because its latency is visible."""
-REQUESTED_MESSAGES: Final = (
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU,
-    mavlink.MAVLINK_MSG_ID_RAW_IMU,
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-    mavlink.MAVLINK_MSG_ID_ODOMETRY,
-    mavlink.MAVLINK_MSG_ID_ALTITUDE,
+ATTITUDE_MESSAGES: Final = tuple(STATE_MESSAGES)[:2]
+"""Messages sent with the attitudes that the vehicle's own autopilot reports."""
+POSITION_MESSAGES: Final = tuple(STATE_MESSAGES)[2:4]
+"""Messages sent with fixes of a vehicle without an IMU."""
+REQUESTED_MESSAGES: Final = tuple(
+    MESSAGE_IDS[name]
+    for name in ("SCALED_IMU", "RAW_IMU", "LOCAL_POSITION_NED", "ODOMETRY", "ALTITUDE")
 )
 """Messages sent with IMU samples only to clients that request them: after one ALTITUDE,
 QGroundControl shows altitudes of no other message."""
 CARRIED_MESSAGES: Final = frozenset({*STATE_MESSAGES, *REQUESTED_MESSAGES})
-TIMED_MESSAGES: Final = (
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT,
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS,
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION,
-    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
-    mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
-    mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
-    mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2,
-    mavlink.MAVLINK_MSG_ID_RADIO_STATUS,
-    mavlink.MAVLINK_MSG_ID_RC_CHANNELS,
+TIMED_MESSAGES: Final = tuple(
+    MESSAGE_IDS[name]
+    for name in (
+        *("HEARTBEAT", "SYS_STATUS", "SYSTEM_TIME", "HOME_POSITION", "ESTIMATOR_STATUS"),
+        *("EXTENDED_SYS_STATE", "NAV_CONTROLLER_OUTPUT", "MISSION_CURRENT", "HIGH_LATENCY2"),
+        *("RADIO_STATUS", "RC_CHANNELS"),
+    )
 )
-ATTITUDE_MESSAGES: Final = (
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE,
-)
-"""Messages sent with the attitudes that the vehicle's own autopilot reports."""
-POSITION_MESSAGES: Final = (
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
-    mavlink.MAVLINK_MSG_ID_VFR_HUD,
-)
-"""Messages sent with fixes of a vehicle without an IMU."""
 APART_US: Final = 13_000
 """Time between the starts of successive timed messages: otherwise those with equal intervals would
 always be due together. Not a multiple of 10 ms, at which samples of 100 Hz arrive."""
-HEARTBEAT_HZ: Final = 1.0
-"""Clients expect heartbeats at this rate, and report a vehicle without them as lost."""
-RADIO_STATUS_HZ: Final = 1.0
-"""Rate of the link reports."""
-RC_CHANNELS_HZ: Final = 5.0
-"""Sent only for a vehicle whose own autopilot reports its link or channels."""
-Builder = Callable[[int], Any]
+FIXED_RATES_HZ: Final = {"HEARTBEAT": 1.0, "RADIO_STATUS": 1.0, "RC_CHANNELS": 5.0}
+"""Clients report a vehicle with fewer heartbeats as lost; the others are sent only for a radio or
+an autopilot that reports them."""
 
 
 class Motion:
@@ -147,33 +122,19 @@ class Motion:
             self.landed_state = candidate
 
 
-class Telemetry:
-    """The newest records of one aircraft, and the messages built from them."""
+class Telemetry(Newest):
+    """The newest records of one aircraft, and the schedule of the messages built from them."""
 
     def __init__(self, settings: VehicleSettings, health: Health) -> None:
-        self.settings = settings
-        self.health = health
+        super().__init__(settings, health)
         self.motion = Motion(settings.takeoff_speed_mps, settings.takeoff_height_m)
-        self.home: Home | None = None
-        self._origin: Home | None = None
-        """Origin of the local frame: the first home; a later home does not move it."""
         self.calibrating = False
-        self.state: NavState | None = None
-        self._reference_alt_m = NAN
         self._ground_alt_m = NAN
         """Height of the first good fix, independent of home."""
-        self._sample: ImuSample | None = None
-        self._baro: BaroSample | None = None
-        self.fix: GpsFix | None = None
-        self._located_fix: GpsFix | None = None
-        """The newest fix with a position, which is repeated without a fix."""
-        self._mag_b_ut = UNKNOWN_VEC3
-        self._updated = 0
         self._first_us: int | None = None
         """Time of the first fix."""
         self._announced_modes = 0
         self._batteries: dict[int, Stream] = {}
-        self._unix_offset_us: int | None = None
         self.streams = {message_id: Stream(us) for message_id, us in _intervals(settings).items()}
         self._pace = Pace()
         """Interval of the IMU samples."""
@@ -181,63 +142,31 @@ class Telemetry:
         """When the next timed message is due; None if it must be computed."""
         self._state_due_us = 0
         """Time before which no sample triggers a message."""
-        self._builders = self._own_builders()
+        self._builders: dict[int, Builder] = {
+            **BUILDERS,
+            HEARTBEAT: Telemetry._heartbeat,
+            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Telemetry._extended_sys_state,
+            mavlink.MAVLINK_MSG_ID_SYS_STATUS: lambda _, now_us: health.sys_status(now_us),
+            mavlink.MAVLINK_MSG_ID_RADIO_STATUS: lambda *_: health.radio_status(),
+            mavlink.MAVLINK_MSG_ID_RC_CHANNELS: lambda _, now_us: health.reported.channels(
+                now_us, health.silent_us
+            ),
+            BATTERY_STATUS: lambda _, now_us: health.newest_battery(now_us),
+        }
         self._state_streams = [(self.streams[m], self._builders[m]) for m in STATE_MESSAGES]
         """Schedule and builder of each message that IMU samples trigger."""
         self._timed = [*TIMED_MESSAGES]
-        self._add_registered()
-        self._polled = False
-
-    def _own_builders(self) -> dict[int, Builder]:
-        health = self.health
-        return {
-            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._of_attitude(
-                messages.attitude_quaternion
-            ),
-            mavlink.MAVLINK_MSG_ID_ATTITUDE: self._of_attitude(messages.attitude),
-            mavlink.MAVLINK_MSG_ID_VFR_HUD: self._vfr_hud,
-            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._estimator_status,
-            mavlink.MAVLINK_MSG_ID_RC_CHANNELS: lambda now_us: health.reported.channels(
-                now_us, health.silent_us
-            ),
-            mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position,
-            mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: self._highres_imu,
-            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps_raw,
-            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: lambda _: (
-                self._baro and messages.scaled_pressure(self._baro)
-            ),
-            mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
-            mavlink.MAVLINK_MSG_ID_SYS_STATUS: health.sys_status,
-            mavlink.MAVLINK_MSG_ID_RADIO_STATUS: health.radio_status,
-            mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: self._system_time,
-            mavlink.MAVLINK_MSG_ID_HOME_POSITION: lambda _: (
-                self.home and messages.home_position(self.home)
-            ),
-            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
-            mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2: self._high_latency,
-            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: health.newest_battery,
-            mavlink.MAVLINK_MSG_ID_SCALED_IMU: self._of_sample(messages.scaled_imu),
-            mavlink.MAVLINK_MSG_ID_RAW_IMU: self._of_sample(messages.raw_imu),
-            mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._of_origin(messages.local_position_ned),
-            mavlink.MAVLINK_MSG_ID_ODOMETRY: self._of_origin(messages.odometry),
-            mavlink.MAVLINK_MSG_ID_ALTITUDE: self._of_origin(self._altitude),
-            mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: self._global_origin,
-        }
-
-    def add(self, message_id: int, builder: Builder) -> None:
-        """Add a message that another service builds."""
-        self._builders[message_id] = builder
-
-    def _add_registered(self) -> None:
         for added in ADDED_MESSAGES.values():
             if added.message_id in self.streams:
                 raise ValueError(f"message {added.message_id} is sent by every vehicle already")
             self._timed.append(added.message_id)
             self.streams[added.message_id] = Stream(interval_us(added.rate_hz))
-            self.add(added.message_id, lambda _, build=added.build: build(self._newest()))  # type: ignore[misc]
+            self.add(added.message_id, lambda newest, _, build=added.build: build(newest))  # type: ignore[misc]
+        self._polled = False
 
-    def _newest(self) -> NewestRecords:
-        return NewestRecords(self.state, self._sample, self._baro, self.fix)
+    def add(self, message_id: int, builder: Builder) -> None:
+        """Add a message that another service builds."""
+        self._builders[message_id] = builder
 
     def knows(self, message_id: int) -> bool:
         """Return whether the vehicle ever sends a message."""
@@ -278,21 +207,22 @@ class Telemetry:
         if self.state is None:
             for message_id, after_us in STATE_MESSAGES.items():
                 self.streams[message_id].begin(time_us + after_us)
-        self.state, self._sample = state, sample
-        self._updated |= messages.IMU_UPDATED
+        self.state, self.sample = state, sample
+        self.updated |= messages.IMU_UPDATED
         if sample.mag_b_ut is not None:
-            self._mag_b_ut = sample.mag_b_ut
-            self._updated |= messages.MAG_UPDATED
+            self.mag_b_ut = sample.mag_b_ut
+            self.updated |= messages.MAG_UPDATED
         # Tests for NaN, the latitude first, which is NaN for a long time without GPS.
-        if (
-            self._reference_alt_m != self._reference_alt_m
-            and state.lat_deg == state.lat_deg
-            and messages.has_position(state)
-        ):
-            self._reference_alt_m = state.alt_amsl_m
+        if self.reference_alt_m != self.reference_alt_m and state.lat_deg == state.lat_deg:
+            self._note_height(state)
         self.motion.update(state, self._ground_alt_m)
         period_us = self._pace.update(time_us)
         return [] if time_us + period_us < self._state_due_us else self._carried(time_us, period_us)
+
+    def _note_height(self, state: NavState) -> None:
+        """Refer heights to the first position, until there is a home."""
+        if math.isnan(self.reference_alt_m) and messages.has_position(state):
+            self.reference_alt_m = state.alt_amsl_m
 
     def _carried(self, time_us: int, period_us: int) -> list[Answer]:
         """Build the messages that a sample triggers, and note when the next one is due."""
@@ -304,7 +234,7 @@ class Telemetry:
                 continue
             if due_us is None or due_us <= soon_us:
                 if stream.offer_paced(time_us, period_us):
-                    message = build(time_us)
+                    message = build(self, time_us)
                     if message is not None:
                         found.append(Reply(message))
                 due_us = stream.due_us
@@ -313,6 +243,14 @@ class Telemetry:
         self._state_due_us = next_us
         return found
 
+    def _built(self, message_ids: Iterable[int], now_us: int) -> list[Answer]:
+        built = (self.build(message_id, now_us) for message_id in message_ids)
+        return [Reply(message) for message in built if message is not None]
+
+    def _offered(self, time_us: int, *message_ids: int) -> list[Answer]:
+        """Build those of some messages that are due at the time of a record."""
+        return self._built([m for m in message_ids if self.streams[m].offer(time_us)], time_us)
+
     def on_report(self, report: VehicleReport) -> list[Answer]:
         """Process a report of the vehicle's own autopilot."""
         reported, time_us = self.health.reported, report.time_us
@@ -320,67 +258,56 @@ class Telemetry:
         found: list[Answer] = [Reply(message) for message in named_values(report)]
         if report.attitude_rad is not None and not self.health.is_fused(time_us):
             found += self._on_reported(time_us, ATTITUDE_MESSAGES)
-        if report.battery is not None:
-            stream = self.streams[mavlink.MAVLINK_MSG_ID_BATTERY_STATUS]
-            if report.battery.number or stream.offer(time_us):
-                found.append(Reply(battery_status(report.battery)))
+        if report.battery is not None and (
+            report.battery.number or self.streams[BATTERY_STATUS].offer(time_us)
+        ):
+            found.append(Reply(battery_status(report.battery)))
         if reported.mode_changes != self._announced_modes:
             self._announced_modes = reported.mode_changes
             number = reported.mode_changes & 0xFF
             found.append(Reply(mavlink.MAVLink_available_modes_monitor_message(number)))
-            current = self.build(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, time_us)
-            found += [] if current is None else [Reply(current)]
+            found += self._built([mavlink.MAVLINK_MSG_ID_CURRENT_MODE], time_us)
         return found
 
     def _on_reported(self, time_us: int, carried: tuple[int, ...]) -> list[Answer]:
         """Update the state of a vehicle without an IMU of ours, and return its messages."""
         self.state = state = self.health.reported.state(time_us, self.fix, self.health.silent_us)
-        if math.isnan(self._reference_alt_m) and messages.has_position(state):
-            self._reference_alt_m = state.alt_amsl_m
+        self._note_height(state)
         if carried is POSITION_MESSAGES:
             self.motion.update(state, self._ground_alt_m)
-        due = (m for m in carried if self.streams[m].offer(time_us))
-        built = (self.build(message_id, time_us) for message_id in due)
-        return [Reply(message) for message in built if message is not None]
-
-    def _position_of_fix(self, fix: GpsFix) -> list[Answer]:
-        """Use a fix as the position of a vehicle that has no IMU."""
-        if self._first_us is None:
-            self._first_us = fix.time_us
-        known = self.health.is_reported or fix.time_us - self._first_us >= WITHOUT_IMU_US
-        if self.health.is_fused(fix.time_us) or not known:
-            return []
-        return self._on_reported(fix.time_us, POSITION_MESSAGES)
+        return self._offered(time_us, *carried)
 
     def on_baro(self, sample: BaroSample) -> list[Answer]:
         """Process a barometer sample, and return its message if due."""
-        self._baro = sample
-        self._updated |= messages.PRESSURE_UPDATED
-        stream = self.streams[mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE]
-        return [Reply(messages.scaled_pressure(sample))] if stream.offer(sample.time_us) else []
+        self.baro = sample
+        self.updated |= messages.PRESSURE_UPDATED
+        return self._offered(sample.time_us, mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE)
 
     def on_gps(self, fix: GpsFix) -> list[Answer]:
         """Process a GPS fix, return its messages if due, and set home at the first good one."""
         self.fix = fix
         if messages.is_located(fix):
-            self._located_fix = fix
+            self.located_fix = fix
         if fix.utc_us is not None:
-            self._unix_offset_us = fix.utc_us - fix.time_us
-        stream = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT]
-        found: list[Answer] = []
-        if stream.offer(fix.time_us):
-            found.append(Reply(messages.gps_raw_int(fix, self._located_fix)))
+            self.unix_offset_us = fix.utc_us - fix.time_us
+        found = self._offered(fix.time_us, GPS_RAW_INT)
         wanted = self.home is None or math.isnan(self._ground_alt_m)
         limits = self.settings
         if wanted and is_good_enough(fix, limits.home_accuracy_m, limits.home_satellites):
             self._ground_alt_m = fix.alt_amsl_m
             if self.home is None:
                 found.append(self.set_home(Home(location_of(fix), fix.time_us)))
-        return found + self._position_of_fix(fix)
+        # The position of a vehicle that has no IMU.
+        if self._first_us is None:
+            self._first_us = fix.time_us
+        known = self.health.is_reported or fix.time_us - self._first_us >= WITHOUT_IMU_US
+        if known and not self.health.is_fused(fix.time_us):
+            found += self._on_reported(fix.time_us, POSITION_MESSAGES)
+        return found
 
     def on_node_status(self, status: NodeStatus) -> list[Answer]:
         """Return a node's supply message, if due."""
-        common_us = self.streams[mavlink.MAVLINK_MSG_ID_BATTERY_STATUS].interval_us
+        common_us = self.streams[BATTERY_STATUS].interval_us
         stream = self._batteries.setdefault(status.node.node_id, Stream(common_us))
         if stream.interval_us != common_us:
             stream.change(common_us)
@@ -390,9 +317,9 @@ class Telemetry:
     def set_home(self, home: Home) -> Reply:
         """Set home, and return HOME_POSITION."""
         self.home = home
-        self._origin = self._origin or home
-        self._reference_alt_m = home.location.alt_amsl_m
-        return Reply(messages.home_position(home))
+        self.origin = self.origin or home
+        self.reference_alt_m = home.location.alt_amsl_m
+        return Reply(messages.home_position(self, home.set_time_us))
 
     def clear_home(self) -> None:
         """Let the next good fix set home; heights stay relative to the old one until then."""
@@ -409,14 +336,11 @@ class Telemetry:
             return []
         due = [m for m in self._timed if self.streams[m].tick(now_us)]
         self._timed_due_us = None
-        built = (self.build(message_id, now_us) for message_id in due)
-        found: list[Answer] = [Reply(message) for message in built if message is not None]
         silent = not self.health.is_alive(GPS, now_us)
-        wanted = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT].interval_us > 0
-        if silent and wanted and mavlink.MAVLINK_MSG_ID_HEARTBEAT in due:
+        if HEARTBEAT in due and silent and self.streams[GPS_RAW_INT].interval_us > 0:
             # Without data from the GPS node, no fix triggers GPS_RAW_INT.
-            found.append(Reply(messages.gps_absent(now_us, self._located_fix)))
-        return found
+            due.append(GPS_RAW_INT)
+        return self._built(due, now_us)
 
     def next_due_us(self) -> int:
         """Return when `poll` has something to send; the heartbeat never stops."""
@@ -428,115 +352,24 @@ class Telemetry:
     def build(self, message_id: int, now_us: int) -> Any:
         """Build one message from the newest records; None if it is never sent, or not yet."""
         builder = self._builders.get(message_id)
-        return builder(now_us) if builder else None
-
-    def _of_attitude(self, build: Callable[[NavState], Any]) -> Builder:
-        """Build a message only if the attitude is known; with GPS only it is not."""
-
-        def builder(_now_us: int) -> Any:
-            state = self.state
-            return None if state is None or math.isnan(state.q_nb[0]) else build(state)
-
-        return builder
-
-    def _estimator_status(self, _now_us: int) -> Any:
-        """Build a message only for a state that is our own estimate."""
-        known = self.state is not None and self._sample is not None
-        return messages.estimator_status(self.state) if known and self.state else None
-
-    def _vfr_hud(self, now_us: int) -> Any:
-        if self.state is None:
-            return None
-        reported, timeout_us = self.health.reported, self.health.silent_us
-        return messages.vfr_hud(
-            self.state,
-            heading_rad=reported.value("heading_rad", now_us, timeout_us),
-            airspeed_mps=reported.value("airspeed_mps", now_us, timeout_us),
-            throttle_percent=reported.value("throttle_percent", now_us, timeout_us),
-        )
-
-    def _of_sample(self, build: Callable[[ImuSample, Vec3], Any]) -> Builder:
-        return lambda _: None if self._sample is None else build(self._sample, self._mag_b_ut)
-
-    def _of_origin(self, build: Callable[[NavState, Location], Any]) -> Builder:
-        def builder(_now_us: int) -> Any:
-            state, origin = self.state, self._origin
-            if state is None or origin is None or not messages.has_position(state):
-                return None
-            return build(state, origin.location)
-
-        return builder
-
-    def _altitude(self, state: NavState, origin: Location) -> Any:
-        return messages.altitude(state, self._baro, self._reference_alt_m, origin)
-
-    def _global_origin(self, _now_us: int) -> Any:
-        origin = self._origin
-        return origin and messages.gps_global_origin(origin.location, origin.set_time_us)
-
-    def _global_position(self, now_us: int) -> Any:
-        if self.state is None or not messages.has_position(self.state):
-            return None
-        reference_m = self._reference_alt_m
-        height_m = self.health.reported.value("alt_home_m", now_us, self.health.silent_us)
-        if height_m is not None and not self.health.is_fused(now_us):
-            reference_m = self.state.alt_amsl_m - height_m
-        return messages.global_position_int(self.state, reference_m)
-
-    def _highres_imu(self, _now_us: int) -> Any:
-        if self._sample is None:
-            return None
-        updated, self._updated = self._updated, 0
-        return messages.highres_imu(self._sample, self._mag_b_ut, self._baro, updated)
-
-    def _gps_raw(self, now_us: int) -> Any:
-        if self.fix is None or not self.health.is_alive(GPS, now_us):
-            return messages.gps_absent(now_us, self._located_fix)
-        return messages.gps_raw_int(self.fix, self._located_fix)
-
-    def _system_time(self, now_us: int) -> Any:
-        offset = self._unix_offset_us
-        return messages.system_time(now_us, None if offset is None else now_us + offset)
+        return builder(self, now_us) if builder else None
 
     def _extended_sys_state(self, _now_us: int) -> Any:
         return mavlink.MAVLink_extended_sys_state_message(
             mavlink.MAV_VTOL_STATE_UNDEFINED, self.motion.landed_state
         )
 
-    @property
-    def _type(self) -> int:
-        kind: int = getattr(mavlink, f"MAV_TYPE_{self.settings.type.upper()}")
-        reported = self.health.reported.vehicle_type
-        return kind if reported is None else reported
-
-    @property
-    def mode(self) -> tuple[int, str]:
-        """Number and name of the present mode."""
-        reported = self.health.reported
-        if reported.mode:
-            return reported.custom_mode, reported.mode
-        return CUSTOM_MODES[self.autopilot], MODE_NAME
-
-    @property
-    def autopilot(self) -> int:
-        """The MAV_AUTOPILOT that is reported."""
-        return AUTOPILOTS[self.settings.autopilot]
-
-    def _high_latency(self, now_us: int) -> Any:
-        return high_latency2(self._type, self.autopilot, self.state, self.fix, self.health, now_us)
-
     def _heartbeat(self, now_us: int) -> Any:
         # The aircraft is flown by radio control; the gateway does not control it.
         base_mode = mavlink.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
         if self.armed:
             base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-        autopilot = self.autopilot
-        if autopilot != mavlink.MAV_AUTOPILOT_GENERIC or self.health.reported.mode:
+        if self.autopilot != mavlink.MAV_AUTOPILOT_GENERIC or self.health.reported.mode:
             # Clients look up the name of a mode of these autopilots by its number.
             base_mode |= mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         return mavlink.MAVLink_heartbeat_message(
-            self._type,
-            autopilot,
+            self.vehicle_type,
+            self.autopilot,
             base_mode,
             custom_mode=self.mode[0],
             system_status=self._system_status(now_us),
@@ -558,11 +391,9 @@ class Telemetry:
 
 def _intervals(settings: VehicleSettings) -> dict[int, int]:
     """Return the interval of every message; the setting of a rate has the name of its message."""
-    found = dict.fromkeys(REQUESTED_MESSAGES, OFF)
-    found[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = interval_us(HEARTBEAT_HZ)
-    found[mavlink.MAVLINK_MSG_ID_RADIO_STATUS] = interval_us(RADIO_STATUS_HZ)
-    found[mavlink.MAVLINK_MSG_ID_RC_CHANNELS] = interval_us(RC_CHANNELS_HZ)
-    for name, rate in msgspec.structs.asdict(settings.rates).items():
-        message = f"MAVLINK_MSG_ID_{name.removesuffix('_hz').upper()}"
-        found[getattr(mavlink, message)] = interval_us(rate)
-    return found
+    rates = msgspec.structs.asdict(settings.rates).items()
+    rates_hz = {name.removesuffix("_hz").upper(): rate_hz for name, rate_hz in rates}
+    return dict.fromkeys(REQUESTED_MESSAGES, OFF) | {
+        MESSAGE_IDS[name]: interval_us(rate_hz)
+        for name, rate_hz in (FIXED_RATES_HZ | rates_hz).items()
+    }

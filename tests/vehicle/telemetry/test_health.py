@@ -57,12 +57,12 @@ def test_recording_that_waits_for_arming_is_not_shown_as_switched_off(health: He
 
 def test_radio_status_has_the_weakest_measured_signal_if_any(health: Health) -> None:
     health.on_link(report(link(IMU_NODE), link(GPS_NODE)))
-    assert health.radio_status(0) is None
+    assert health.radio_status() is None
     strong, weak = RadioSignal(-60, 10.0), RadioSignal(-121, -7.25)
     other = link(NodeId(2, 0), signal=RadioSignal(-127, -15.0))
     nodes = link(IMU_NODE, signal=strong), link(GPS_NODE, signal=weak, lost=7)
     health.on_link(report(*nodes, other))
-    sent = health.radio_status(0)
+    sent = health.radio_status()
     # As QGroundControl reads them: signed bytes.
     assert [value - 256 for value in (sent.rssi, sent.noise)] == [-121, -114]
     assert (sent.remrssi, sent.remnoise, sent.txbuf, sent.rxerrors) == (255, 255, 100, 7)
