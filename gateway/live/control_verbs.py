@@ -24,7 +24,7 @@ from gateway.live.session import SessionState
 from gateway.live.source_port import SourcePort
 from gateway.printable import reason_of
 from gateway.recordings.index import Recording, delete_recording, find_recording, list_recordings
-from gateway.records import FusedSample, ImuFlags, ImuRaw, NodeId
+from gateway.records import FusedSample, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.status import RecorderStatus
 from gateway.units import US_PER_S
@@ -38,63 +38,58 @@ NEEDED_EXTRAS: Final = {"mqtt": "mqtt", EndpointKind.ZENOH: "fleet"}
 """Extras by kind of endpoint."""
 IDLE_US: Final = 5 * US_PER_S
 """Samples are no longer collected after this time without a request."""
-Values = tuple[int, ...]
-"""Time, accelerometer, gyroscope and magnetometer counts, temperature, three ranges, flags."""
 VehicleId = Annotated[int, msgspec.Meta(ge=1, le=255)]
 
 
-class RecorderVerbs:
-    """The verbs `record.*`, which answer when the disk has done what was asked."""
+def recorder_verbs(recorder: Recorder, has_vehicle: Callable[[], bool] = lambda: True) -> Verbs:
+    """Return the handlers of `record.*`, which answer when the disk has done what was asked."""
 
-    def __init__(self, recorder: Recorder, has_vehicle: Callable[[], bool] = lambda: True) -> None:
-        self._recorder, self._has_vehicle = recorder, has_vehicle
+    async def start() -> RecorderStatus:
+        recorder.record()
+        await recorder.settle()
+        return recorder.status()
 
-    def verbs(self) -> Verbs:
-        """Return the handlers."""
-        return {
-            "record.start": self._start,
-            "record.stop": self._stop,
-            "record.status": self._recorder.status,
-            "record.rename": self._rename,
-            "record.delete": self._delete,
-            "record.list": self._list,
-            "record.note": self._note,
-        }
+    async def stop() -> RecorderStatus:
+        recorder.stop()
+        await recorder.settle()
+        return recorder.status()
 
-    async def _start(self) -> RecorderStatus:
-        self._recorder.record()
-        await self._recorder.settle()
-        return self._recorder.status()
+    async def rename(name: str) -> RecorderStatus:
+        await recorder.save(name)
+        return recorder.status()
 
-    async def _stop(self) -> RecorderStatus:
-        self._recorder.stop()
-        await self._recorder.settle()
-        return self._recorder.status()
-
-    async def _rename(self, name: str) -> RecorderStatus:
-        await self._recorder.save(name)
-        return self._recorder.status()
-
-    # A folder of thousands of files takes long, and must not delay the telemetry.
-    async def _delete(self, name: str) -> Recording:
-        folder = self._recorder.folder
-        name = (await asyncio.to_thread(find_recording, folder, name)).name
-        now = self._recorder.status()
-        if name == now.name and now.state != SessionState.IDLE:
-            raise ControlError(f"{name} is being recorded; stop it first")
-        return await asyncio.to_thread(delete_recording, folder, name)
-
-    async def _list(self) -> list[Recording]:
-        return await asyncio.to_thread(list_recordings, self._recorder.folder)
-
-    def _note(self, text: str) -> RecorderStatus:
+    def note(text: str) -> RecorderStatus:
         if not text.strip():
             raise ControlError("the note is empty: describe what happens now")
-        if not self._has_vehicle():
+        if not has_vehicle():
             raise ControlError("no vehicle is received, to whose recording the note could be added")
-        if not self._recorder.note(text):
+        if not recorder.note(text):
             raise ControlError("sent to the ground stations, but in no file: nothing is recorded")
-        return self._recorder.status()
+        return recorder.status()
+
+    return {
+        "record.start": start,
+        "record.stop": stop,
+        "record.status": recorder.status,
+        "record.rename": rename,
+        "record.note": note,
+        **_folder_verbs(recorder),
+    }
+
+
+def _folder_verbs(recorder: Recorder) -> Verbs:
+    # A folder of thousands of files takes long, and must not delay the telemetry.
+    async def delete(name: str) -> Recording:
+        name = (await asyncio.to_thread(find_recording, recorder.folder, name)).name
+        now = recorder.status()
+        if name == now.name and now.state != SessionState.IDLE:
+            raise ControlError(f"{name} is being recorded; stop it first")
+        return await asyncio.to_thread(delete_recording, recorder.folder, name)
+
+    async def listed() -> list[Recording]:
+        return await asyncio.to_thread(list_recordings, recorder.folder)
+
+    return {"record.delete": delete, "record.list": listed}
 
 
 def source_verbs(ports: Sequence[SourcePort]) -> Verbs:
@@ -140,47 +135,37 @@ def mark_verbs(mark: Callable[[Location | None, int | None], None]) -> Verbs:
     return {"mark": set_mark}
 
 
-class SerialVerbs:
-    """`serial.*`; the port of a simulated receiver stays open."""
+def serial_verbs(serial: SerialPort, *, is_simulated: bool) -> Verbs:
+    """Return the handlers of `serial.*`; the port of a simulated receiver stays open."""
+    own = serial.status([]).wanted
 
-    def __init__(self, port: SerialPort, *, is_simulated: bool) -> None:
-        self._port = port
-        self._own = port.status([]).wanted
-        self._is_simulated = is_simulated
+    def check_changeable() -> None:
+        if is_simulated:
+            raise ControlError("the receiver is simulated: `mavgate run` uses a serial port")
 
-    def verbs(self) -> Verbs:
-        """Return the handlers."""
-        return {
-            "serial.status": self._status,
-            "serial.connect": self._connect,
-            "serial.disconnect": self._disconnect,
-        }
-
-    async def _status(self) -> SerialStatus:
+    async def status() -> SerialStatus:
         # In a thread: a USB hub that does not answer delays the list.
         ports = await asyncio.to_thread(list_serial_ports)
-        return replace(self._port.status(ports), is_fixed=self._is_simulated)
+        return replace(serial.status(ports), is_fixed=is_simulated)
 
-    async def _connect(self, port: str) -> SerialStatus:
-        self._check_changeable()
+    async def connect(port: str) -> SerialStatus:
+        check_changeable()
         ports = await asyncio.to_thread(list_serial_ports)
         # The port of the settings may be chosen even if this machine does not list it.
-        check_listed(port, {AUTO, self._own, *(each.device for each in ports)})
+        check_listed(port, {AUTO, own, *(each.device for each in ports)})
         try:
             load_entry_points()
         except LibraryError as error:
             raise ControlError(str(error)) from error
-        await self._port.connect(port)
-        return self._port.status(ports)
+        await serial.connect(port)
+        return serial.status(ports)
 
-    async def _disconnect(self) -> SerialStatus:
-        self._check_changeable()
-        await self._port.disconnect()
-        return await self._status()
+    async def disconnect() -> SerialStatus:
+        check_changeable()
+        await serial.disconnect()
+        return await status()
 
-    def _check_changeable(self) -> None:
-        if self._is_simulated:
-            raise ControlError("the receiver is simulated: `mavgate run` uses a serial port")
+    return {"serial.status": status, "serial.connect": connect, "serial.disconnect": disconnect}
 
 
 def check_listed(port: str, known: set[str]) -> None:
@@ -254,7 +239,7 @@ class ImuTap:
         self._calibration, self._calibrate = calibration, calibrate
         self._vehicle_id = 0
         self._requested_us: int | None = None
-        self._samples: deque[Values] = deque(maxlen=MAX_SAMPLES)
+        self._samples: deque[tuple[object, ...]] = deque(maxlen=MAX_SAMPLES)
 
     def verbs(self) -> Verbs:
         """Return the handlers."""
@@ -270,9 +255,9 @@ class ImuTap:
             self._vehicle_id = 0
             self._samples.clear()
             return
-        self._samples.append(values_of(raw))
+        self._samples.append(msgspec.structs.astuple(raw))
 
-    def _take(self, vehicle_id: VehicleId) -> list[Values]:
+    def _take(self, vehicle_id: VehicleId) -> list[tuple[object, ...]]:
         if vehicle_id != self._vehicle_id:
             self._samples.clear()
         self._vehicle_id, self._requested_us = vehicle_id, None
@@ -292,19 +277,6 @@ class ImuTap:
         return "calibrated"
 
 
-def values_of(raw: ImuRaw) -> Values:
-    """Write a raw sample as numbers."""
-    return (
-        *(raw.time_us, *raw.accel_raw, *raw.gyro_raw, *raw.mag_raw, raw.temperature_raw),
-        *(raw.accel_range_g, raw.gyro_range_dps, raw.mag_lsb_per_gauss, int(raw.flags)),
-    )
-
-
-def raw_of(values: Values, vehicle_id: int) -> ImuRaw:
-    """Read a raw sample from its numbers."""
-    time_us, ax, ay, az, gx, gy, gz, mx, my, mz, temperature = values[:11]
-    range_g, range_dps, lsb_per_gauss, flags = values[11:]
-    return ImuRaw(
-        time_us, NodeId(vehicle_id, 0), time_us, (ax, ay, az), (gx, gy, gz), (mx, my, mz),
-        temperature, range_g, range_dps, lsb_per_gauss, ImuFlags(flags),
-    )  # fmt: skip
+def raw_of(values: Sequence[object]) -> ImuRaw:
+    """Read a raw sample from its fields."""
+    return msgspec.convert(dict(zip(ImuRaw.__struct_fields__, values, strict=True)), ImuRaw)

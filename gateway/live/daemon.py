@@ -22,15 +22,14 @@ from gateway.config import (
     save_aircraft,
 )
 from gateway.hub.hub import Hub
-from gateway.live.armed_watch import VehicleLocations
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
 from gateway.live.control_verbs import (
     ImuTap,
-    RecorderVerbs,
-    SerialVerbs,
     client_verbs,
     introduction_verb,
     mark_verbs,
+    recorder_verbs,
+    serial_verbs,
     source_verbs,
 )
 from gateway.live.kept_files import PlanFiles, TimestampFile, begin_worker
@@ -42,7 +41,7 @@ from gateway.live.recorder import Recorder
 from gateway.live.recording_budget import RecordingBudget
 from gateway.live.serial_port import AUTO, SerialPort
 from gateway.live.service import LoopLag, ServiceNotifier, set_realtime_priority
-from gateway.live.session import SessionState
+from gateway.live.session import SessionState, VehicleLocations
 from gateway.live.source_port import SourcePort, read_map
 from gateway.live.vehicle_watch import VehicleWatch
 from gateway.pipeline import Pipeline, PipelineSettings
@@ -140,7 +139,6 @@ class Daemon:
         self._files = begin_worker("settings")
         self._metrics = MetricsServer(self._metrics_text)
         self._vehicles = VehicleWatch()
-        """None in a gateway that serves no metrics."""
         self._notifier = ServiceNotifier()
         self._sent: Counter[int] = Counter()
         self._lag = LoopLag()
@@ -170,6 +168,7 @@ class Daemon:
             lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
             self._introduction,
             self._locations,
+            lambda: self._watch_vehicles().armed(self.now_us()),
             lambda: self._hub.observe(runs=self._recorder.takes_frames),
             # A simulated time begins with the machine's, and is late by the start-up.
             gps_time=self._receiver is None,
@@ -183,9 +182,9 @@ class Daemon:
             socket_path("run"),
             {"status": self.snapshot, "reload": self._reload_or_refuse},
             identity_verb(lambda: self._own_ids | self._hub.routed_vehicles(), self._hub.endpoints),
-            RecorderVerbs(self._recorder, self._has_vehicle).verbs(),
+            recorder_verbs(self._recorder, self._has_vehicle),
             mark_verbs(self._mark),
-            SerialVerbs(self._serial, is_simulated=self._receiver is not None).verbs(),
+            serial_verbs(self._serial, is_simulated=self._receiver is not None),
             client_verbs(self._hub, self._folder),
             source_verbs(self._sources),
             self._imu.verbs(),
@@ -263,7 +262,9 @@ class Daemon:
         self._files.shutdown()
         self._recorder.close()
         self._plans.close()
-        self._timestamps.close(self._pipeline.newest_timestamps())
+        if newest := self._pipeline.newest_timestamps():
+            self._timestamps.save(0, newest)
+        self._timestamps.close()
         self._metrics.close()
         self._hub.close()
 
@@ -382,7 +383,7 @@ class Daemon:
         self._budget.note(client_id, now_us, trusted=incoming.trusted)
         out = self._pipeline.handle(incoming, now_us)
         if (timestamps := self._pipeline.timestamps_to_keep()) is not None:
-            self._timestamps.save(timestamps)
+            self._timestamps.save(0, timestamps)
         # A ground station's broadcast is both handled and forwarded: it is recorded once. Frames of
         # untrusted clients are recorded only if they had an effect.
         kept = incoming.trusted or bool(out.frames or out.records or out.orders)

@@ -24,7 +24,6 @@ from typing import Final
 
 import msgspec
 
-from gateway.live.armed_watch import ArmedWatch, VehicleLocations, label_of
 from gateway.live.kept_files import begin_worker, done_by
 from gateway.live.part import PENDING_LIMIT, Part, Run
 from gateway.live.part_files import DiskState, PartFiles, close_behind, free_bytes_near, reason_of
@@ -38,6 +37,8 @@ from gateway.live.session import (
     Session,
     SessionAction,
     SessionState,
+    VehicleLocations,
+    label_of,
     session_name,
 )
 from gateway.output import sync_folder
@@ -63,10 +64,10 @@ class Recorder:
     head of a vehicle's table, which gets its session, part and start here; `state_of` the state of
     a vehicle's fusion after all records passed to `flight`; `introduction_of` the frames of a
     vehicle that every part begins with: version, modes, parameters, missions, home; `vehicles_of`
-    latitude and longitude of the homes of own aircraft, or None, by id. `announce` is called with
-    whether it is a problem, and a text for the user, `on_change` when `takes_frames` may have
-    changed. Without `gps_time`, the time of GPS is ignored
-    and the machine's is used.
+    latitude and longitude of the homes of own aircraft, or None, by id; `armed_of` those of all
+    vehicles that report to be armed. `announce` is called with whether it is a problem, and a text
+    for the user, `on_change` when `takes_frames` may have changed. Without `gps_time`, the time of
+    GPS is ignored and the machine's is used.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class Recorder:
         state_of: Callable[[int], FusionState | None] = lambda _: None,
         introduction_of: Callable[[int], list[bytes]] = lambda _: [],
         vehicles_of: Callable[[], VehicleLocations] = dict,
+        armed_of: Callable[[], VehicleLocations] = dict,
         on_change: Callable[[], None] = lambda: None,
         *,
         gps_time: bool = True,
@@ -88,7 +90,7 @@ class Recorder:
         self._header_of = header_of
         self._announce = announce
         self._state_of, self._introduction_of = state_of, introduction_of
-        self._vehicles_of, self._on_change = vehicles_of, on_change
+        self._vehicles_of, self._armed_of, self._on_change = vehicles_of, armed_of, on_change
         self._gps_time = gps_time
         self._session = Session(settings)
         self._civil = CivilClock()
@@ -96,7 +98,7 @@ class Recorder:
         self._present: Part | None = None
         self._memory: deque[tuple[int, Part]] = deque()
         """The data before arming, in two parts whose begins differ by half its length."""
-        self._watch = ArmedWatch() if settings.mode == "armed" else None
+        self._holds = settings.mode == "armed"
         self._files: PartFiles | None = None
         self._disk = DiskState(0, 0)
         self._sync_due_us = 0
@@ -161,10 +163,11 @@ class Recorder:
 
     def set_in_flight(self, *, in_flight: bool, operates: bool) -> None:
         """Note whether an own aircraft is in flight, and whether one is armed."""
-        if self._watch is not None:
-            # Some own aircraft report an autopilot's state, and have no samples.
+        if self._holds:
+            # The armed bit of own aircraft may follow the recording. Some of them report an
+            # autopilot's state, and have no samples.
             own = self._seen | self._vehicles_of().keys()
-            in_flight = operates or self._watch.is_armed(self._clock(), own)
+            in_flight = operates or bool(self._armed_of().keys() - own)
         self._session.set_in_flight(in_flight)
 
     def note(self, text: str) -> bool:
@@ -227,15 +230,13 @@ class Recorder:
     def frame(self, frame: bytes) -> None:
         """Record a MAVLink frame that was sent or received."""
         now_us = self._clock()
-        if self._watch is not None:
-            self._watch.feed(frame, now_us)
         for part in self._parts() if self._settings.tlog else ():
             part.add_frame(frame, now_us)
 
     @property
     def takes_frames(self) -> bool:
         """Whether frames are recorded at the moment, or held in memory."""
-        return self._settings.tlog and (self._part is not None or self._watch is not None)
+        return self._settings.tlog and (self._part is not None or self._holds)
 
     @property
     def _part(self) -> Part | None:
@@ -250,9 +251,6 @@ class Recorder:
     def run(self, run: Run) -> None:
         """Record frames that the hub has forwarded together."""
         now_us = self._clock()
-        if self._watch is not None:
-            for frame in run.run():
-                self._watch.feed(frame, now_us)
         for part in self._parts() if self._settings.tlog else ():
             part.add_run(run, now_us)
 
@@ -286,7 +284,7 @@ class Recorder:
 
     def _hold(self) -> None:
         """Discard the oldest stretch in memory, and begin to hold the next one."""
-        if self._watch is None:
+        if not self._holds:
             return
         if self._part is not None or any(p.stamper.has_jumped(self._civil) for p in self._parts()):
             self._memory.clear()
@@ -324,7 +322,7 @@ class Recorder:
         """Return the text after the time in the name of a recording that begins now."""
         if self._settings.name == "time":
             return ""
-        known = {} if self._watch is None else self._watch.vehicles(self._clock())
+        known = dict(self._armed_of()) if self._holds else {}
         own = self._vehicles_of().items()
         known |= {key: at for key, at in own if at is not None or key not in known}
         return label_of(known, with_location=self._settings.name == "place")

@@ -22,6 +22,7 @@ A user's start or stop is valid until the next one; without one, the mode in the
 whether a recording is requested.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -36,7 +37,10 @@ RESUME_FACTOR: Final = 1.25
 RESUME_LEAST_MB: Final = 1.0
 """Least free space to resume in any case: some ten seconds of recording."""
 PART_DIGITS: Final = 2
-
+MAX_LABELLED: Final = 4
+"""Maximum vehicles in the name of a recording."""
+VehicleLocations = Mapping[int, tuple[float, float] | None]
+"""Latitude and longitude in degrees by system id; None if they are not known."""
 
 Mode = Literal["manual", "in_flight", "armed", "always"]
 NameStyle = Literal["time", "vehicle", "place"]
@@ -161,6 +165,16 @@ def session_name(unix_us: int) -> str:
 def part_stem(session: str, part: int) -> str:
     """Name the files of a part, without their endings: `20260611-142530_01`."""
     return f"{session}_{part:0{PART_DIGITS}d}"
+
+
+def label_of(vehicles: VehicleLocations, *, with_location: bool) -> str:
+    """Return the end of a recording's name: `-v1-v2-47.3977N-8.5456E`."""
+    label = "".join(f"-v{system_id}" for system_id in sorted(vehicles)[:MAX_LABELLED])
+    known = (at for _, at in sorted(vehicles.items()) if at is not None)
+    if with_location and (at := next(known, None)) is not None:
+        north, east = "NS"[at[0] < 0], "EW"[at[1] < 0]
+        label += f"-{abs(at[0]):.4f}{north}-{abs(at[1]):.4f}{east}"
+    return label
 
 
 class Session:

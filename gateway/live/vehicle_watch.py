@@ -14,9 +14,15 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.routing_table import FrameStream, Origin
 from gateway.hub.stats import ClientStats
+from gateway.live.session import VehicleLocations
 from gateway.units import US_PER_S
 from gateway.vehicle_row import VehicleRow
-from gateway.vehicle_state.newest import STATE_IDS, NewestState, NewestVehicles
+from gateway.vehicle_state.newest import (
+    HEARTBEAT_TIMEOUT_US,
+    STATE_IDS,
+    NewestState,
+    NewestVehicles,
+)
 from gateway.vehicle_state.senders import MODES_ID
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
@@ -74,6 +80,14 @@ class VehicleWatch:
     def present(self, now_us: int) -> dict[int, NewestState]:
         """Return the vehicles that were received recently."""
         return dict(list(self._vehicles.heard(now_us).items())[:MAX_SYSTEMS])
+
+    def armed(self, now_us: int) -> VehicleLocations:
+        """Return latitude and longitude of each armed vehicle, deg; None without a position."""
+        return {
+            system_id: None if (at := state.position) is None else (at.lat_deg, at.lon_deg)
+            for system_id, state in self.present(now_us).items()
+            if state.is_armed() and state.age_us(now_us, "HEARTBEAT") <= HEARTBEAT_TIMEOUT_US
+        }
 
     def rows(
         self,

@@ -4,12 +4,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from gateway.live.armed_watch import VehicleLocations
 from gateway.live.recorder import Recorder
-from gateway.live.session import RecordingSettings
+from gateway.live.session import RecordingSettings, VehicleLocations
+from gateway.live.vehicle_watch import VehicleWatch
 from gateway.recordings.table import TableHeader, TableReader
 from gateway.recordings.tlog import encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeId
+from gateway.wire.mavlink_splitter import frame_of
 from gateway.wire.timesync import ENOUGH
 from tests.conftest import ManualClock
 from tests.kit.recordings import make_frames, read_tlog
@@ -66,6 +67,7 @@ class RecorderBench:
         self.announced: list[tuple[bool, str]] = []
         options = {"folder": str(folder), "mode": "always", "free_floor_mb": 0.0, **settings}
         self.takes_frames: list[bool] = []
+        self._watch = VehicleWatch()
         self.recorder = Recorder(
             RecordingSettings(**options),
             clock,
@@ -75,6 +77,7 @@ class RecorderBench:
             fusion_of,
             introduction_of,
             vehicles_of,
+            lambda: self._watch.armed(clock()),
             lambda: self.takes_frames.append(self.recorder.takes_frames),
         )
 
@@ -86,6 +89,7 @@ class RecorderBench:
         for frame in frames:
             self.clock.advance(0.001)
             self.recorder.frame(frame)
+            self._watch.feed(frame_of(frame), self.clock())
 
     async def record(self, frames: list[bytes], seconds: float = 0.5) -> None:
         self.send(frames)

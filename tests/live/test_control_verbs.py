@@ -17,7 +17,7 @@ from gateway.hub.hub import Hub
 from gateway.hub.transports import url_files
 from gateway.live import control_verbs
 from gateway.live.control_socket import ControlError, ControlServer
-from gateway.live.control_verbs import RecorderVerbs, client_verbs, mark_verbs
+from gateway.live.control_verbs import client_verbs, mark_verbs, recorder_verbs
 from gateway.outputs import extend
 from gateway.recordings.index import Recording
 from gateway.vehicle.plan import Location
@@ -46,7 +46,7 @@ async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[RecorderBen
 async def test_recording_is_started_renamed_stopped_listed_and_deleted(
     bench: RecorderBench, tmp_path: Path
 ) -> None:
-    server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder).verbs())
+    server = ControlServer(tmp_path / "s", recorder_verbs(bench.recorder))
     started = (await ask(server, "record.start"))["result"]
     assert (started["state"], started["part"]) == ("recording", 1)
     bench.send(make_frames(9))
@@ -71,7 +71,7 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(
 async def test_note_that_no_vehicle_could_get_is_refused(
     bench: RecorderBench, tmp_path: Path
 ) -> None:
-    server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder, lambda: False).verbs())
+    server = ControlServer(tmp_path / "s", recorder_verbs(bench.recorder, lambda: False))
     refused = await ask(server, "record.note", text="here")
     assert "no vehicle is received" in refused["error"]
 
@@ -79,7 +79,7 @@ async def test_note_that_no_vehicle_could_get_is_refused(
 async def test_recordings_are_listed_off_the_event_loop(
     bench: RecorderBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder).verbs())
+    server = ControlServer(tmp_path / "s", recorder_verbs(bench.recorder))
     looked: list[threading.Thread] = []
 
     def look(_folder: Path) -> list[Recording]:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from gateway.cli.live import calibrate
-from gateway.live.control_socket import ControlServer, Verbs, socket_path
-from gateway.live.control_verbs import IDLE_US, MAX_SAMPLES, ImuTap, raw_of, values_of
+from gateway.live.control_socket import MAX_LINE, ControlServer, Verbs, socket_path
+from gateway.live.control_verbs import IDLE_US, MAX_SAMPLES, ImuTap, raw_of
 from gateway.records import FusedSample
 from gateway.sensing.calibration import NodeCalibration
 from tests.kit.cli import invoke
@@ -42,7 +42,11 @@ def test_samples_are_collected_only_while_they_are_requested() -> None:
             tap.add(sample)
         found = take(3)
         assert len(found) == taken
-        assert all(values_of(raw_of(values, 3)) == values for values in found)
+        line = msgspec.json.encode(found)
+        assert len(line) < MAX_LINE
+        assert [*map(raw_of, msgspec.json.decode(line))] == [
+            s.imu for s in samples(count)[-taken:] if taken
+        ]
 
 
 @pytest.mark.io

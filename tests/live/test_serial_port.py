@@ -12,7 +12,7 @@ import serial
 
 from gateway.live import serial_port
 from gateway.live.control_socket import ControlServer
-from gateway.live.control_verbs import SerialVerbs
+from gateway.live.control_verbs import serial_verbs
 from gateway.live.serial_port import (
     LONGEST_RETRY_S,
     Port,
@@ -405,7 +405,7 @@ async def test_serial_port_is_changed_closed_and_opened_again(
     monkeypatch.setattr("gateway.live.control_verbs.list_serial_ports", adapters.ports)
     first, second = adapters.plug(), adapters.plug()
     port = listener.port(first)
-    server = ControlServer(tmp_path / "s", SerialVerbs(port, is_simulated=False).verbs())
+    server = ControlServer(tmp_path / "s", serial_verbs(port, is_simulated=False))
     port.start()
     status = (await ask(server, "serial.status"))["result"]
     assert (status["state"], status["device"], len(status["ports"])) == ("open", first, 2)
@@ -431,7 +431,7 @@ async def test_serial_port_is_changed_closed_and_opened_again(
 async def test_port_of_a_simulated_receiver_is_not_changed(
     listener: Listener, tmp_path: Path
 ) -> None:
-    verbs = SerialVerbs(listener.port(), is_simulated=True).verbs()
+    verbs = serial_verbs(listener.port(), is_simulated=True)
     server = ControlServer(tmp_path / "s", verbs)
     assert (await ask(server, "serial.status"))["result"]["is_fixed"]
     for verb, params in (("serial.connect", {"port": "auto"}), ("serial.disconnect", {})):

@@ -443,7 +443,7 @@ def _capture_live(vehicle: int) -> Capture:
                 idle_s = 0.0 if found else idle_s + POLL_S
                 if idle_s > SAMPLE_TIMEOUT_S:
                     refuse(f"no samples of vehicle {vehicle}: is it on?")
-                is_done = collecting.add(raw_of(tuple(values), vehicle) for values in found)
+                is_done = collecting.add(map(raw_of, found))
         return node_samples(collecting.raws)
 
     return capture

@@ -9,7 +9,7 @@ import pytest
 
 from gateway.batch.catalogue import CATALOGUE_NAME
 from gateway.live.control_socket import ControlServer, socket_path
-from gateway.live.control_verbs import RecorderVerbs
+from gateway.live.control_verbs import recorder_verbs
 from tests.conftest import ManualClock
 from tests.kit.cli import invoke
 from tests.kit.recorder import RecorderBench
@@ -28,7 +28,7 @@ async def gateway(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     bench = RecorderBench(tmp_path / "elsewhere", clock, mode="manual")
     bench.recorder.start()
-    server = ControlServer(socket_path("run"), RecorderVerbs(bench.recorder).verbs())
+    server = ControlServer(socket_path("run"), recorder_verbs(bench.recorder))
     await server.start()
     yield bench
     server.close()
@@ -74,7 +74,7 @@ async def test_recorder_that_waits_for_arming_is_shown_with_its_memory(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     bench = RecorderBench(tmp_path / "recordings", clock, mode="armed")
-    server = ControlServer(socket_path("run"), RecorderVerbs(bench.recorder).verbs())
+    server = ControlServer(socket_path("run"), recorder_verbs(bench.recorder))
     await server.start()
     try:
         await bench.turn()
