@@ -50,7 +50,7 @@ KERNEL_MODULES: Final = (
 ARCHITECTURES: Final = ("x86_64", "aarch64")
 OLDEST_GLIBC: Final = "2.17"
 """Oldest version of the C library with which the library of a wheel runs."""
-NO_KERNELS: Final = ("gateway.compiled", "gateway.settings")
+NO_KERNELS: Final = ("gateway.compiled", "gateway.compiled.entry_point", "gateway.settings")
 """Modules that all kernels import, but from which they use no constant."""
 COMPILER: Final = Path(__file__).with_name("kernel_compiler.py")
 OTHERS_WRITE: Final = stat.S_IWGRP | stat.S_IWOTH
@@ -101,7 +101,7 @@ def build_installed(path: Path, architecture: str | None = None, *, rebuild: boo
         importlib.import_module(name)
     # Any imported module may define a constant or a type of a kernel.
     names = [name for name in sys.modules if name.startswith("gateway.")]
-    files = {sys.modules[name].__file__ for name in names if not name.startswith(NO_KERNELS)}
+    files = {sys.modules[name].__file__ for name in names if name not in NO_KERNELS}
     stamp = "\n".join(sorted(stamp_of(Path(file)) for file in files if file))
     cached = None if rebuild or architecture else cached_object(stamp)
     build_library(

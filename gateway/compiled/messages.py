@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from gateway.compiled import address_of, array_at, compiled
+from gateway.compiled import address_of, array_at, compiled, layout_of, record_at, shared
 from gateway.compiled.system_calls import send_many, send_one
 
 ROOM: Final = 64
@@ -20,48 +20,94 @@ DATAGRAMS: Final = 0
 SEGMENTS: Final = 1
 STREAM: Final = 2
 """Modes of sending: each part as a datagram, parts of one size as one message, or as a stream."""
-
-PARTS, GROUPS, LAST_SIZE, PARTS_AT, PLAIN_AT, GROUPS_AT, CONTROL_AT, WHOLE_AT = range(8)
-"""Words of an outbox: the number of its parts, and of its groups of one size; the last number of
-bytes of a stream that were sent; addresses of the parts, of headers for each part and for each
-group, of the groups' control data, and of a header of all parts."""
-OUTBOX_WORDS: Final = 8
-HEADER_WORDS: Final = 8
-FIRST_AT, COUNT, CONTROL, CONTROL_SIZE, FLAGS, LENGTH = 2, 3, 4, 5, 6, 7
-"""Words of a `struct mmsghdr`: address and number of its parts, address and size of its control
-data, flags of what was received; the bytes received or sent."""
-CONTROL_WORDS: Final = 4
-SEGMENT_SIZE, FIRST = 2, 3
-"""Words of control data: the size of the datagrams; the first part of the group, which the system
-ignores."""
 SOL_UDP: Final = 17
 UDP_SEGMENT: Final = 103
 _CONTROL_BYTES: Final = 24
 _CONTROL_LENGTH: Final = 18
 """Sizes of control data, a header of 16 bytes and a number of two: with and without padding."""
-_INT: Final = np.dtype(np.int64)
+
+
+@shared
+class MessagePart:
+    """A `struct iovec`."""
+
+    at: int
+    length: int
+
+
+@shared
+class MessageHeader:
+    """A `struct mmsghdr`."""
+
+    name_at: int
+    name_size: int
+    parts_at: int
+    parts: int
+    control_at: int
+    control_size: int
+    received_flags: int
+    length: int
+    """Bytes that were received or sent."""
+
+
+@shared
+class Control:
+    """A `struct cmsghdr` and its data."""
+
+    length: int
+    level_and_type: int
+    segment_size: int
+    """Size of the datagrams."""
+    first: int
+    """First part of the group, which the system ignores."""
+
+
+@shared
+class OutboxState:
+    """Parts to send, and the structures that the system calls need for them."""
+
+    parts: int
+    groups: int
+    """Groups of successive parts of one size."""
+    last_size: int
+    """Bytes of a stream that were sent last."""
+    parts_at: int
+    plain_at: int
+    """Address of a header for each part."""
+    groups_at: int
+    """Address of a header for each group."""
+    control_at: int
+    whole_at: int
+    """Address of a header of all parts."""
+
+
+PART: Final = layout_of(MessagePart)
+HEADER: Final = layout_of(MessageHeader)
+CONTROL: Final = layout_of(Control)
+OUTBOX: Final = layout_of(OutboxState)
+HEADER_SIZE: Final = HEADER.itemsize
+PART_SIZE: Final = PART.itemsize
 
 
 class Outbox:
-    """The memory of an outbox; `words` is passed by address and `parts` is to be filled."""
+    """The memory of an outbox."""
 
     def __init__(self) -> None:
-        self.parts = np.zeros((ROOM, 2), np.int64)
-        control = np.zeros((ROOM, CONTROL_WORDS), np.int64)
-        control[:, 0], control[:, 1] = _CONTROL_LENGTH, SOL_UDP | UDP_SEGMENT << 32
+        self.parts = np.zeros(ROOM, PART)
+        control = np.zeros(ROOM, CONTROL)
+        control["length"], control["level_and_type"] = _CONTROL_LENGTH, SOL_UDP | UDP_SEGMENT << 32
         groups, whole = headers_of(self.parts), headers_of(self.parts[:1])
-        groups[:, CONTROL] = address_of(control) + np.arange(ROOM) * control.strides[0]
-        groups[:, CONTROL_SIZE] = _CONTROL_BYTES
+        groups["control_at"] = address_of(control) + np.arange(ROOM) * CONTROL.itemsize
+        groups["control_size"] = _CONTROL_BYTES
         self._kept = (self.parts, headers_of(self.parts), groups, control, whole)
-        self.words = np.zeros(OUTBOX_WORDS, np.int64)
-        self.words[PARTS_AT:] = [address_of(each) for each in self._kept]
+        self.state: Any = OutboxState(0, 0, 0, *map(address_of, self._kept))  # type: ignore[call-arg]
 
 
 def headers_of(parts: Any) -> Any:
     """Return a header for each part; the caller must keep the parts alive."""
-    headers = np.zeros((len(parts), HEADER_WORDS), np.int64)
-    headers[:, FIRST_AT] = address_of(parts) + np.arange(len(parts)) * parts.strides[0]
-    headers[:, COUNT] = 1
+    headers = np.zeros(len(parts), HEADER)
+    headers["parts_at"] = address_of(parts) + np.arange(len(parts)) * PART.itemsize
+    headers["parts"] = 1
     return headers
 
 
@@ -77,20 +123,20 @@ def way_to_send(sock: socket.socket) -> int:
 @compiled
 def group(outbox: Any) -> None:
     """Join successive parts of one size into groups."""
-    parts = array_at(outbox[PARTS_AT], (ROOM, 2), _INT)
-    headers = array_at(outbox[GROUPS_AT], (ROOM, HEADER_WORDS), _INT)
-    control = array_at(outbox[CONTROL_AT], (ROOM, CONTROL_WORDS), _INT)
+    parts = array_at(outbox.parts_at, (ROOM,), PART)
+    headers = array_at(outbox.groups_at, (ROOM,), HEADER)
+    control = array_at(outbox.control_at, (ROOM,), CONTROL)
     first = count = 0
-    while first < outbox[PARTS]:
+    while first < outbox.parts:
         end = first + 1
-        while end < outbox[PARTS] and parts[end, 1] == parts[first, 1]:
+        while end < outbox.parts and parts[end].length == parts[first].length:
             end += 1
-        headers[count, FIRST_AT] = outbox[PARTS_AT] + 16 * first
-        headers[count, COUNT] = end - first
-        control[count, SEGMENT_SIZE], control[count, FIRST] = parts[first, 1], first
+        headers[count].parts_at = outbox.parts_at + PART_SIZE * first
+        headers[count].parts = end - first
+        control[count].segment_size, control[count].first = parts[first].length, first
         count += 1
         first = end
-    outbox[GROUPS] = count
+    outbox.groups = count
 
 
 @compiled
@@ -98,34 +144,32 @@ def send_parts(outbox: Any, file: int, way: int) -> int:
     """Send all parts, which are grouped; return the number sent, or a negative error number.
 
     An error after some parts were sent is not reported. In a stream, the next part may have been
-    sent up to `LAST_SIZE`.
+    sent up to `last_size`.
     """
     if way == STREAM:
         return _send_stream(outbox, file)
-    if outbox[PARTS] == 1:
-        parts = array_at(outbox[PARTS_AT], (ROOM, 2), _INT)
-        return min(send_one(file, parts[0, 0], parts[0, 1]), 1)
+    if outbox.parts == 1:
+        part = record_at(outbox.parts_at, PART)
+        return min(send_one(file, part.at, part.length), 1)
     first = 0
     if way == SEGMENTS:
-        done = send_many(file, outbox[GROUPS_AT], outbox[GROUPS])
-        if done == outbox[GROUPS]:
-            return int(outbox[PARTS])
-        control = array_at(outbox[CONTROL_AT], (ROOM, CONTROL_WORDS), _INT)
-        first = control[max(done, 0), FIRST]
-    done = send_many(file, outbox[PLAIN_AT] + 8 * HEADER_WORDS * first, outbox[PARTS] - first)
+        done = send_many(file, outbox.groups_at, outbox.groups)
+        if done == outbox.groups:
+            return int(outbox.parts)
+        first = array_at(outbox.control_at, (ROOM,), CONTROL)[max(done, 0)].first
+    done = send_many(file, outbox.plain_at + HEADER_SIZE * first, outbox.parts - first)
     return first + max(done, 0) if first else done
 
 
 @compiled
 def _send_stream(outbox: Any, file: int) -> int:
-    parts = array_at(outbox[PARTS_AT], (ROOM, 2), _INT)
-    header = array_at(outbox[WHOLE_AT], (HEADER_WORDS,), _INT)
-    header[COUNT] = outbox[PARTS]
-    done = send_many(file, outbox[WHOLE_AT], 1)
-    size = header[LENGTH] if done == 1 else 0
+    parts = array_at(outbox.parts_at, (ROOM,), PART)
+    header = record_at(outbox.whole_at, HEADER)
+    header.parts = outbox.parts
+    size = header.length if send_many(file, outbox.whole_at, 1) == 1 else 0
     sent = 0
-    while sent < outbox[PARTS] and size >= parts[sent, 1]:
-        size -= parts[sent, 1]
+    while sent < outbox.parts and size >= parts[sent].length:
+        size -= parts[sent].length
         sent += 1
-    outbox[LAST_SIZE] = size
+    outbox.last_size = size
     return sent

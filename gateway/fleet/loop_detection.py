@@ -12,7 +12,7 @@ from typing import Final
 import msgspec
 
 from gateway.fleet.id_map import Vehicle
-from gateway.hub.routing_table import FrameMemory
+from gateway.hub.duplicates import FrameMemory
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
 

@@ -23,17 +23,17 @@ Theory of operation
    our vehicles) clears all routes, the table too, and the next frame of each kind is routed again.
 3. `router.Router` handles frames without a cached route: our own that came back, round-trip
    requests, requests to our vehicles, frames that address a system, and the first broadcast of each
-   kind. `routing_table.RoutingTable` has the paths to each system. `routing_table.DuplicateFilter`
+   kind. `routing_table.RoutingTable` has the paths to each system. `duplicates.DuplicateFilter`
    drops copies and late frames of systems that are received on several paths.
 4. Our own frames wait in two queues, answers and telemetry, and some are sent at each turn of the
    event loop. When the processor is short of time, old telemetry is dropped and answers are not.
    `fanout.Fanout` renumbers for each client, so that filters leave no gaps; `FrameSigner` signs.
 5. A client whose link is slow has a bounded `send_queue.SendQueue`, where answers and attitudes
-   overtake; a link of known bandwidth gets telemetry at lower rates (`send_queue.Bandwidth`).
+   overtake; a link of known bandwidth gets telemetry at lower rates (`bandwidth.Bandwidth`).
 6. Untrusted clients may cause a bounded number of reads, requests and answers (`limits`), are in no
    routing table, and reach our vehicles only.
 
-An endpoint kind is one file in `transports/` over `base.Client` or `base.Listener`, with
+An endpoint kind is one file in `transports/` over `base.Client` or `listener.Listener`, with
 `datagram` and `stream` between for the common part of datagram sockets and of byte streams. No
 transport blocks or raises; each closes itself on an error, and `tick` opens it again. Everything
 but `transports/`, `hub.py`, `router.py` and the compiled step is pure: time is an argument, and

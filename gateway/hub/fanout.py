@@ -20,24 +20,26 @@ gets every frame. A client of MAVLink 1 gets the messages that this version can 
 extensions and signatures.
 """
 
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 from weakref import WeakValueDictionary
 
-from gateway.hub.endpoint import NO_MESSAGES, Endpoint
-from gateway.hub.forwarding import Forwarding
-from gateway.hub.forwarding_step import IS_OBSERVED, TARGETS
-from gateway.hub.limits import RateLimit
-from gateway.hub.routing_table import Origin, SystemPath
-from gateway.hub.send_queue import (
+from gateway.hub.bandwidth import (
     HIGH_LATENCY2,
     HIGH_LATENCY2_BYTES,
     SATELLITE_BUDGET,
-    SEQUENCE_MASK,
     Bandwidth,
+    Offered,
 )
-from gateway.hub.transports.base import Client, OnForeign, Route, Target, Targets
+from gateway.hub.endpoint import NO_MESSAGES, Endpoint
+from gateway.hub.forwarding import Forwarding
+from gateway.hub.limits import RateLimit
+from gateway.hub.numbering import SEQUENCE_MASK
+from gateway.hub.route import OnForeign, Route, Target, Targets
+from gateway.hub.routing_table import Origin, SystemPath
+from gateway.hub.transports.base import Client
 from gateway.records import ClientInterval
 from gateway.units import US_PER_S
 from gateway.wire.frame_editing import edit_frame
@@ -58,16 +60,6 @@ OnRun = Callable[[Forwarding], None]
 _TargetsKey = tuple[tuple[int, int, Origin | None], ...]
 
 
-@dataclass(slots=True)
-class _Gap:
-    """Number of frames of one component that were not sent to a client, modulo 256."""
-
-    skipped: int = 0
-
-    def skip(self) -> None:
-        self.skipped = (self.skipped + 1) & SEQUENCE_MASK
-
-
 @dataclass(slots=True, eq=False)
 class _Subscription:
     """One client with its limits; survives every change of routes."""
@@ -80,7 +72,8 @@ class _Subscription:
     """Bytes of answers since the last plan of the bandwidth."""
     requested: dict[tuple[int, int], int] = field(default_factory=dict)
     """Requested intervals by system and message."""
-    gaps: dict[Origin, _Gap] = field(default_factory=dict)
+    skipped: Counter[Origin] = field(default_factory=Counter)
+    """Frames of each of our components that were not sent to the client."""
     limits: dict[bytes, RateLimit] = field(default_factory=dict)
     inserted: dict[Origin, int] = field(default_factory=dict)
     """Kept answers that the gateway has sent in the name of other systems, by these. Frames of a
@@ -114,14 +107,6 @@ class _Subscription:
         if len(self.inserted) < MAX_KINDS:
             self.inserted.setdefault(origin, 0)
 
-    def gap_of(self, origin: Origin) -> _Gap:
-        gap = self.gaps.get(origin)
-        if gap is None:
-            if len(self.gaps) >= MAX_KINDS:
-                self.gaps.clear()
-            gap = self.gaps[origin] = _Gap()
-        return gap
-
     def limit_of(self, key: bytes, interval_us: int) -> RateLimit | None:
         """Return the limit of a kind of frame; None if there is none, and never will be."""
         planned_us = self.bandwidth.interval_us(key) if self.bandwidth else 0
@@ -136,7 +121,7 @@ class _Subscription:
         limit.change(max(interval_us, planned_us))
         return limit
 
-    def plan(self, offered: dict[bytes, tuple[int, int, int]], elapsed_s: float) -> None:
+    def plan(self, offered: dict[bytes, Offered], elapsed_s: float) -> None:
         """Adapt the limits to the bandwidth, if it is known; no route depends on intervals."""
         if self.bandwidth is None:
             return
@@ -177,9 +162,12 @@ class OwnRoute:
     def __init__(self, message_id: int) -> None:
         self.message_id = message_id
         self.frames = self.size = 0
-        self.targets: list[tuple[Callable[[MavFrame], None], _Gap, RateLimit | None]] = []
-        self.closed: list[_Gap] = []
-        """Gaps of the clients that get no frame of this kind."""
+        self.targets: list[
+            tuple[Callable[[MavFrame], None], Counter[Origin], RateLimit | None]
+        ] = []
+        """How each client is sent a frame, its skipped frames, and its limit."""
+        self.closed: list[Counter[Origin]] = []
+        """The skipped frames of the clients that get no frame of this kind."""
 
     def settle(self) -> tuple[int, int]:
         """Return the frames and bytes since the last call."""
@@ -202,19 +190,17 @@ class Fanout:
     ) -> None:
         self._is_recording = is_recording
         self.forwarding = forwarding or Forwarding()
-        self.forwarding.work[IS_OBSERVED] = on_foreign is not None
+        self.forwarding.work.is_observed = on_foreign is not None
         self._on_foreign, self._on_run = on_foreign, on_run
         self._targets: WeakValueDictionary[_TargetsKey, Targets] = WeakValueDictionary()
         """Targets by client, limit and renumbered system of each: routes share them."""
         self._targets_at: WeakValueDictionary[int, Targets] = WeakValueDictionary()
         """The same targets by the address of their memory."""
-        self.others: dict[tuple[int, bytes], Route] = {}
-        """Routes by client and key of frames that are not only forwarded, such as heartbeats."""
         self.forwarded = 0
         """Frames of other systems that were forwarded by cached routes."""
         self._own: dict[bytes, OwnRoute] = {}
-        self._offered: dict[bytes, tuple[int, int, int]] = {}
-        """Message id, frames and bytes of each kind since the last plan of the bandwidths."""
+        self._offered: dict[bytes, Offered] = {}
+        """The frames of each kind since the last plan of the bandwidths."""
         self._is_metered = False
         """Whether `_offered` is needed."""
         self._signer = signer
@@ -229,7 +215,6 @@ class Fanout:
         self.settle()
         self._meter_all()
         self._own.clear()
-        self.others.clear()
         self.forwarding.clear()
         for subscription in self._subscriptions.values():
             subscription.client.routes.clear()
@@ -248,15 +233,13 @@ class Fanout:
         for subscription in self._subscriptions.values():
             for key, route in subscription.client.routes.items():
                 self._meter(key, route.message_id, *route.settle(self.forwarding))
-        for (_, key), route in self.others.items():
-            self._meter(key, route.message_id, *route.settle(self.forwarding))
         for key, own in self._own.items():
             self._meter(key, own.message_id, *own.settle())
 
     def _meter(self, key: bytes, message_id: int, frames: int, size: int) -> None:
         if frames and len(self._offered) < MAX_KINDS:
-            _, known_frames, known_size = self._offered.get(key, (0, 0, 0))
-            self._offered[key] = message_id, known_frames + frames, known_size + size
+            known = self._offered.get(key, Offered(message_id, 0, 0))
+            self._offered[key] = Offered(message_id, known.frames + frames, known.size + size)
 
     def add(self, client: Client) -> None:
         """Include a client from the next frame on."""
@@ -291,18 +274,18 @@ class Fanout:
         route.frames += 1
         route.size += len(frame.data)
         copies: dict[int, MavFrame] = {}
-        for send, gap, limit in route.targets:
+        origin = frame.origin
+        for send, skipped, limit in route.targets:
             if limit is not None and not limit.is_due(now_us):
-                gap.skip()
+                skipped[origin] += 1
                 continue
-            skipped = gap.skipped
-            copy = copies.get(skipped)
+            number = sequence - skipped[origin] & SEQUENCE_MASK
+            copy = copies.get(number)
             if copy is None:
-                number = sequence - skipped & SEQUENCE_MASK
-                copy = copies[skipped] = self._signer.sequence_and_sign(frame, number, now_us)
+                copy = copies[number] = self._signer.sequence_and_sign(frame, number, now_us)
             send(copy)
-        for gap in route.closed:
-            gap.skip()
+        for skipped in route.closed:
+            skipped[origin] += 1
 
     def answer(
         self, frame: MavFrame, sequence: int, client_ids: Collection[int], now_us: int
@@ -330,13 +313,13 @@ class Fanout:
         """Send a frame of ours to some clients, and leave no gap in the numbers of the others."""
         # A copy: a client that breaks at this frame removes itself.
         for subscription in tuple(self._subscriptions.values()):
-            gap = subscription.gap_of(frame.origin)
+            skipped = subscription.skipped
             if gets(subscription):
                 subscription.answered += len(frame.data)
-                number = sequence - gap.skipped & SEQUENCE_MASK
+                number = sequence - skipped[frame.origin] & SEQUENCE_MASK
                 subscription.client.send(self._signer.sequence_and_sign(frame, number, now_us))
             else:
-                gap.skip()
+                skipped[frame.origin] += 1
 
     def insert(self, frame: MavFrame, client_ids: Collection[int], newest: int) -> None:
         """Send a kept answer of another system to some clients, past their filters.
@@ -424,41 +407,35 @@ class Fanout:
         if shared is None:
             shared = self._targets[tuple(key)] = Targets(targets)
             self._targets_at[shared.address] = shared
-        return Route(frame.message_id, shared, source, path, rejects, self._on_foreign)
+        return Route(frame.message_id, shared, source.client_id, path, rejects, self._on_foreign)
 
-    def keep_route(self, route: Route, source: Client, key: bytes) -> None:
-        """Forward all frames of this kind from a client by a route, without examining each."""
+    def keep_route(
+        self, route: Route, source: Client, key: bytes, *, is_examined: bool = False
+    ) -> None:
+        """Forward all frames of this kind from a client by a route."""
         if len(source.routes) >= MAX_ROUTES:
             oldest = next(iter(source.routes))
-            self._discard(oldest, source.routes.pop(oldest))
+            gone = source.routes.pop(oldest)
+            self.forwarded += gone.targets.settle()
+            if self._is_metered:
+                self._meter(oldest, gone.message_id, *gone.settle(self.forwarding))
+            gone.leave(self.forwarding, oldest)
         source.routes[key] = route
-        if source.renumbering is None:
+        route.is_examined = is_examined
+        if source.renumbering is None and not is_examined:
             route.enter(self.forwarding, key)
-
-    def keep_other(self, route: Route, source: Client, key: bytes) -> None:
-        """Forward all frames of this kind from a client by a route, after examining each."""
-        if len(self.others) >= MAX_ROUTES:
-            oldest = next(iter(self.others))
-            self._discard(oldest[1], self.others.pop(oldest))
-        self.others[source.client_id, key] = route
-
-    def _discard(self, key: bytes, route: Route) -> None:
-        self.forwarded += route.targets.settle()
-        if self._is_metered:
-            self._meter(key, route.message_id, *route.settle(self.forwarding))
-        route.leave(self.forwarding, key)
 
     def observe(self, *, runs: bool) -> None:
         """Pass the runs of the compiled step to `on_run`, or not."""
-        self.forwarding.work[IS_OBSERVED] = runs
+        self.forwarding.work.is_observed = runs
 
     def finish_run(self, now_us: int) -> None:
         """Complete the forwarding of a run: the part that the compiled step leaves to Python."""
         forwarding = self.forwarding
-        targets, failures = self._targets_at[forwarding.work[TARGETS]], forwarding.failures()
+        targets, failures = self._targets_at[forwarding.work.targets], forwarding.failures()
         if failures or targets.others:
             targets.finish(forwarding.run(), failures, now_us)
-        if forwarding.work[IS_OBSERVED]:
+        if forwarding.work.is_observed:
             if self._on_run is not None:
                 self._on_run(forwarding)
             elif self._on_foreign is not None:
@@ -471,13 +448,11 @@ class Fanout:
         decides.
         """
         links = [self._subscriptions[key] for key in client_ids if key in self._subscriptions]
-        origins = {origin for link in links for origin in link.gaps}
         requested = {k: v for link in reversed(links) for k, v in link.requested.items()}
+        self.clear()
         for link in links:
             link.requested, link.inserted = dict(requested), dict(links[0].inserted)
-            for origin in origins:
-                link.gap_of(origin).skipped = links[0].gap_of(origin).skipped
-        self.clear()
+            link.skipped = links[0].skipped.copy()
 
     def thin(self, now_us: int) -> None:
         """Plan the message intervals to clients of known bandwidth; call it once a second."""
@@ -518,12 +493,11 @@ class Fanout:
         route = OwnRoute(frame.message_id)
         for subscription in self._subscriptions.values():
             interval_us = self._interval_us(subscription, frame, is_ours=True)
-            gap = subscription.gap_of(frame.origin)
             if interval_us == NO_MESSAGES:
-                route.closed.append(gap)
+                route.closed.append(subscription.skipped)
                 continue
             limit = subscription.limit_of(frame.key, interval_us)
-            route.targets.append((subscription.client.send, gap, limit))
+            route.targets.append((subscription.client.send, subscription.skipped, limit))
         self._own[frame.key] = route
         return route
 

@@ -7,27 +7,24 @@ import numpy as np
 
 from gateway.compiled import address_of
 from gateway.compiled.entry_point import LibraryError
-from gateway.compiled.messages import LENGTH, PARTS, Outbox, headers_of
-from gateway.hub import forwarding_step as step
+from gateway.compiled.messages import PART, Outbox, headers_of
+from gateway.hub import forwarding_step as kernel
 
-MAX_COMPILED: Final = step.ENTRIES // 2
+MAX_COMPILED: Final = kernel.ENTRIES // 2
 """Maximum routes in the table; frames of further ones are forwarded by Python."""
 FIRST_LARGEST: Final = 280
 """Assumed size of datagrams until some are received, bytes: that of the largest frame."""
 
-Words = memoryview
 
-
-def new_client_words(client_id: int) -> Words:
-    """Return the words of a client without a file to receive from or send to."""
-    words = np.zeros(step.CLIENT_WORDS, np.int64)
-    words[step.CLIENT_ID], words[step.LARGEST] = client_id, FIRST_LARGEST
-    words[step.INPUT] = words[step.OUTPUT] = -1
-    return words.data
+def new_client_state(client_id: int) -> kernel.ClientState:
+    """Return the state of a client without a file to receive from or send to."""
+    state = kernel.ClientState()
+    state.id, state.input, state.output, state.largest = client_id, -1, -1, FIRST_LARGEST
+    return state
 
 
 class Forwarding:
-    """The memory of one hub; `problem` is the reason if there is no compiled step.
+    """The memory of one hub; `problem` is the reason if there is no compiled kernel.
 
     Parameters
     ----------
@@ -39,42 +36,43 @@ class Forwarding:
         self.problem: LibraryError | None = None
         self.is_compiled = is_compiled
         try:
-            step.forward.load()
+            kernel.forward.load()
         except LibraryError as error:
             self.problem, self.is_compiled = error, False
-        buffer = np.zeros(step.READS * step.MAX_DATAGRAM, np.uint8)
-        begins = address_of(buffer) + np.arange(step.READS) * step.MAX_DATAGRAM
-        places = np.column_stack([begins, np.full(step.READS, step.MAX_DATAGRAM)])
-        received, self._outbox = headers_of(places), Outbox()
-        self._table = np.zeros((step.ENTRIES, 3), np.int64)
+        buffer = np.zeros(kernel.READS * kernel.MAX_DATAGRAM, np.uint8)
+        parts = np.zeros(kernel.READS, PART)
+        parts["at"] = address_of(buffer) + np.arange(kernel.READS) * kernel.MAX_DATAGRAM
+        parts["length"] = kernel.MAX_DATAGRAM
+        received, self._outbox = headers_of(parts), Outbox()
+        self._table = np.zeros(kernel.ENTRIES, kernel.ENTRY)
         self._filled: set[int] = set()
         """Entries of the table that are used."""
-        self._routes = np.zeros((MAX_COMPILED, step.ROUTE_WORDS), np.int64)
-        self._route_words = self._routes.data
+        self._routes = np.zeros(MAX_COMPILED, kernel.ROUTE)
+        self._frames, self._sizes = (self._routes[name].data for name in ("frames", "frames_size"))
         self._used = 0
         self._free: list[int] = []
         """Rows of the routes used before that are free."""
-        self._failed = np.zeros((step.MAX_FAILED, step.FAILED_WORDS), np.int64)
-        records = np.zeros(step.READS * step.MAX_RECORD, np.uint8)
-        self._newest = np.zeros((MAX_COMPILED, step.MAX_FRAME), np.uint8)
-        memory = (
-            *(buffer, received, self._outbox.words, self._table, self._failed),
-            *(records, self._routes, self._newest),
-        )
-        work = np.zeros(step.WORDS, np.int64)
-        work[step.MOST] = len(buffer)
-        work[step.BUFFER_AT :] = [address_of(each) for each in memory]
-        self.work: Words = work.data
-        self._work_at = address_of(work)
-        self._buffer, self._lengths, self._records = buffer.data, received[:, LENGTH], records.data
-        self._kept = (*memory, places)
-        self._record = step.record.bound(self._work_at) if self.is_compiled else None
+        self._failed = (kernel.Failure * kernel.MAX_FAILED)()  # type: ignore[operator]
+        records = np.zeros(kernel.READS * kernel.MAX_RECORD, np.uint8)
+        self._newest = np.zeros((MAX_COMPILED, kernel.MAX_FRAME), np.uint8)
+        memory = {
+            "buffer_at": buffer, "headers_at": received, "outbox_at": self._outbox.state,
+            "table_at": self._table, "failed_at": self._failed, "records_at": records,
+            "routes_at": self._routes, "newest_at": self._newest,
+        }  # fmt: skip
+        self.work = work = kernel.Work()
+        work.most = len(buffer)
+        for name, part in memory.items():
+            setattr(work, name, address_of(part))
+        self._buffer, self._lengths, self._records = buffer.data, received["length"], records.data
+        self._kept = (memory, parts)
+        self._record = kernel.record.bound(address_of(work)) if self.is_compiled else None
 
-    def step(self, client: Words, *, reads: bool) -> Callable[[], None]:
+    def step(self, client: kernel.ClientState, *, reads: bool) -> Callable[[], None]:
         """Return a client's step: one that receives first, or one that continues a read."""
         if not self.is_compiled:
             return lambda: None
-        return step.forward.bound(self._work_at, address_of(client), int(reads))
+        return kernel.forward.bound(address_of(self.work), address_of(client), int(reads))
 
     def enter(
         self, client_id: int, key: bytes, seed: int, targets_at: int, stream_at: int, heard_at: int
@@ -92,108 +90,107 @@ class Forwarding:
             row, self._used = self._used, self._used + 1
         self._routes[row] = seed, targets_at, stream_at, heard_at, 0, 0, 0, 0
         number = int.from_bytes(key, "little")
-        entry = step.entry_of(client_id, number)
+        entry = kernel.entry_of(client_id, number)
         while entry in self._filled:
-            entry = (entry + 1) % step.ENTRIES
+            entry = (entry + 1) % kernel.ENTRIES
         self._filled.add(entry)
-        self._table[entry] = client_id, number, address_of(self._routes[row])
+        route_at = self.work.routes_at + row * kernel.ROUTE.itemsize
+        self._table[entry] = client_id, number, route_at
         return row
 
     def leave(self, client_id: int, key: bytes, row: int) -> None:
         """Remove a route; the entries after it move up, since a search ends at the first gap."""
         number, table = int.from_bytes(key, "little"), self._table
-        gap = step.entry_of(client_id, number)
-        while (table[gap, step.KEY_CLIENT], table[gap, step.KEY]) != (client_id, number):
-            gap = (gap + 1) % step.ENTRIES
+        gap = kernel.entry_of(client_id, number)
+        while (table[gap].client_id, table[gap].key) != (client_id, number):
+            gap = (gap + 1) % kernel.ENTRIES
         entry = gap
-        while (entry := (entry + 1) % step.ENTRIES) in self._filled:
-            begin = step.entry_of(*map(int, table[entry, : step.ROUTE_AT]))
-            if (entry - begin) % step.ENTRIES >= (entry - gap) % step.ENTRIES:
+        while (entry := (entry + 1) % kernel.ENTRIES) in self._filled:
+            begin = kernel.entry_of(int(table[entry].client_id), int(table[entry].key))
+            if (entry - begin) % kernel.ENTRIES >= (entry - gap) % kernel.ENTRIES:
                 table[gap] = table[entry]
                 gap = entry
-        table[gap, step.KEY_CLIENT] = 0
+        table[gap].client_id = 0
         self._filled.discard(gap)
-        self._routes[row, step.NEWEST_SIZE] = 0
+        self._routes[row].newest_size = 0
         self._free.append(row)
 
     def settle(self, row: int) -> tuple[int, int]:
         """Return the frames and bytes of a route since the last call."""
-        words = self._route_words
-        frames = words[row, step.FRAMES]
-        if not frames:
+        if not (frames := self._frames[row]):
             return 0, 0
-        size = words[row, step.SIZE]
-        words[row, step.FRAMES] = words[row, step.SIZE] = 0
+        size = self._sizes[row]
+        self._frames[row] = self._sizes[row] = 0
         return frames, size
 
     def newest(self) -> list[tuple[bytes, int]]:
         """Return the newest frame of each route that had one since the last call, and its time."""
-        routes, found = self._routes[: self._used], []
-        for row in np.flatnonzero(routes[:, step.NEWEST_SIZE]).tolist():
-            size, time_us = routes[row, step.NEWEST_SIZE :].tolist()
-            found.append((self._newest[row, :size].tobytes(), time_us))
-        routes[:, step.NEWEST_SIZE] = 0
-        return found
+        routes = self._routes[: self._used]
+        rows = np.flatnonzero(routes["newest_size"])
+        sizes, times_us = (routes[name][rows].tolist() for name in ("newest_size", "newest_us"))
+        found = [self._newest[row, :size].tobytes() for row, size in zip(rows, sizes, strict=True)]
+        routes["newest_size"] = 0
+        return [*zip(found, times_us, strict=True)]
 
     def clear(self) -> None:
         """Discard all routes."""
         if self._filled:
-            self._table[list(self._filled), step.KEY_CLIENT] = 0
+            self._table["client_id"][list(self._filled)] = 0
             self._filled.clear()
         self._used = 0
         self._free.clear()
 
     def records(self, first_us: int, step_us: int) -> bytes:
-        """Return the frames of the run as in a tlog, with the time of the first and the step."""
+        """Return the frames of the run as in a tlog, with the time of the first and the kernel."""
         if self._record is None:
             return b""
         work = self.work
-        work[step.TIME_US], work[step.TIME_STEP] = first_us, step_us
+        work.time_us, work.time_step = first_us, step_us
         self._record()
-        return bytes(self._records[: work[step.RECORDS_SIZE]])
+        return bytes(self._records[: work.records_size])
 
     @property
     def run_length(self) -> int:
         """The number of frames of the run."""
-        return int(self._outbox.words[PARTS])
+        return int(self._outbox.state.parts)
 
     def load(self, data: bytes, now_us: int) -> None:
         """Load a chunk of a stream, of at most 256 kB, as if the step had received it."""
         self._buffer[: len(data)] = data
         self._lengths[0] = len(data)
         work = self.work
-        work[step.NOW_US] = now_us
-        work[step.COUNT] = 1
-        work[step.AT] = work[step.OFFSET] = work[step.TAKEN] = 0
+        work.now_us = now_us
+        work.count = 1
+        work.at = work.offset = work.taken = 0
 
     def run(self) -> list[bytes]:
         """Return the frames of the run."""
-        buffer, begin = self._buffer, self.work[step.BUFFER_AT]
-        parts = self._outbox.parts[: self._outbox.words[PARTS]].tolist()
+        buffer, begin = self._buffer, self.work.buffer_at
+        parts = self._outbox.parts[: self._outbox.state.parts].tolist()
         return [bytes(buffer[at - begin : at - begin + size]) for at, size in parts]
 
-    def failures(self) -> list[list[int]]:
-        """Return the clients that did not get the whole run, as in `forwarding_step.FAILED`."""
-        found: list[list[int]] = self._failed[: self.work[step.FAILED]].tolist()
+    def failures(self) -> list[kernel.Failure]:
+        """Return the clients that did not get the whole run."""
+        found: list[kernel.Failure] = self._failed[: self.work.failed]
         return found
 
     def rest(self) -> bytes:
         """Return the rest of the present datagram."""
-        at, offset = self.work[step.AT], self.work[step.OFFSET]
-        begin = at * step.MAX_DATAGRAM
+        at, offset = self.work.at, self.work.offset
+        begin = at * kernel.MAX_DATAGRAM
         return bytes(self._buffer[begin + offset : begin + int(self._lengths[at])])
 
     def skip(self) -> None:
         """Go on to the next datagram."""
         work = self.work
-        work[step.TAKEN] += int(self._lengths[work[step.AT]])
-        work[step.AT] += 1
-        work[step.OFFSET] = 0
+        work.taken += int(self._lengths[work.at])
+        work.at += 1
+        work.offset = 0
 
     def unread(self) -> list[bytes]:
         """Return the datagrams that are left, and skip them."""
         found = []
-        while self.work[step.AT] < self.work[step.COUNT]:
+        while self.work.at < self.work.count:
             found.append(self.rest())
             self.skip()
         return found

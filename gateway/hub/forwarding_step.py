@@ -22,22 +22,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from gateway.compiled import array_at, compiled
+from gateway.compiled import array_at, compiled, layout_of, record_at, shared
 from gateway.compiled.entry_point import EntryPoint
-from gateway.compiled.messages import (
-    FLAGS,
-    HEADER_WORDS,
-    LAST_SIZE,
-    LENGTH,
-    OUTBOX_WORDS,
-    PARTS,
-    PARTS_AT,
-    ROOM,
-    group,
-    send_parts,
-)
+from gateway.compiled.messages import HEADER, OUTBOX, PART, ROOM, group, send_parts
 from gateway.compiled.system_calls import MSG_TRUNC, receive_many
-from gateway.hub.stream_words import ACCEPTED, HALF, LAST, LEADER, LOST, NEWEST_US, STREAM_WORDS
+from gateway.hub.frame_stream import STREAM, count_sequence
 from gateway.wire.frame_scan import SEQUENCE, TIME_SIZE, frame_holds, frame_key, frame_size
 
 MAX_DATAGRAM: Final = 4096
@@ -46,43 +35,11 @@ packet, at most some 2000 bytes."""
 READS: Final = ROOM
 """Maximum datagrams of a read, and maximum frames of a run."""
 HAND_OVER, RUN_SENT, ERROR, UNREAD = 1, 2, 4, 8
-
-STATUS, NOW_US, MOST, IS_OBSERVED, COUNT, AT, OFFSET, TAKEN, READ, ERROR_NUMBER = range(10)
-"""Words of the state of a step: its result and the time; maximum bytes of a read, and whether
-Python gets each run; the number of datagrams, the present one and the offset in it; bytes
-processed and read; the number of an error."""
-FRAME, TARGETS, RUN_SIZE, FAILED, TIME_US, TIME_STEP, RECORDS_SIZE = range(10, 17)
-"""Size of the frame that is passed to Python, if it is one; the address of the targets of the run,
-its bytes, and the number of failed targets; the time of its first record, and between two, and the
-bytes of all."""
-BUFFER_AT, HEADERS_AT, OUTBOX_AT, TABLE_AT, FAILED_AT = range(17, 22)
-RECORDS_AT, ROUTES_AT, NEWEST_AT = range(22, 25)
-"""Addresses of the other memory; `NEWEST_AT` is that of the newest frame of each route."""
-WORDS: Final = 25
-CLIENT_ID, INPUT, OUTPUT, WAY, IS_PLAIN, LARGEST, CUT, RECEIVED, RECEIVED_SIZE, HEARD_US = range(10)
-"""Words of a client: its id; the files to receive from and to send to, or -1, and the mode of
-sending; whether its frames may be forwarded without Python; the size of its largest recent
-datagram; datagrams that were cut, frames and bytes that were forwarded, time of the last one."""
-CLIENT_WORDS: Final = 10
-SEED, TARGETS_OF, STREAM_AT, HEARD_AT, FRAMES, SIZE, NEWEST_SIZE, ROUTE_US = range(8)
-"""Words of a route: seed of the checksum, addresses of its targets, of the stream of its system and
-of the time when the system was received last; numbers of frames and bytes; size and time of the
-newest frame."""
-ROUTE_WORDS: Final = 8
-TARGET_COUNT, HAS_OTHERS, SENT, SENT_SIZE, FIRST_TARGET = range(5)
-"""Words of targets: number of clients, whether Python serves others, frames and bytes sent to each,
-address of the first."""
-KEY_CLIENT, KEY, ROUTE_AT = range(3)
-"""Words of an entry of the table."""
 ENTRIES: Final = 65_536
 MAX_FRAME: Final = 280
 MAX_RECORD: Final = TIME_SIZE + MAX_FRAME
 """Maximum sizes of a frame, and of one with its time, bytes."""
-FAILED_WORDS: Final = 4
-"""Words of a failed client: index among the targets, number of frames sent, number of the error,
-and bytes of the next frame that were sent."""
 MAX_FAILED: Final = 4096
-
 _INT: Final = np.dtype(np.int64)
 _BYTE: Final = np.dtype(np.uint8)
 _LOW_KEY: Final = (1 << 24) - 1
@@ -91,74 +48,202 @@ _FACTORS: Final = (0x9E3779, 0x85EBCB, 0xC2B2AF)
 _LEAST_DATAGRAM: Final = 32
 
 
+@shared
+class Work:
+    """State of a step, and the addresses of the other memory."""
+
+    status: int
+    now_us: int
+    most: int
+    """Maximum bytes of a read."""
+    is_observed: int
+    """Whether Python gets each run."""
+    count: int
+    """Datagrams that were read."""
+    at: int
+    """The present one of them."""
+    offset: int
+    """Offset in it."""
+    taken: int
+    """Bytes that were processed."""
+    read: int
+    """Bytes that were read."""
+    error_number: int
+    frame: int
+    """Size of the frame that is passed to Python, if it is one."""
+    targets: int
+    """Address of the targets of the run."""
+    run_size: int
+    failed: int
+    """Number of clients that did not get the whole run."""
+    time_us: int
+    """Time of the run's first record."""
+    time_step: int
+    """Time between two records, us."""
+    records_size: int
+    buffer_at: int
+    headers_at: int
+    outbox_at: int
+    table_at: int
+    failed_at: int
+    records_at: int
+    routes_at: int
+    newest_at: int
+    """Address of the newest frame of each route."""
+
+
+@shared
+class ClientState:
+    """State of a client in the step; its files are -1 if it has none."""
+
+    id: int
+    input: int
+    """File to receive from."""
+    output: int
+    """File to send to."""
+    way: int
+    """Mode of sending."""
+    is_plain: int
+    """Whether its frames may be forwarded without Python."""
+    largest: int
+    """Size of its largest recent datagram."""
+    cut: int
+    """Datagrams that were longer than a read."""
+    received: int
+    """Frames that were forwarded."""
+    received_size: int
+    heard_us: int
+    """Time of the last one."""
+
+
+@shared
+class RouteState:
+    """A route: the seed of its checksum, its targets, its system, and what was forwarded."""
+
+    seed: int
+    targets_at: int
+    stream_at: int
+    heard_at: int
+    """Address of the time when the system was received last."""
+    frames: int
+    frames_size: int
+    newest_size: int
+    newest_us: int
+
+
+@shared
+class TargetCounts:
+    """Head of the memory of targets; the addresses of the clients follow."""
+
+    clients: int
+    has_others: int
+    """Whether Python serves others."""
+    sent: int
+    """Frames sent to each."""
+    sent_size: int
+
+
+@shared
+class Failure:
+    """A client that did not get the whole run."""
+
+    index: int
+    """Among the targets."""
+    sent: int
+    """Frames sent."""
+    number: int
+    """Number of the error."""
+    part: int
+    """Bytes of the next frame that were sent."""
+
+
+@shared
+class Entry:
+    """An entry of the table of routes."""
+
+    client_id: int
+    key: int
+    route_at: int
+
+
+WORK: Final = layout_of(Work)
+CLIENT: Final = layout_of(ClientState)
+ROUTE: Final = layout_of(RouteState)
+TARGETS: Final = layout_of(TargetCounts)
+FAILURE: Final = layout_of(Failure)
+ENTRY: Final = layout_of(Entry)
+_ROUTE_SIZE: Final = ROUTE.itemsize
+_TARGETS_SIZE: Final = TARGETS.itemsize
+
+
 @EntryPoint
 def forward(work_at: int, client_at: int, reads: int) -> None:
     """Receive if `reads`, and forward up to the first bytes that need Python."""
-    work = array_at(work_at, (WORDS,), _INT)
-    client = array_at(client_at, (CLIENT_WORDS,), _INT)
-    headers = array_at(work[HEADERS_AT], (READS, HEADER_WORDS), _INT)
-    outbox = array_at(work[OUTBOX_AT], (OUTBOX_WORDS,), _INT)
-    work[STATUS] = work[FAILED] = outbox[PARTS] = 0
+    work = record_at(work_at, WORK)
+    client = record_at(client_at, CLIENT)
+    headers = array_at(work.headers_at, (READS,), HEADER)
+    outbox = record_at(work.outbox_at, OUTBOX)
+    work.status = work.failed = outbox.parts = 0
     if reads:
         _receive(work, client, headers)
     _walk(work, client, headers, outbox)
-    if not work[STATUS] & RUN_SENT:
+    if not work.status & RUN_SENT:
         _send_run(work, outbox)
-    if work[AT] < work[COUNT]:
-        work[STATUS] |= UNREAD
+    if work.at < work.count:
+        work.status |= UNREAD
 
 
 @compiled
 def _receive(work: Any, client: Any, headers: Any) -> None:
     """Receive about as many datagrams as `MOST` allows."""
-    work[AT] = work[OFFSET] = work[COUNT] = work[TAKEN] = work[READ] = 0
-    count = min(READS, max(1, (work[MOST] + client[LARGEST] - 1) // client[LARGEST]))
-    count = receive_many(client[INPUT], work[HEADERS_AT], count)
+    work.at = work.offset = work.count = work.taken = work.read = 0
+    count = min(READS, max(1, (work.most + client.largest - 1) // client.largest))
+    count = receive_many(client.input, work.headers_at, count)
     if count < 0:
         if count != -errno.EAGAIN:
-            work[STATUS], work[ERROR_NUMBER] = ERROR, -count
+            work.status, work.error_number = ERROR, -count
         return
-    work[COUNT] = count
+    work.count = count
     # The size decreases slowly, so that a mixture of sizes is not underestimated.
-    largest = max(_LEAST_DATAGRAM, client[LARGEST] - client[LARGEST] // 4)
+    largest = max(_LEAST_DATAGRAM, client.largest - client.largest // 4)
     for k in range(count):
-        work[READ] += headers[k, LENGTH]
-        largest = max(largest, headers[k, LENGTH])
-        if headers[k, FLAGS] & MSG_TRUNC:
-            client[CUT] += 1
-    client[LARGEST] = largest
+        work.read += headers[k].length
+        largest = max(largest, headers[k].length)
+        if headers[k].received_flags & MSG_TRUNC:
+            client.cut += 1
+    client.largest = largest
 
 
 @compiled
 def _walk(work: Any, client: Any, headers: Any, outbox: Any) -> None:
     """Gather runs and send all but the last, up to the first bytes that need Python."""
-    data = array_at(work[BUFFER_AT], (READS * MAX_DATAGRAM,), _BYTE)
-    while work[AT] < work[COUNT] and work[TAKEN] < work[MOST]:
-        begin = work[AT] * MAX_DATAGRAM + work[OFFSET]
-        end = work[AT] * MAX_DATAGRAM + headers[work[AT], LENGTH]
+    data = array_at(work.buffer_at, (READS * MAX_DATAGRAM,), _BYTE)
+    while work.at < work.count and work.taken < work.most:
+        begin = work.at * MAX_DATAGRAM + work.offset
+        end = work.at * MAX_DATAGRAM + headers[work.at].length
         while begin < end:
             size = frame_size(data, begin, end)
-            found = _route_of(work, client, data, begin) if size and client[IS_PLAIN] else 0
+            found = _route_of(work, client, data, begin) if size and client.is_plain else 0
             if found == 0:
-                work[FRAME] = size
-                work[STATUS] |= HAND_OVER
+                work.frame = size
+                work.status |= HAND_OVER
                 return
-            route = array_at(found, (ROUTE_WORDS,), _INT)
-            if not frame_holds(data, begin, route[SEED]):
-                work[FRAME] = 0
-                work[STATUS] |= HAND_OVER
+            route = record_at(found, ROUTE)
+            if not frame_holds(data, begin, route.seed):
+                work.frame = 0
+                work.status |= HAND_OVER
                 return
-            if outbox[PARTS] == READS or route[TARGETS_OF] != work[TARGETS]:
+            if outbox.parts == READS or route.targets_at != work.targets:
                 _send_run(work, outbox)
-                if work[STATUS] & RUN_SENT:
+                if work.status & RUN_SENT:
                     return
             _gather(work, client, outbox, route, data, begin, size)
             _keep(work, found, route, data, begin, size)
             begin += size
-            work[OFFSET] += size
-        work[TAKEN] += headers[work[AT], LENGTH]
-        work[AT] += 1
-        work[OFFSET] = 0
+            work.offset += size
+        work.taken += headers[work.at].length
+        work.at += 1
+        work.offset = 0
 
 
 @compiled
@@ -173,35 +258,23 @@ def entry_of(client_id: int, key: int) -> int:
 def _route_of(work: Any, client: Any, data: Any, begin: int) -> int:
     """Return the address of the route of a frame, or 0."""
     key = frame_key(data, begin)
-    table = array_at(work[TABLE_AT], (ENTRIES, 3), _INT)
-    entry = entry_of(client[CLIENT_ID], key)
-    while table[entry, KEY_CLIENT]:
-        if table[entry, KEY] == key and table[entry, KEY_CLIENT] == client[CLIENT_ID]:
-            return int(table[entry, ROUTE_AT])
+    table = array_at(work.table_at, (ENTRIES,), ENTRY)
+    entry = entry_of(client.id, key)
+    while table[entry].client_id:
+        if table[entry].key == key and table[entry].client_id == client.id:
+            return int(table[entry].route_at)
         entry = (entry + 1) % ENTRIES
     return 0
 
 
 @compiled
-def count_sequence(stream: Any, sequence: int) -> None:
-    """Count an accepted frame of a stream, and those lost before it."""
-    ahead = (sequence - stream[LAST]) & 0xFF
-    if stream[ACCEPTED] == 0:
-        stream[LAST] = sequence
-    elif 0 < ahead < HALF:
-        stream[LOST] += ahead - 1
-        stream[LAST] = sequence
-    stream[ACCEPTED] += 1
-
-
-@compiled
 def _keep(work: Any, route_at: int, route: Any, data: Any, begin: int, size: int) -> None:
     """Keep a frame as the newest of its route."""
-    row = (route_at - work[ROUTES_AT]) // (8 * ROUTE_WORDS)
-    newest = array_at(work[NEWEST_AT] + row * MAX_FRAME, (MAX_FRAME,), _BYTE)
+    row = (route_at - work.routes_at) // _ROUTE_SIZE
+    newest = array_at(work.newest_at + row * MAX_FRAME, (MAX_FRAME,), _BYTE)
     for i in range(size):
         newest[i] = data[begin + i]
-    route[NEWEST_SIZE], route[ROUTE_US] = size, work[NOW_US]
+    route.newest_size, route.newest_us = size, work.now_us
 
 
 @compiled
@@ -209,66 +282,67 @@ def _gather(
     work: Any, client: Any, outbox: Any, route: Any, data: Any, begin: int, size: int
 ) -> None:
     """Add a frame to the run, and count it."""
-    parts = array_at(outbox[PARTS_AT], (READS, 2), _INT)
-    parts[outbox[PARTS], 0], parts[outbox[PARTS], 1] = work[BUFFER_AT] + begin, size
-    outbox[PARTS] += 1
-    work[TARGETS] = route[TARGETS_OF]
-    work[RUN_SIZE] += size
-    stream = array_at(route[STREAM_AT], (STREAM_WORDS,), _INT)
+    parts = array_at(outbox.parts_at, (READS,), PART)
+    part = parts[outbox.parts]
+    part.at, part.length = work.buffer_at + begin, size
+    outbox.parts += 1
+    work.targets = route.targets_at
+    work.run_size += size
+    stream = record_at(route.stream_at, STREAM)
     count_sequence(stream, int(data[begin + SEQUENCE]))
-    stream[data[begin + SEQUENCE]] = stream[NEWEST_US] = work[NOW_US]
-    stream[LEADER] = client[CLIENT_ID]
-    heard = array_at(route[HEARD_AT], (1,), _INT)
-    heard[0] = client[HEARD_US] = work[NOW_US]
-    client[RECEIVED] += 1
-    client[RECEIVED_SIZE] += size
-    route[FRAMES] += 1
-    route[SIZE] += size
+    stream.sent_us[data[begin + SEQUENCE]] = stream.newest_us = work.now_us
+    stream.leader = client.id
+    heard = array_at(route.heard_at, (1,), _INT)
+    heard[0] = client.heard_us = work.now_us
+    client.received += 1
+    client.received_size += size
+    route.frames += 1
+    route.frames_size += size
 
 
 @compiled
 def _send_run(work: Any, outbox: Any) -> None:
     """Send the run to its clients, and discard it unless Python must process it further."""
-    if outbox[PARTS] == 0:
+    if outbox.parts == 0:
         return
-    count = array_at(work[TARGETS], (1,), _INT)[TARGET_COUNT]
-    targets = array_at(work[TARGETS], (FIRST_TARGET + count,), _INT)
-    failed = array_at(work[FAILED_AT], (MAX_FAILED, FAILED_WORDS), _INT)
+    targets = record_at(work.targets, TARGETS)
+    clients = array_at(work.targets + _TARGETS_SIZE, (targets.clients,), _INT)
+    failed = array_at(work.failed_at, (MAX_FAILED,), FAILURE)
     group(outbox)
-    for k in range(count):
-        client = array_at(targets[FIRST_TARGET + k], (CLIENT_WORDS,), _INT)
-        outbox[LAST_SIZE] = 0
-        sent = send_parts(outbox, client[OUTPUT], client[WAY]) if client[OUTPUT] >= 0 else 0
-        if sent < outbox[PARTS]:
-            row = work[FAILED]
-            failed[row, 0], failed[row, 1] = k, max(sent, 0)
-            failed[row, 2], failed[row, 3] = max(-sent, 0), outbox[LAST_SIZE]
-            work[FAILED] += 1
-    targets[SENT] += outbox[PARTS]
-    targets[SENT_SIZE] += work[RUN_SIZE]
-    work[RUN_SIZE] = 0
-    if work[FAILED] or targets[HAS_OTHERS] or work[IS_OBSERVED]:
-        work[STATUS] |= RUN_SENT
+    for k in range(targets.clients):
+        client = record_at(clients[k], CLIENT)
+        outbox.last_size = 0
+        sent = send_parts(outbox, client.output, client.way) if client.output >= 0 else 0
+        if sent < outbox.parts:
+            failure = failed[work.failed]
+            failure.index, failure.sent = k, max(sent, 0)
+            failure.number, failure.part = max(-sent, 0), outbox.last_size
+            work.failed += 1
+    targets.sent += outbox.parts
+    targets.sent_size += work.run_size
+    work.run_size = 0
+    if work.failed or targets.has_others or work.is_observed:
+        work.status |= RUN_SENT
     else:
-        outbox[PARTS] = 0
+        outbox.parts = 0
 
 
 @EntryPoint
 def record(work_at: int) -> None:
     """Write the frames of the run one after the other, each behind its time, as in a tlog."""
-    work = array_at(work_at, (WORDS,), _INT)
-    outbox = array_at(work[OUTBOX_AT], (OUTBOX_WORDS,), _INT)
-    parts = array_at(outbox[PARTS_AT], (READS, 2), _INT)
-    data = array_at(work[BUFFER_AT], (READS * MAX_DATAGRAM,), _BYTE)
-    records = array_at(work[RECORDS_AT], (READS * MAX_RECORD,), _BYTE)
-    end, time_us = 0, work[TIME_US]
-    for k in range(outbox[PARTS]):
+    work = record_at(work_at, WORK)
+    outbox = record_at(work.outbox_at, OUTBOX)
+    parts = array_at(outbox.parts_at, (READS,), PART)
+    data = array_at(work.buffer_at, (READS * MAX_DATAGRAM,), _BYTE)
+    records = array_at(work.records_at, (READS * MAX_RECORD,), _BYTE)
+    end, time_us = 0, work.time_us
+    for k in range(outbox.parts):
         for i in range(TIME_SIZE):
             records[end + i] = time_us >> 8 * (TIME_SIZE - 1 - i) & 0xFF
         end += TIME_SIZE
-        begin = parts[k, 0] - work[BUFFER_AT]
-        for i in range(parts[k, 1]):
+        begin = parts[k].at - work.buffer_at
+        for i in range(parts[k].length):
             records[end + i] = data[begin + i]
-        end += parts[k, 1]
-        time_us += work[TIME_STEP]
-    work[RECORDS_SIZE] = end
+        end += parts[k].length
+        time_us += work.time_step
+    work.records_size = end

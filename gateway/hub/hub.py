@@ -14,11 +14,14 @@ import msgspec
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout, OnRun
 from gateway.hub.forwarding import Forwarding
-from gateway.hub.forwarding_step import MOST
+from gateway.hub.frame_stream import FrameStream
+from gateway.hub.numbering import Numbering
+from gateway.hub.own_vehicles import OwnVehicles
 from gateway.hub.round_trip import RoundTrip
+from gateway.hub.route import OnForeign
 from gateway.hub.router import Router
-from gateway.hub.routing_table import FrameStream, Origin, OwnVehicles
-from gateway.hub.send_queue import NOT_TELEMETRY_IDS, Numbering
+from gateway.hub.routing_table import Origin
+from gateway.hub.send_queue import NOT_TELEMETRY_IDS
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import (
     ClientAlerts,
@@ -33,9 +36,8 @@ from gateway.hub.transports.base import (
     UNTRUSTED_READ_BURST,
     UNTRUSTED_READ_RATE,
     Client,
-    Listener,
-    OnForeign,
 )
+from gateway.hub.transports.listener import Listener
 from gateway.hub.transports.registry import CLIENTS, LISTENERS
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.token_bucket import TokenBucket
@@ -365,7 +367,7 @@ class Hub:
         """Read the fewer bytes at one wake-up the more clients may get them."""
         fair = PASSED_ON_BYTES // max(len(self._clients), 1)
         self.read_bytes = min(max(fair, LEAST_READ_BYTES), READ_BYTES)
-        self.forwarding.work[MOST] = self.read_bytes
+        self.forwarding.work.most = self.read_bytes
 
     def new_client_id(self) -> int:
         """Return an id that no client had before."""

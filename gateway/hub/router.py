@@ -13,24 +13,17 @@ from typing import Final
 from pymavlink.dialects.v20 import all as dialect
 
 from gateway.answers.answer_cache import AnswerCache
+from gateway.hub.duplicates import LATE, NEW, DuplicateFilter, FrameMemory
 from gateway.hub.fanout import Fanout
 from gateway.hub.limits import RequestQueue
+from gateway.hub.own_vehicles import OwnVehicles
+from gateway.hub.redundant_links import RedundantLinks
 from gateway.hub.round_trip import MAX_ASKED, NOBODY, RoundTrip, is_of_gateway
-from gateway.hub.routing_table import (
-    LATE,
-    MEMORY_US,
-    NEW,
-    DuplicateFilter,
-    FrameMemory,
-    Origin,
-    OwnVehicles,
-    RedundantLinks,
-    RoutingTable,
-    SystemPath,
-)
+from gateway.hub.route import OnForeign
+from gateway.hub.routing_table import MEMORY_US, Origin, RoutingTable, SystemPath
 from gateway.hub.stats import HubCounters
 from gateway.hub.systems import Reach
-from gateway.hub.transports.base import Client, HubContext, OnForeign
+from gateway.hub.transports.base import Client, HubContext
 from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import HEARTBEAT_ID, TARGET_OFFSETS
@@ -397,8 +390,7 @@ class Router:
             clients = self._table.clients_with_vehicles(client.client_id)
             self._fanout.deliver(frame, [*filter(reaches, clients)], client.client_id)
             return
-        source_id, key = client.client_id, frame.key
-        route = self._fanout.others.get((source_id, key))
+        route = client.routes.get(frame.key)
         if route is None:
             path = path or SystemPath(now_us)
             is_shared = self._table.is_shared(frame.origin, now_us)
@@ -406,10 +398,8 @@ class Router:
             route = self._fanout.make_route(frame, client, path, rejects, reaches)
             is_kept = client.endpoint.cache and self._cache.reads(message_id)
             is_plain = self._rejects is None or not client.may_return
-            if telemetry and is_plain and not is_kept:
-                self._fanout.keep_route(route, client, key)
-            else:
-                self._fanout.keep_other(route, client, key)
+            is_examined = not (telemetry and is_plain) or is_kept
+            self._fanout.keep_route(route, client, frame.key, is_examined=bool(is_examined))
         route.forward(frame, now_us, is_checked=True)
 
     def _count(self, frame: MavFrame) -> None:

@@ -119,7 +119,7 @@ class ControlServer:
         except OSError as error:
             raise ControlError(f"control socket {self.path}: {error.strerror}") from error
         # Imported here and below: clients do not need it, and it takes half of a command's start.
-        from gateway.hub.transports.stream import accept_each
+        from gateway.hub.transports.sockets import accept_each
 
         accept_each(self._socket, self._on_connection, self._report)
 

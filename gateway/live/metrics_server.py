@@ -10,7 +10,7 @@ from typing import Final
 
 from gateway.hub.endpoint import names_loopback
 from gateway.hub.stats import ListenerStats
-from gateway.hub.transports.stream import accept_each
+from gateway.hub.transports.sockets import accept_each
 from gateway.printable import reason_of
 
 log = logging.getLogger(__name__)

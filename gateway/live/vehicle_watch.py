@@ -12,7 +12,8 @@ from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.hub.routing_table import FrameStream, Origin
+from gateway.hub.frame_stream import FrameStream
+from gateway.hub.routing_table import Origin
 from gateway.hub.stats import ClientStats
 from gateway.live.session import VehicleLocations
 from gateway.units import US_PER_S

@@ -16,7 +16,7 @@ from typing import Any, Final
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from gateway.hub.transports.stream import accept_each
+from gateway.hub.transports.sockets import accept_each
 from gateway.panel.admission import Holder, Places, address_group
 
 log = logging.getLogger(__name__)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from gateway.hub.transports import stream as accepting
-from gateway.hub.transports.stream import accept_each
+from gateway.hub.transports import sockets as accepting
+from gateway.hub.transports.sockets import accept_each
 from gateway.live.control_socket import ControlServer
 from gateway.live.metrics_server import MetricsServer
 from tests.kit.hub import no_descriptors, receive

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.hub.bandwidth import FLOOR_HZ, HIGH_LATENCY2, NEVER_THINNED, Bandwidth, Offered
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout
 from gateway.hub.routing_table import SystemPath
-from gateway.hub.send_queue import FLOOR_HZ, HIGH_LATENCY2, NEVER_THINNED, Bandwidth
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
@@ -197,7 +197,7 @@ def test_any_load_is_planned_so_that_it_fits_or_nothing_starves(
 ) -> None:
     bandwidth = Bandwidth(budget)
     offered = {
-        message_id.to_bytes(5, "big"): (message_id, frames, frames * size)
+        message_id.to_bytes(5, "big"): Offered(message_id, frames, frames * size)
         for message_id, (frames, size) in kinds.items()
     }
     bandwidth.plan(offered, answered, 1.0)

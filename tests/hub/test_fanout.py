@@ -3,15 +3,13 @@
 import itertools
 from random import Random
 
-import numpy as np
 import pytest
 
-from gateway.compiled import address_of
 from gateway.hub.fanout import Fanout
 from gateway.hub.forwarding import Forwarding
-from gateway.hub.forwarding_step import HAND_OVER, IS_PLAIN, RUN_SENT, STATUS, _route_of
+from gateway.hub.forwarding_step import HAND_OVER, RUN_SENT, ClientState, _route_of
+from gateway.hub.route import Route
 from gateway.hub.routing_table import SystemPath
-from gateway.hub.transports.base import Route
 from gateway.records import ClientInterval
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
@@ -253,12 +251,13 @@ def test_compiled_step_finds_the_routes_that_have_not_left(seed: int) -> None:
             assert row is not None
             known[client_id, key] = row
     assert sorted(known.values()) == sorted(set(known.values()))
-    data = np.zeros(12, np.uint8)
     for client_id, key in kinds:
-        data[5:10] = list(key)
-        found = _route_of(forwarding.work.obj, [client_id], data, 0)
+        state, data = ClientState(), bytes(5) + key
+        state.id = client_id
+        found = _route_of(forwarding.work, state, data, 0)
         row = known.get((client_id, key))
-        assert found == (0 if row is None else address_of(forwarding._routes[row]))
+        first, size = forwarding.work.routes_at, forwarding._routes.itemsize
+        assert found == (0 if row is None else first + row * size)
 
 
 def test_plan_of_a_bandwidth_changes_limits_and_no_routes(fanout: Fanout, vehicle: Sender) -> None:
@@ -283,16 +282,16 @@ def test_frames_of_the_compiled_step_are_counted_when_their_route_is_settled(
     frames = [vehicle.attitude() for _ in range(3)]
     route = fanout.make_route(frame_of(frames[0]), source, path, None)
     fanout.keep_route(route, source, frame_of(frames[0]).key)
-    source.words[IS_PLAIN] = 1
-    step = forwarding.step(source.words, reads=False)
+    source.memory.is_plain = 1
+    step = forwarding.step(source.memory, reads=False)
     for now_us, frame in enumerate(frames, start=70):
         forwarding.load(frame, now_us)
         step()
-        assert forwarding.work[STATUS] == RUN_SENT
+        assert forwarding.work.status == RUN_SENT
         fanout.finish_run(now_us)
     forwarding.load(frames[0][:-1] + b"?", 99)
     step()
-    assert forwarding.work[STATUS] & HAND_OVER
+    assert forwarding.work.status & HAND_OVER
     assert peer.frames == frames
     assert route.settle(forwarding) == (3, sum(map(len, frames)))
     assert route.settle(forwarding) == (0, 0)
@@ -301,4 +300,4 @@ def test_frames_of_the_compiled_step_are_counted_when_their_route_is_settled(
     assert (peer.counters.sent, source.counters.received) == (3, 3)
     stream = path.stream
     assert (path.heard_us, stream.count, stream.newest_us, stream.leader) == (72, 3, 72, 2)
-    assert list(stream.words[:3]) == [70, 71, 72]
+    assert stream.sent_us[:3] == [70, 71, 72]

@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.hub.round_trip import PROBE_COMPONENT
-from gateway.hub.transports import stream
+from gateway.hub.transports import sockets
 from gateway.hub.transports.base import STALE_AFTER_US
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
@@ -292,7 +292,7 @@ class TestListeningPorts:
     async def test_clients_are_admitted_once_descriptors_are_free_again(
         self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(stream, "ACCEPT_AGAIN_S", 0.001)
+        monkeypatch.setattr(sockets, "ACCEPT_AGAIN_S", 0.001)
         hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
         (port,) = hub.listening_ports()
         caller = rig.station(port, socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)

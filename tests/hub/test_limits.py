@@ -14,8 +14,9 @@ from gateway.hub.limits import (
     UNTRUSTED_RATE,
     RequestQueue,
 )
-from gateway.hub.transports.base import STALE_AFTER_US, client_to_remove
+from gateway.hub.transports.base import STALE_AFTER_US
 from gateway.hub.transports.datagram import UNPROVEN_IDLE_US, gone_clients
+from gateway.hub.transports.listener import client_to_remove
 from gateway.records import Incoming
 from gateway.units import US_PER_S
 

@@ -5,21 +5,11 @@ import random
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.routing_table import (
-    LATE,
-    LINKED_US,
-    MEMORY_FRAMES,
-    MEMORY_US,
-    NEW,
-    OWN_FRESH_US,
-    ROUTE_FRESH_US,
-    DuplicateFilter,
-    FrameStream,
-    OwnVehicles,
-    RedundantLinks,
-    RoutingTable,
-    SystemPath,
-)
+from gateway.hub.duplicates import LATE, MEMORY_FRAMES, NEW, DuplicateFilter
+from gateway.hub.frame_stream import FrameStream
+from gateway.hub.own_vehicles import OWN_FRESH_US, OwnVehicles
+from gateway.hub.redundant_links import LINKED_US, RedundantLinks
+from gateway.hub.routing_table import MEMORY_US, ROUTE_FRESH_US, RoutingTable, SystemPath
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 from tests.kit.mavlink import numbered, packed

@@ -6,7 +6,9 @@ from collections.abc import Callable
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.send_queue import BULK_BYTES, URGENT_RUN, Pacer, Packer, SendQueue
+from gateway.hub.packer import Packer
+from gateway.hub.send_queue import BULK_BYTES, URGENT_RUN, SendQueue
+from gateway.hub.transports.serial_line import Pacer
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.mavlink import frames_in, numbered, raw_frame

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from gateway.hub.endpoint import parse_endpoint
-from gateway.hub.forwarding import new_client_words
+from gateway.hub.forwarding import new_client_state
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientCounters
@@ -100,7 +100,7 @@ class KeepingClient(Client):
         self.counters = ClientCounters()
         self.routes = {}
         self.heard_us = None
-        self.words = new_client_words(client_id)
+        self.memory = new_client_state(client_id)
         self.now_us = 0
         self.sent: list[tuple[int, MavFrame]] = []
         self._direct = direct

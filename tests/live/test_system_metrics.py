@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.hub.routing_table import FrameStream
+from gateway.hub.frame_stream import FrameStream
 from gateway.live.metrics import prometheus_text, text_of
 from gateway.live.system_metrics import system_families
 from gateway.live.vehicle_watch import DECODED_US, MAX_SYSTEMS, VehicleWatch

@@ -1,35 +1,27 @@
-"""Base of all transports: a client, the cached routes of its frames, and a listening port."""
+"""Base of all transports: a client of the hub, and the part of the hub that it uses."""
 
 import asyncio
 import logging
 import socket
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Final, Generic, Protocol, TypeVar
+from typing import ClassVar, Final, Protocol
 
-import numpy as np
-
-from gateway.compiled import address_of
 from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import OPEN_TO_ALL, Endpoint, EndpointKind, is_loopback
-from gateway.hub.forwarding import Forwarding, Words, new_client_words
-from gateway.hub.limits import RateLimit
-from gateway.hub.routing_table import Origin, SystemPath
-from gateway.hub.send_queue import RADIO_STATUS
+from gateway.hub.forwarding import Forwarding, new_client_state
+from gateway.hub.route import Route
+from gateway.hub.routing_table import Origin
 from gateway.hub.settings import HubSettings
-from gateway.hub.stats import ClientCounters, ClientStats, ListenerStats
+from gateway.hub.stats import ClientCounters, ClientStats
 from gateway.hub.systems import SystemTranslation
 from gateway.printable import reason_of
 from gateway.token_bucket import TokenBucket
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import (
-    KEY_SIZE_V2,
     START_V2,
     Event,
     MavFrame,
@@ -49,31 +41,10 @@ processor. The rest waits with the sender, or is lost in the kernel."""
 UNTRUSTED_READ_BURST: Final = 256_000
 VERSION_PROBE_US: Final = 5 * US_PER_S
 """Time for which a client of version 1 is sent version 2: several heartbeats of the client."""
-RETRY_US: Final = US_PER_S
-"""Interval of attempts to reopen a socket."""
-
-EXAMINED: Final = frozenset({RADIO_STATUS, MESSAGE_IDS["AVAILABLE_MODES"]})
-"""Messages of which Python examines each, not only the newest."""
-OnForeign = Callable[[Sequence[bytes]], None]
-"""Called with frames of other systems that are forwarded, in their order."""
 STALE_AFTER_US: Final = 3 * US_PER_S
 """Time without a frame after which a client may be replaced: three missed heartbeats."""
-SHARE: Final = 4
-"""Divisor: one host keeps a quarter of a full port's clients when others connect."""
-FEW: Final = 4
-"""Clients that one host keeps in any case, such as a ground station, a script and a display."""
-
-
-@contextmanager
-def new_socket(family: int, kind: int) -> Iterator[socket.socket]:
-    """Yield a non-blocking socket; it is closed if the `with` block raises."""
-    sock = socket.socket(family, kind)
-    try:
-        sock.setblocking(False)
-        yield sock
-    except BaseException:
-        sock.close()
-        raise
+RETRY_US: Final = US_PER_S
+"""Interval of attempts to reopen a socket."""
 
 
 class HubContext(Protocol):
@@ -130,134 +101,6 @@ class HubContext(Protocol):
         """Remove a client and close it."""
 
 
-class Targets:
-    """The clients of some routes: those that the compiled step sends to, and others with limits."""
-
-    def __init__(self, targets: "Iterable[Target]") -> None:
-        self.forwarded = 0
-        """Frames sent by `send` since the last call of `settle`."""
-        self.direct: list[Client] = []
-        self.others: list[tuple[Callable[[MavFrame], None], RateLimit | None]] = []
-        for client, limit, send in targets:
-            if limit is None and send is None and client.is_direct:
-                self.direct.append(client)
-            else:
-                self.others.append((send or client.send, limit))
-        words = [address_of(client.words) for client in self.direct]
-        self._memory = np.array([len(words), bool(self.others), 0, 0, *words])
-        self.address = address_of(self._memory)
-
-    def settle(self) -> int:
-        """Count what the compiled step has sent; return the number of frames sent otherwise."""
-        words = self._memory.data
-        if frames := words[kernel.SENT]:
-            for client in self.direct:
-                client.counters.sent += frames
-                client.counters.bytes_sent += words[kernel.SENT_SIZE]
-            words[kernel.SENT] = words[kernel.SENT_SIZE] = 0
-        forwarded, self.forwarded = self.forwarded, 0
-        return forwarded
-
-    def send(self, frame: MavFrame, now_us: int) -> None:
-        """Send a frame to every client."""
-        self.forwarded += 1
-        for client in self.direct:
-            client.transmit(frame)
-        self._send_others(frame, now_us)
-
-    def finish(self, run: list[bytes], failures: list[list[int]], now_us: int) -> None:
-        """Complete the forwarding of a run: the part that the compiled step leaves to Python."""
-        for index, sent, *failure in failures:
-            self.direct[index].send_rest(run[sent:], *failure)
-        if self.others:
-            for data in run:
-                self._send_others(frame_of(data), now_us)
-
-    def _send_others(self, frame: MavFrame, now_us: int) -> None:
-        for send, limit in self.others:
-            if limit is None or limit.is_due(now_us):
-                send(frame)
-
-
-class Route:
-    """The clients that get one kind of frame from one client.
-
-    `source` brings the frames of a system by `path`. `rejects` returns whether a frame is dropped
-    as a copy, `on_foreign` is called with each forwarded one.
-    """
-
-    def __init__(
-        self,
-        message_id: int,
-        targets: Targets,
-        source: "Client",
-        path: SystemPath,
-        rejects: Callable[[MavFrame, int], bool] | None,
-        on_foreign: OnForeign | None,
-    ) -> None:
-        self.message_id = message_id
-        self.frames = self.size = 0
-        self.targets = targets
-        self._source = source
-        self._path = path
-        self._rejects = rejects
-        self._on_foreign = on_foreign
-        self._row: int | None = None
-        """Its row in the compiled step."""
-
-    def enter(self, forwarding: Forwarding, key: bytes) -> None:
-        """Let the compiled step forward such frames, unless it needs more than their headers."""
-        seed = CRC_EXTRA.get(self.message_id)
-        is_plain = self._rejects is None and self.message_id not in EXAMINED
-        if (
-            seed
-            and is_plain
-            and len(key) == KEY_SIZE_V2
-            and len(self.targets.direct) < kernel.MAX_FAILED
-        ):
-            path = self._path
-            self._row = forwarding.enter(
-                self._source.client_id,
-                key,
-                seed[0],
-                self.targets.address,
-                address_of(path.stream.words),
-                address_of(path.heard),
-            )
-
-    @property
-    def is_compiled(self) -> bool:
-        """Whether the compiled step forwards such frames."""
-        return self._row is not None
-
-    def leave(self, forwarding: Forwarding, key: bytes) -> None:
-        """Remove the route from the compiled step."""
-        if self._row is not None:
-            forwarding.leave(self._source.client_id, key, self._row)
-            self._row = None
-
-    def forward(self, frame: MavFrame, now_us: int, *, is_checked: bool = False) -> None:
-        """Send a frame to every client; a rejected one to none."""
-        self._path.heard_us = now_us
-        if not is_checked:
-            if self._rejects is None:
-                self._path.stream.accept(frame.sequence, self._source.client_id, now_us)
-            elif self._rejects(frame, now_us):
-                return
-        self.frames += 1
-        self.size += len(frame.data)
-        self.targets.send(frame, now_us)
-        if self._on_foreign is not None:
-            self._on_foreign((frame.data,))
-
-    def settle(self, forwarding: Forwarding) -> tuple[int, int]:
-        """Return the frames and bytes that were forwarded since the last call."""
-        frames, size = (0, 0) if self._row is None else forwarding.settle(self._row)
-        frames, size = self.frames + frames, self.size + size
-        self.frames = self.size = 0
-        return frames, size
-
-
 @dataclass(eq=False)
 class Client:
     """One peer that frames are sent to; the base of every transport."""
@@ -279,8 +122,8 @@ class Client:
     round_trip_us: int | None = None
     counters: ClientCounters = field(default_factory=ClientCounters)
     routes: dict[bytes, Route] = field(default_factory=dict)
-    """Cached routes of frames from here, by `MavFrame.key`; the fan-out clears them."""
-    words: Words = field(init=False)
+    """Routes of frames from here, by `MavFrame.key`; the fan-out clears them."""
+    memory: kernel.ClientState = field(init=False)
     """Its state in the compiled step."""
     loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop)
     sink: "Callable[[bytes, int], None] | None" = None
@@ -305,7 +148,7 @@ class Client:
         self.trusted = _is_trusted(self.endpoint, self.host)
         self.name = self.name or self.endpoint.name
         self.since_us = self.context.now_us()
-        self.words = new_client_words(self.client_id)
+        self.memory = new_client_state(self.client_id)
         self._renumber()
 
     def become(self, state: str, error: Exception | None = None) -> None:
@@ -319,16 +162,8 @@ class Client:
 
     @property
     def send(self) -> Callable[[MavFrame], None]:
-        """The function that sends a frame in the version of MAVLink that the client needs."""
-        if self.renumbering is not None:
-            return self._transmit_renumbered
-        return self._transmit_version1 if self.is_mavlink1 else self.transmit
-
-    def _transmit_renumbered(self, frame: MavFrame) -> None:
-        assert self.renumbering is not None
-        changed = self.renumbering.to_link(frame)
-        if changed is not None:
-            (self._transmit_version1 if self.is_mavlink1 else self.transmit)(changed)
+        """The function that sends a frame with the ids, and in the version, of the client."""
+        return self.transmit if self.is_unchanged else self._transmit_changed
 
     def _renumber(self) -> None:
         """Begin to translate the system ids of its link, or end it."""
@@ -337,8 +172,13 @@ class Client:
             on_change = partial(self.context.reconfigure, self)
             self.renumbering = SystemTranslation(new_ids, self.context.signer.renewal, on_change)
 
-    def _transmit_version1(self, frame: MavFrame) -> None:
-        data = to_mavlink1(frame.data)
+    def _transmit_changed(self, frame: MavFrame) -> None:
+        if self.renumbering is not None:
+            changed = self.renumbering.to_link(frame)
+            if changed is None:
+                return
+            frame = changed
+        data = to_mavlink1(frame.data) if self.is_mavlink1 else frame.data
         if data is not None:
             self.transmit(frame if data is frame.data else frame_of(data))
 
@@ -454,7 +294,7 @@ class Client:
                 return
             frame = changed
         route = self.routes.get(frame.key)
-        if route is not None:
+        if route is not None and not route.is_examined:
             route.forward(frame, now_us)
         elif not self.endpoint.monitor:
             self.context.deliver(self, frame, now_us)
@@ -462,12 +302,12 @@ class Client:
     def go_on(self, step: Callable[[], None], now_us: int) -> None:
         """Call the step again, and process the frames it leaves to Python, until none is left."""
         work = self.context.forwarding.work
-        while (status := work[kernel.STATUS]) & (kernel.RUN_SENT | kernel.HAND_OVER):
+        while (status := work.status) & (kernel.RUN_SENT | kernel.HAND_OVER):
             if status & kernel.RUN_SENT:
                 self.context.finish_run(now_us)
             if status & kernel.HAND_OVER:
                 self._take_over(now_us)
-            if self.words[kernel.INPUT] < 0:
+            if self.memory.input < 0:
                 # Closed by one of the frames.
                 return
             step()
@@ -475,13 +315,13 @@ class Client:
     def _take_over(self, now_us: int) -> None:
         """Process a frame without a compiled route, or all that is left of a datagram."""
         forwarding = self.context.forwarding
-        data, size = forwarding.rest(), forwarding.work[kernel.FRAME]
-        frame = read_datagram(data[:size]) if size and self.words[kernel.IS_PLAIN] else None
+        data, size = forwarding.rest(), forwarding.work.frame
+        frame = read_datagram(data[:size]) if size and self.memory.is_plain else None
         if frame is None:
             forwarding.skip()
             self.accept_rest(data, now_us)
             return
-        forwarding.work[kernel.OFFSET] += size
+        forwarding.work.offset += size
         self.counters.bytes_received += size
         self.receive_frame(frame, now_us)
 
@@ -491,15 +331,14 @@ class Client:
 
     def settle(self) -> int:
         """Count what the compiled step has forwarded; return the number of frames."""
-        words = self.words
-        self.counters.cut += words[kernel.CUT]
-        words[kernel.CUT] = 0
-        frames = words[kernel.RECEIVED]
-        if frames:
+        memory = self.memory
+        self.counters.cut += memory.cut
+        memory.cut = 0
+        if frames := memory.received:
             self.counters.received += frames
-            self.counters.bytes_received += words[kernel.RECEIVED_SIZE]
-            words[kernel.RECEIVED] = words[kernel.RECEIVED_SIZE] = 0
-            self.heard_us = max(self.heard_us or 0, words[kernel.HEARD_US])
+            self.counters.bytes_received += memory.received_size
+            memory.received = memory.received_size = 0
+            self.heard_us = max(self.heard_us or 0, memory.heard_us)
         return frames
 
     def sink_bytes(self, data: bytes, now_us: int) -> bool:
@@ -569,136 +408,6 @@ class Client:
             hint=hint,
             **counters,
         )
-
-
-Target = tuple[Client, RateLimit | None, Callable[[MavFrame], None] | None]
-"""A client of a route, its limit, and the function that sends to it; None for its own."""
-Peer = TypeVar("Peer", bound=Client)
-
-
-def client_to_remove(
-    present: Collection[Peer], host: str, max_clients: int, now_us: int
-) -> Peer | None:
-    """Choose the client to remove from a full port for a new one from `host`.
-
-    It is the one that has sent nothing for longest, else the newest of the host that holds more
-    than its share; None if all are alive and no host, or only the new client's, holds more.
-    """
-    stalest = min(present, key=lambda client: client.last_us)
-    if now_us - stalest.last_us >= STALE_AFTER_US:
-        return stalest
-    crowded = crowded_host(present, max_clients)
-    if crowded in (None, host):
-        return None
-    return [client for client in present if client.host == crowded][-1]
-
-
-def crowded_host(present: Collection[Client], max_clients: int) -> str | None:
-    """Return the host with the most clients if those are more than its share."""
-    host, count = Counter(client.host for client in present).most_common(1)[0]
-    return host if count > max(FEW, max_clients // SHARE) else None
-
-
-class Listener(Generic[Peer]):
-    """An endpoint that makes a client of every peer that connects, up to a bounded number."""
-
-    def __init__(self, context: HubContext, endpoint: Endpoint) -> None:
-        self.endpoint = endpoint
-        self.reason = ""
-        self.turned_away = 0
-        self._context = context
-        self._loop = asyncio.get_running_loop()
-        self._clients: dict[int, Peer] = {}
-        self._socket: socket.socket | None = None
-        self._retry_us = 0
-        self._logged = ""
-
-    @property
-    def port(self) -> int:
-        """The port that is bound, or 0."""
-        return self._socket.getsockname()[1] if self._socket else 0
-
-    def tick(self, now_us: int) -> None:
-        """Bind if that failed; called a few times a second."""
-        if now_us < self._retry_us or self._socket is not None:
-            return
-        self._retry_us = now_us + RETRY_US
-        try:
-            self._socket = self._bind()
-        except OSError as error:
-            self._report(error)
-            return
-        self._report(None)
-        self._watch(self._socket)
-
-    def reconfigure(self, endpoint: Endpoint) -> None:
-        """Apply changed options of the same endpoint, to its clients too."""
-        self.endpoint = endpoint
-        for client in self._clients.values():
-            client.reconfigure(endpoint)
-
-    def close(self) -> None:
-        """Remove all clients and close the port."""
-        for client in list(self._clients.values()):
-            self.leave(client)
-        self._shut()
-
-    def fail(self, error: Exception) -> None:
-        """Close the port after an unexpected error; `tick` reopens it."""
-        self._report(error)
-        self._shut()
-
-    def leave(self, client: Client) -> None:
-        """Remove one client."""
-        self._clients.pop(client.client_id, None)
-        self._context.vanish(client)
-
-    def _has_room(self, host: str, now_us: int) -> bool:
-        """Return whether there is room for a new client, after removing another if needed."""
-        most = self._context.settings.max_clients
-        if len(self._clients) < most:
-            return True
-        removed = client_to_remove(self._clients.values(), host, most, now_us)
-        if removed is not None:
-            self.leave(removed)
-        return removed is not None
-
-    def stats(self) -> ListenerStats:
-        """Return the port's present figures."""
-        return ListenerStats(
-            name=self.endpoint.name,
-            endpoint=self.endpoint.url,
-            state="closed" if self.reason else "open",
-            reason=self.reason,
-            port=self.port,
-            clients=len(self._clients),
-            turned_away=self.turned_away,
-        )
-
-    def _shut(self) -> None:
-        if self._socket is not None:
-            self._loop.remove_reader(self._socket)
-            self._socket.close()
-            self._socket = None
-
-    def _bind(self) -> socket.socket:
-        """Open the port or raise OSError."""
-        raise NotImplementedError
-
-    def _watch(self, sock: socket.socket) -> None:
-        """Accept clients of the port from now on."""
-        raise NotImplementedError
-
-    def _report(self, error: Exception | None) -> None:
-        """Note why no client can connect, or that one could; a change is logged."""
-        self.reason = "" if error is None else reason_of(error)
-        if self.reason == self._logged:
-            return
-        self._logged = self.reason
-        if self.reason:
-            log.warning("%s: %s; trying again until it works", self.endpoint.name, self.reason)
-        else:
-            log.info("%s is open", self.endpoint.name)
 
 
 def _is_trusted(endpoint: Endpoint, host: str) -> bool:

@@ -6,8 +6,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
-from gateway.hub.transports.base import Client, HubContext, Listener
-from gateway.hub.transports.datagram import DatagramClient, bound_socket
+from gateway.hub.transports.base import Client, HubContext
+from gateway.hub.transports.datagram import DatagramClient
+from gateway.hub.transports.listener import Listener
+from gateway.hub.transports.sockets import bound_socket
 from gateway.wire.mavlink_splitter import MavFrame
 
 MAX_DATAGRAM: Final = 65_536

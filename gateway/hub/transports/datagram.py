@@ -13,10 +13,10 @@ from typing import Final
 from gateway.compiled.messages import way_to_send
 from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import Endpoint
+from gateway.hub.packer import Packer
 from gateway.hub.round_trip import MEASURING
 from gateway.hub.routing_table import Origin
-from gateway.hub.send_queue import Packer
-from gateway.hub.transports.base import RETRY_US, STALE_AFTER_US, Client, new_socket
+from gateway.hub.transports.base import RETRY_US, STALE_AFTER_US, Client
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import HEARTBEAT_ID
 from gateway.wire.mavlink_splitter import DatagramSplitter, MavFrame, message_id_of, read_datagram
@@ -25,9 +25,6 @@ UNPROVEN: Final = "unproven"
 """State of a client of a listening port that has not shown that it receives."""
 SENDING: Final = ("open", UNPROVEN)
 NOBODY_LISTENS: Final = "nobody listens there"
-RECEIVE_BUFFER_BYTES: Final = 1 << 20
-"""Receive buffer of a socket: the default holds only some 256 small datagrams; a parameter upload
-sends more at once."""
 IP_PKTINFO: Final = 8
 """Option for the local address of a datagram; `socket` exports it only from Python 3.14 on."""
 BACKLOG_DATAGRAMS: Final = 256
@@ -97,7 +94,7 @@ class DatagramClient(Client):
 
     def close(self) -> None:
         """Close the socket."""
-        self.words[kernel.INPUT] = -1
+        self.memory.input = -1
         self._use(not_open)
         self.counters.dropped += len(self._backlog)
         self._backlog.clear()
@@ -122,9 +119,9 @@ class DatagramClient(Client):
         Without `is_read`, call `begin_reading` later.
         """
         self._socket = sock
-        self.words[kernel.INPUT] = sock.fileno()
+        self.memory.input = sock.fileno()
         self._output = sock.fileno() if write is None else -1
-        self.words[kernel.WAY] = way_to_send(sock)
+        self.memory.way = way_to_send(sock)
         self._direct = write or sock.send
         self._use(self._direct)
         self._revive()
@@ -140,7 +137,7 @@ class DatagramClient(Client):
     def _use(self, write: Write) -> None:
         """Send by a function from now on; the compiled step sends if it is the direct one."""
         self.write = write
-        self.words[kernel.OUTPUT] = self._output if write is self._direct else -1
+        self.memory.output = self._output if write is self._direct else -1
 
     def become(self, state: str, error: Exception | None = None) -> None:
         """Set the state and its reason."""
@@ -149,7 +146,7 @@ class DatagramClient(Client):
 
     def _update_plain(self) -> None:
         """Let Python process the next datagram if it may change the state or complete a frame."""
-        self.words[kernel.IS_PLAIN] = self.state in SENDING and not self.splitter
+        self.memory.is_plain = self.state in SENDING and not self.splitter
 
     def accept_rest(self, data: bytes, now_us: int) -> None:
         """Process received bytes, without the compiled step."""
@@ -262,25 +259,25 @@ class DatagramClient(Client):
         forwarding, now = self.context.forwarding, self.context.now_us
         if not forwarding.is_compiled:
             return partial(self._read_each, sock)
-        work, step = forwarding.work, forwarding.step(self.words, reads=True)
-        on = forwarding.step(self.words, reads=False)
+        work, step = forwarding.work, forwarding.step(self.memory, reads=True)
+        on = forwarding.step(self.memory, reads=False)
 
         def read() -> None:
-            now_us = work[kernel.NOW_US] = now()
+            now_us = work.now_us = now()
             step()
-            if work[kernel.STATUS]:
+            if work.status:
                 self.go_on(on, now_us)
                 self._end_read(sock)
             if not self.trusted:
-                self.limit_reads(sock, read, work[kernel.READ])
+                self.limit_reads(sock, read, work.read)
 
         return read
 
     def _end_read(self, sock: socket.socket) -> None:
         """Handle an error, and keep unread datagrams for a later turn of the loop."""
         forwarding = self.context.forwarding
-        if forwarding.work[kernel.STATUS] & kernel.ERROR:
-            self._note_read_error(forwarding.work[kernel.ERROR_NUMBER])
+        if forwarding.work.status & kernel.ERROR:
+            self._note_read_error(forwarding.work.error_number)
         if self._socket is sock and (unread := forwarding.unread()):
             self.loop.remove_reader(sock)
             self.loop.call_soon(self._read_later_part, sock, deque(unread))
@@ -438,18 +435,6 @@ def gone_clients(
         or (idle_us >= UNPROVEN_IDLE_US and not client.is_proven)
         or (idle_us >= STALE_AFTER_US and newest[client.host, client.identity] is not client)
     ]
-
-
-def bound_socket(address: tuple[str, int], *, shared: bool) -> socket.socket:
-    """Open a datagram socket on an address; `shared` if one is bound there already."""
-    family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-    with new_socket(family, socket.SOCK_DGRAM) as sock:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        if shared:
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        sock.bind(address)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-        return sock
 
 
 def local_host_of(ancillary: list[tuple[int, int, bytes]]) -> str:

@@ -12,7 +12,8 @@ from gateway.hub.endpoint import (
     Endpoint,
     EndpointKind,
 )
-from gateway.hub.transports.base import Client, HubContext, Listener
+from gateway.hub.transports.base import Client, HubContext
+from gateway.hub.transports.listener import Listener
 from gateway.hub.transports.serial_line import SerialClient
 from gateway.hub.transports.tcp import TcpClient, TcpListener
 from gateway.hub.transports.udp import UdpClient

@@ -7,15 +7,15 @@ since pyserial spins on a full buffer.
 
 import asyncio
 import logging
+import math
 import os
 from typing import Final
 
 import serial
 
-from gateway.hub import forwarding_step as kernel
-from gateway.hub.send_queue import RADIO_STATUS, Pacer
 from gateway.hub.transports.stream import QueuedClient
 from gateway.units import BITS_PER_BYTE, US_PER_S
+from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import MavFrame
 
 log = logging.getLogger(__name__)
@@ -26,6 +26,28 @@ AHEAD_US: Final = 30_000
 QUEUE_US: Final = US_PER_S
 """Size of the queue as time on the line; older telemetry is of no use on a radio."""
 MIN_QUEUE_BYTES: Final = 2048
+
+
+class Pacer:
+    """Keep the driver's buffer of a serial line short, so that urgent frames need not wait for it.
+
+    A driver accepts kilobytes at once, which at 57600 Bd is most of a second. The pacer computes
+    when the line of `baud` will have sent them, and allows the next frame `ahead_us` before.
+    """
+
+    def __init__(self, baud: int, ahead_us: int) -> None:
+        self._baud = baud
+        self._ahead_us = ahead_us
+        self._free_us = 0
+
+    def delay_us(self, now_us: int) -> int:
+        """Return the time until the next frame may be written; 0 is now."""
+        return max(0, self._free_us - self._ahead_us - now_us)
+
+    def wrote(self, size: int, now_us: int) -> None:
+        """Account for bytes written to the driver."""
+        busy_us = math.ceil(size * BITS_PER_BYTE * US_PER_S / self._baud)
+        self._free_us = max(self._free_us, now_us) + busy_us
 
 
 class SerialClient(QueuedClient):
@@ -64,7 +86,7 @@ class SerialClient(QueuedClient):
             self.become("unreachable", error)
             return
         self._port = port
-        self.words[kernel.INPUT], self.words[kernel.IS_PLAIN] = port.fileno(), 1
+        self.memory.input, self.memory.is_plain = port.fileno(), 1
         self._splitter.reset()
         self.become("open")
         self.loop.add_reader(port.fileno(), self._on_readable, port)
@@ -77,13 +99,13 @@ class SerialClient(QueuedClient):
 
     def receive_frame(self, frame: MavFrame, now_us: int) -> None:
         """Route one frame; those of the radio report the room in its buffer."""
-        if frame.message_id == RADIO_STATUS:
+        if frame.message_id == MESSAGE_IDS["RADIO_STATUS"]:
             self.context.update_buffer(self.client_id, frame.free_percent)
         super().receive_frame(frame, now_us)
 
     def close(self) -> None:
         """Close the port; waiting frames are lost."""
-        self.words[kernel.INPUT] = -1
+        self.memory.input = -1
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -4,23 +4,21 @@ A stalled client fills its own queue and loses its own oldest telemetry; the ker
 connection when nothing was acknowledged for long.
 """
 
-import asyncio
 import socket
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Final
 
 from gateway.compiled.messages import STREAM
-from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import host_and_port
 from gateway.hub.routing_table import Origin
 from gateway.hub.send_queue import SendQueue
-from gateway.hub.transports.base import Client, Listener, Peer, new_socket
+from gateway.hub.transports.base import Client
+from gateway.hub.transports.listener import Listener, Peer
+from gateway.hub.transports.sockets import accept_each, new_socket
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter, frame_of
 
-ACCEPT_AGAIN_S: Final = 1.0
-"""Delay after which a failed accept is repeated, s."""
 CHUNK_BYTES: Final = 4096
 """Maximum bytes joined into one write while a queue drains."""
 SLOW_CHUNK_BYTES: Final = 512
@@ -44,54 +42,6 @@ ACCEPT_BACKLOG: Final = 128
 """Connections that may wait in the kernel, as when all pages reconnect: a wake-up accepts one."""
 
 
-def accept_each(
-    sock: socket.socket,
-    admit: Callable[[socket.socket, Any], None],
-    report: Callable[[OSError | None], None],
-) -> None:
-    """Accept the connections of a socket until it is closed; needs a running event loop.
-
-    Without free file descriptors a waiting connection would wake the loop for ever, so the socket
-    is then not watched for `ACCEPT_AGAIN_S`.
-
-    Parameters
-    ----------
-    sock : socket
-        Listens, and does not block. Remove it from the loop's readers before it is closed.
-    admit : callable
-        Takes each connection and its peer's address. One at a wake-up, since to admit one takes as
-        long as to serve the others several times.
-    report : callable
-        Called with the error when connections begin to wait, and with None when they no longer do.
-    """
-    loop = asyncio.get_running_loop()
-    waiting = False
-
-    def watch() -> None:
-        if sock.fileno() >= 0:
-            loop.add_reader(sock, accept)
-
-    def accept() -> None:
-        nonlocal waiting
-        try:
-            connection, address = sock.accept()
-        except BlockingIOError:
-            return
-        except OSError as error:
-            loop.remove_reader(sock)
-            loop.call_later(ACCEPT_AGAIN_S, watch)
-            if not waiting:
-                waiting = True
-                report(error)
-            return
-        if waiting:
-            waiting = False
-            report(None)
-        admit(connection, address)
-
-    watch()
-
-
 class QueuedClient(Client):
     """A peer behind a link that may be slow or stalled: frames wait in a bounded queue."""
 
@@ -106,7 +56,7 @@ class QueuedClient(Client):
             self.queue_bytes, self._is_own, signer, self._system_here, self._is_numbered
         )
         self._splitter = MavlinkSplitter()
-        self._step = self.context.forwarding.step(self.words, reads=False)
+        self._step = self.context.forwarding.step(self.memory, reads=False)
 
     def _system_here(self, system: int) -> int:
         return system if self.renumbering is None else self.renumbering.here(system)
@@ -189,7 +139,7 @@ class StreamClient(QueuedClient):
     def _update_output(self) -> None:
         """Let the compiled step send while nothing waits."""
         is_idle = self._socket is not None and not self._partial and not self._queue
-        self.words[kernel.OUTPUT] = self.words[kernel.INPUT] if is_idle else -1
+        self.memory.output = self.memory.input if is_idle else -1
 
     def transmit(self, frame: MavFrame) -> None:
         """Send one frame at once if nothing waits, else queue it."""
@@ -214,9 +164,8 @@ class StreamClient(QueuedClient):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         self._socket = sock
-        words = self.words
-        words[kernel.INPUT] = sock.fileno()
-        words[kernel.IS_PLAIN], words[kernel.WAY] = 1, STREAM
+        self.memory.input = sock.fileno()
+        self.memory.is_plain, self.memory.way = 1, STREAM
         self._splitter.reset()
         self._read = partial(self._on_readable, sock)
         self.loop.add_reader(sock, self._read)
@@ -230,7 +179,7 @@ class StreamClient(QueuedClient):
 
     def close(self) -> None:
         """Close the connection; waiting frames are lost."""
-        self.words[kernel.INPUT] = self.words[kernel.OUTPUT] = -1
+        self.memory.input = self.memory.output = -1
         if self._socket is not None:
             self.loop.remove_reader(self._socket)
             self.loop.remove_writer(self._socket)
@@ -267,7 +216,7 @@ class StreamClient(QueuedClient):
         self.counters.bytes_sent += taken
         self._partial = data[taken:]
         if self._partial:
-            self.words[kernel.OUTPUT] = -1
+            self.memory.output = -1
             self.loop.add_writer(sock, self._on_writable, sock)
         return not self._partial
 

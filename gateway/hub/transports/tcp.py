@@ -5,7 +5,7 @@ import socket
 from typing import Any
 
 from gateway.hub.endpoint import host_and_port
-from gateway.hub.transports.base import new_socket
+from gateway.hub.transports.sockets import new_socket
 from gateway.hub.transports.stream import StreamClient, StreamListener
 
 

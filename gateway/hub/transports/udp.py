@@ -10,8 +10,9 @@ import socket
 from typing import Any, Final
 
 from gateway.hub.endpoint import host_and_port, is_numeric
-from gateway.hub.transports.base import RETRY_US, new_socket
-from gateway.hub.transports.datagram import RECEIVE_BUFFER_BYTES, DatagramClient
+from gateway.hub.transports.base import RETRY_US
+from gateway.hub.transports.datagram import DatagramClient
+from gateway.hub.transports.sockets import RECEIVE_BUFFER_BYTES, new_socket
 from gateway.units import US_PER_S
 
 RESOLVE_AGAIN_US: Final = 60 * US_PER_S

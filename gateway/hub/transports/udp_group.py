@@ -12,8 +12,8 @@ from functools import partial
 from typing import Any, Final
 
 from gateway.hub.endpoint import EndpointKind
-from gateway.hub.transports.base import new_socket
 from gateway.hub.transports.datagram import Address, DatagramClient
+from gateway.hub.transports.sockets import new_socket
 
 MULTICAST_HOPS: Final = 1
 """Hop limit of multicast datagrams: the local network only."""

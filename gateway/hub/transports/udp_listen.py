@@ -20,22 +20,16 @@ from typing import Final, NamedTuple
 
 from gateway.hub.endpoint import Endpoint, host_and_port, is_of_this_machine
 from gateway.hub.forwarding_step import MAX_DATAGRAM, READS
-from gateway.hub.transports.base import (
-    RETRY_US,
-    STALE_AFTER_US,
-    Client,
-    HubContext,
-    Listener,
-    crowded_host,
-)
+from gateway.hub.transports.base import RETRY_US, STALE_AFTER_US, Client, HubContext
 from gateway.hub.transports.datagram import (
     IP_PKTINFO,
     Address,
     DatagramPeer,
-    bound_socket,
     gone_clients,
     local_host_of,
 )
+from gateway.hub.transports.listener import Listener, crowded_host
+from gateway.hub.transports.sockets import bound_socket
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import DatagramSplitter, MavFrame
 

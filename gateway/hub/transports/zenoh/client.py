@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from gateway.extras import how_to_add
 from gateway.hub.endpoint import Endpoint
-from gateway.hub.send_queue import Packer
+from gateway.hub.packer import Packer
 from gateway.hub.transports.base import READ_BYTES, Client
 from gateway.hub.transports.zenoh.session import (
     MAX_MESSAGE,

@@ -1,0 +1,57 @@
+"""Sequence numbers of our own frames where some are dropped and others overtake."""
+
+from collections.abc import Callable
+from typing import Final
+
+from gateway.hub.routing_table import MAX_ORIGINS, Origin
+from gateway.wire.mavlink_splitter import MavFrame
+
+SEQUENCE_MASK: Final = 0xFF
+
+
+class Numbering:
+    """Renumber our own frames where some are dropped and others overtake.
+
+    Each frame keeps its step from the frame before it in our own order; when frames leave, their
+    steps add up. So without drops every frame leaves with its own number, gaps of a recording
+    included, and with drops the numbers continue without a gap. Frames of others, for whose origin
+    `is_own` returns False, are never changed.
+    """
+
+    def __init__(self, is_own: Callable[[Origin], bool] | None = None) -> None:
+        self._is_own = is_own
+        self._last: dict[Origin, list[int | None]] = {}
+        """The last number of each origin that entered, and the last with which a frame left."""
+
+    def enter(self, frame: MavFrame) -> int | None:
+        """Return a frame's step, to be passed to `leave`; None for a frame of others."""
+        origin, sequence = frame.origin, frame.sequence
+        if self._is_own is not None and not self._is_own(origin):
+            return None
+        last = self._last.get(origin)
+        if last is None:
+            if len(self._last) < MAX_ORIGINS:
+                self._last[origin] = [sequence, None]
+            return 1
+        before, last[0] = last[0], sequence
+        assert before is not None
+        return sequence - before & SEQUENCE_MASK
+
+    def number(self, frame: MavFrame) -> int:
+        """Return the sequence number of a frame that waits in no queue."""
+        last, sequence = self._last.get(frame.origin), frame.sequence
+        if last is not None and last[0] == last[1]:
+            # Nothing was dropped or overtaken so far.
+            last[0] = last[1] = sequence
+            return sequence
+        step = self.enter(frame)
+        return sequence if step is None else self.leave(frame, step)
+
+    def leave(self, frame: MavFrame, step: int) -> int:
+        """Return the sequence number with which a frame is sent."""
+        last = self._last.get(frame.origin)
+        if last is None:
+            return frame.sequence
+        before = last[1]
+        wanted = last[1] = frame.sequence if before is None else before + step & SEQUENCE_MASK
+        return wanted
