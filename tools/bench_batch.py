@@ -1,18 +1,15 @@
 """Measure work on many recordings: serial, in processes, on a Dask cluster.
 
-    python tools/bench_batch.py                        # all of it, in some 20 minutes
-    python tools/bench_batch.py judge --flights 24     # or report, sweep: serial and in processes
-    python tools/bench_batch.py dask --flights 24      # judge: a cluster of two, and processes
-    python tools/bench_batch.py growth --flights 200   # cost and memory against the number of files
-    python tools/bench_batch.py catalogue --files 10000   # a catalogue: index, index again, ask
-    python tools/bench_batch.py --quick                # all of it with few, short flights
+    python -m tools.bench_batch judge --flights 24     # or report, sweep: serial and in processes
+    python -m tools.bench_batch dask --flights 24      # judge: a cluster of two, and processes
+    python -m tools.bench_batch growth --flights 200   # cost and memory against the number of files
+    python -m tools.bench_batch catalogue --files 10000   # index, index again, query
 
 Recordings are simulated once and stay in --folder. Each measurement runs in a new process, so that
 memory is that of this work alone. `start` is the cost that occurs once, of loading the estimators
 or starting a cluster; `wall` and `CPU` are of the work, CPU of all processes together.
 """
 
-import argparse
 import multiprocessing
 import os
 import resource
@@ -23,7 +20,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -32,8 +28,6 @@ from typing import Any, ParamSpec, TypeVar
 
 import msgspec
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import cores
 from gateway.analysis.simulated import ideal_calibration, received
@@ -41,7 +35,7 @@ from gateway.analysis.sweep import parse_axis
 from gateway.batch.catalogue import CATALOGUE_NAME, find_flights, geojson_of, index_folder
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
 from gateway.batch.storage import items_of
-from gateway.batch.tasks import LOOKING, FlightTask, JudgeTask, ResultFolder, SweepTask, run_batch
+from gateway.batch.tasks import FlightTask, JudgeTask, ResultFolder, SweepTask, run_batch
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, encode_head
@@ -50,11 +44,11 @@ from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S
 from gateway.units import US_PER_S
 from tests.batch.season_flights import line_of
+from tools.harness import Figures, arguments, show, write_json
 
 SEEDS = 4
 """Number of different flights; the others are copies with another aircraft and day."""
 WORKERS = 2
-SHORT_S = 60.0
 CATALOGUED_S = 10.0
 DAY_0_US = 1_780_000_000 * US_PER_S
 DAY_US = 86_400 * US_PER_S
@@ -66,118 +60,69 @@ QUERIES = (
     "gps_outages > 0 or faults > 0",
     "error is not null",
 )
-SHARE = {"judge": 1, "report": 16, "sweep": 4}
-"""Divisor by which `all` uses fewer flights for reports and sweeps than for fusing."""
+TASKS = ("judge", "report", "sweep")
+PARTS = (*TASKS, "dask", "growth", "catalogue")
 BROKEN = 100
 """One in this many files of the catalogue is broken."""
-ROW = "{:<8} {:<10} {:>7} {:>7} {:>8} {:>8} {:>9} {:>9} {:>9} {:>8}"
-HEAD = ("part", "by", "flights", "failed", "start, s", "wall, s", "s/flight", "CPU, s", "worker MB",
-        "here MB")  # fmt: skip
-PARTS = ("all", "make", "judge", "report", "sweep", "dask", "growth", "catalogue")
+COLUMNS = ("failed", "start_s", "wall_s", "cpu_s", "worker_mb", "here_mb")
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
 def main() -> None:
-    """Run one part, or all."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("part", nargs="?", choices=PARTS, default="all")
+    """Run one part."""
+    parser = arguments(__doc__)
+    parser.add_argument("part", choices=PARTS)
     parser.add_argument(
-        "--folder", type=Path, default=Path(tempfile.gettempdir(), "mavgate-season")
+        "--folder", type=Path, default=Path(tempfile.gettempdir(), "mavgate-bench-batch")
     )
-    parser.add_argument("--flights", type=int, help="recordings; `all` reports and sweeps fewer")
-    parser.add_argument("--files", type=int, help="files of the catalogue")
-    parser.add_argument("--quick", action="store_true", help="few flights, of 60 s")
-    chosen = parser.parse_args()
-    quick = chosen.quick
-    folder = chosen.folder / ("quick" if quick else "full")
-    flights = chosen.flights or (8 if quick else 200)
-    files = chosen.files or (500 if quick else 10_000)
-    whole = chosen.part == "all"
-    began = time.perf_counter()
-    if chosen.part != "catalogue":
-        make(folder / "flights", flights, SHORT_S if quick else FLIGHT_S)
-    if whole or chosen.part in (*SHARE, "dask", "growth"):
-        work(folder, chosen.part, flights)
-    if whole or chosen.part == "catalogue":
-        fresh_process(catalogue, folder / f"catalogue-{files}", files)
-    print(f"\n{time.perf_counter() - began:.0f} s in all")
+    parser.add_argument("--flights", type=int, default=24, help="recordings")
+    parser.add_argument("--files", type=int, default=10_000, help="files of the catalogue")
+    parser.add_argument("--duration", type=float, default=FLIGHT_S, help="of each recording, s")
+    options = parser.parse_args()
+    folder, part, flights = options.folder, options.part, options.flights
+    if part == "catalogue":
+        fresh_process(catalogue, folder / f"catalogue-{options.files}", options.files)
+        return
+    make(folder / f"flights-{options.duration:.0f}", flights, options.duration)
+    task = part if part in TASKS else "judge"
+    runs = {
+        "growth": [("processes", max(flights // n, 1)) for n in (8, 4, 2, 1)],
+        "dask": [("processes", flights), ("dask", flights)],
+    }.get(part, [("serial", flights), ("processes", flights)])
+    recordings = folder / f"flights-{options.duration:.0f}"
+    rows = [(*run, fresh_process(measure, recordings, task, *run)) for run in runs]
+    base = rows[0][2]["wall_s"] / rows[0][1]
+    show(
+        f"{task}, {WORKERS} processes",
+        ("by", "flights", *COLUMNS, "s/flight, times the first"),
+        [
+            (by, count, *(cost[key] for key in COLUMNS), cost["wall_s"] / count / base)
+            for by, count, cost in rows
+        ],
+    )
+    write_json(options, {"rows": rows})
 
 
-def work(folder: Path, part: str, flights: int) -> None:
-    """Measure the parts for flights, and print their comparisons at the end."""
-    print("\n" + ROW.format(*HEAD), flush=True)
-    done: dict[tuple[str, str, int], Cost] = {}
-
-    def cost(task: str, by: str, count: int) -> Cost:
-        if (task, by, count) not in done:
-            found = done[task, by, count] = fresh_process(measure, folder, task, by, count)
-            print(ROW.format(task, by, count, *found.cells(count)), flush=True)
-        return done[task, by, count]
-
-    compared: list[str] = []
-    for task, share in SHARE.items():
-        if part in ("all", task):
-            count = max(flights // share, WORKERS) if part == "all" else flights
-            serial, pool = cost(task, "serial", count), cost(task, "processes", count)
-            compared.append(
-                f"{task} by {WORKERS} processes: {serial.wall_s / pool.wall_s:.2f} times as fast "
-                f"as one after the other (goal 1.8), CPU {pool.cpu_s / serial.cpu_s:.2f} times"
-            )
-    if part in ("all", "dask"):
-        pool, dask = cost("judge", "processes", flights), cost("judge", "dask", flights)
-        compared.append(
-            f"judge on a cluster of {WORKERS}: {100 * (dask.wall_s / pool.wall_s - 1):+.1f} % wall "
-            f"relative to the local processes (goal below +15 %)"
-        )
-    if part in ("all", "growth"):
-        counts = sorted({max(flights // share, 1) for share in (8, 4, 2, 1)})
-        least, *_, most = (cost("judge", "processes", count) for count in counts)
-        compared.append(
-            f"judge of {counts[-1]} flights relative to {counts[0]}: "
-            f"{most.wall_s / counts[-1] / (least.wall_s / counts[0]):.2f} times the wall a flight, "
-            f"largest worker {most.worker_mb - least.worker_mb:+.0f} MB, "
-            f"this process {most.here_mb - least.here_mb:+.0f} MB"
-        )
-    print("\n" + "\n".join(compared))
-
-
-@dataclass(frozen=True)
-class Cost:
-    """Result of one measurement."""
-
-    failed: int
-    start_s: float
-    wall_s: float
-    cpu_s: float
-    worker_mb: float
-    here_mb: float
-
-    def cells(self, flights: int) -> tuple[str, ...]:
-        """Return the cells of a row of the table."""
-        each = f"{self.wall_s / flights:.2f}"
-        times = (f"{self.start_s:.1f}", f"{self.wall_s:.1f}", each, f"{self.cpu_s:.1f}")
-        return (str(self.failed), *times, f"{self.worker_mb:.0f}", f"{self.here_mb:.0f}")
-
-
-def measure(folder: Path, part: str, by: str, count: int) -> Cost:
+def measure(recordings: Path, part: str, by: str, count: int) -> Figures:
     """Do a task on recordings, once."""
-    items = items_of([str(folder / "flights")])[:count]
-    out = folder / f"out-{part}-{by}"
+    items = items_of([str(recordings)])[:count]
+    out = recordings.with_name(f"out-{part}-{by}")
     shutil.rmtree(out, ignore_errors=True)
-    began = time.perf_counter()
+    began_s = time.perf_counter()
     with executor_of(by) as (executor, workers):
-        start_s = time.perf_counter() - began
+        start_s = time.perf_counter() - began_s
         cpu_s, _ = workers()
-        began = time.perf_counter()
-        results = run_batch(task_of(part), items, executor, ResultFolder(out), progress_of(part))
-        wall_s = time.perf_counter() - began
+        began_s = time.perf_counter()
+        results = run_batch(task_of(part), items, executor, ResultFolder(out), show_progress)
+        wall_s = time.perf_counter() - began_s
         after_s, worker_mb = workers()
     shutil.rmtree(out)
     failed = sum(result.error is not None for result in results)
     here_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return Cost(failed, start_s, wall_s, after_s - cpu_s, worker_mb, here_mb)
+    values = (failed, start_s, wall_s, after_s - cpu_s, worker_mb, here_mb)
+    return dict(zip(COLUMNS, values, strict=True))
 
 
 def task_of(part: str) -> FlightTask:
@@ -238,18 +183,12 @@ def make(folder: Path, count: int, duration_s: float) -> None:
     wanted = [number for number in range(count) if _name(number) not in there]
     if not wanted:
         return
-    began = time.perf_counter()
     works = [
         (folder, seed, [number for number in wanted if number % SEEDS == seed], duration_s)
         for seed in range(SEEDS)
     ]
-    show = progress_of(f"recordings of {duration_s:.0f} s")
     for done, _ in enumerate(LocalProcesses(cores()).run(_make_some, works), 1):
-        show("", done, len(works))
-    print(
-        f"{len(wanted)} recordings of {duration_s:.0f} s simulated in {folder}: "
-        f"{time.perf_counter() - began:.0f} s"
-    )
+        show_progress(f"recordings of {duration_s:.0f} s", done, len(works))
 
 
 def _make_some(work: tuple[Path, int, Sequence[int], float]) -> None:
@@ -313,12 +252,12 @@ def catalogue(place: Path, count: int) -> None:
         print(f"  {1e3 * median(times):7.1f} ms{goal:<10} {found:6} flights: {what}")
 
 
-def _index(place: Path, what: str) -> None:
-    began, before = time.perf_counter(), _children()[0]
-    report = index_folder(place, OPTIONS, LocalProcesses(WORKERS), _bar("index"))
-    wall_s, cpu_s = time.perf_counter() - began, _children()[0] - before
+def _index(place: Path, title: str) -> None:
+    began_s, before_s = time.perf_counter(), _children()[0]
+    report = index_folder(place, OPTIONS, LocalProcesses(WORKERS), partial(show_progress, "index"))
+    wall_s, cpu_s = time.perf_counter() - began_s, _children()[0] - before_s
     print(
-        f"  {what:<20} {wall_s:7.2f} s wall {cpu_s:7.2f} s CPU; {report.read} read, "
+        f"  {title:<20} {wall_s:7.2f} s wall {cpu_s:7.2f} s CPU; {report.read} read, "
         f"{report.unchanged} unchanged, {report.broken} broken",
         flush=True,
     )
@@ -332,28 +271,11 @@ def fresh_process(
         return pool.submit(function, *arguments, **named).result()
 
 
-def progress_of(part: str) -> Callable[[str, int, int], None]:
-    """Return a function that shows the progress of a part on a terminal."""
-    show = _bar(part)
-
-    def show_part(what: str, done: int, total: int) -> None:
-        if what != LOOKING:
-            show(done, total)
-
-    return show_part
-
-
-def _bar(part: str) -> Callable[[int, int], None]:
-    """Return a function that shows a count: in one line of a terminal, in four lines of a file."""
-
-    def show(done: int, total: int) -> None:
-        if sys.stderr.isatty():
-            end = "\r" if done < total else "\r\x1b[K"
-            print(f"{part}: {done} of {total}", end=end, file=sys.stderr, flush=True)
-        elif total and done * 4 // total > (done - 1) * 4 // total:
-            print(f"{part}: {done} of {total}", file=sys.stderr, flush=True)
-
-    return show
+def show_progress(title: str, done: int, total: int) -> None:
+    """Show a count in one line of a terminal."""
+    if sys.stderr.isatty():
+        end = "\r" if done < total else "\r\x1b[K"
+        print(f"{title}: {done} of {total}", end=end, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -5,30 +5,26 @@ station after the other loads all parameters and the mission; printed are the ti
 requests and answers on the radio. Telemetry, which is the same in all cases, is not counted.
 """
 
-import argparse
 import os
-import socket
-import subprocess
-import sys
 import tempfile
 import threading
 import time
-import tty
 from collections import deque
 from pathlib import Path
 from typing import Any, Final
 
+from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mavlink
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from tests.ports import free_port
+from tools.harness import MAVGATE, SerialLine, arguments, running, show, write_json
 
 BYTES_PER_S: Final = 960
 STEP_S: Final = 0.02
 STEP_BYTES: Final = round(BYTES_PER_S * STEP_S)
 PARAMETERS: Final = 907
 ITEMS: Final = 40
-TELEMETRY_S: Final = 0.5
+TELEMETRY_STEPS: Final = 25
 QUIET_S: Final = 3.0
 """Timeout after which a station repeats a request."""
 
@@ -38,97 +34,58 @@ class Vehicle(threading.Thread):
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
-        self.master, slave = os.openpty()
-        tty.setraw(slave)
-        os.set_blocking(self.master, False)
-        self.path, self._slave = os.ttyname(slave), slave
+        self.line = SerialLine()
+        os.set_blocking(self.line.master, False)
         self.radio = 0
         """Bytes of requests and answers on the radio."""
         self.stopped = threading.Event()
         self._mav: Any = mavlink.MAVLink(None, 1, 1)
         self._mav.robust_parsing = True
-        self._out: deque[bytes] = deque()
-        self._left: deque[int] = deque()
-        """Parameters of the list that are still to be sent."""
+        self._answers: deque[Any] = deque()
+        """Answers that are still to be sent."""
 
     def run(self) -> None:
         """Transfer the bytes of each step in either direction."""
-        begin_s = next_s = sent_s = time.monotonic()
-        pending = b""
-        while not self.stopped.is_set():
-            now_s = time.monotonic()
-            if now_s - sent_s >= TELEMETRY_S:
-                sent_s = now_s
-                time_ms = round((now_s - begin_s) * 1000) + 60_000
-                for message in (
-                    mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3),
-                    mavlink.MAVLink_attitude_message(time_ms, 0, 0, 0, 0, 0, 0),
-                ):
-                    pending += self._pack(message)
+        next_s, step, pending = time.monotonic(), 0, b""
+        while not self.stopped.wait(max(0.0, next_s - time.monotonic())):
+            next_s, step = next_s + STEP_S, step + 1
+            if step % TELEMETRY_STEPS == 0:
+                time_ms = 60_000 + round(1000 * step * STEP_S)
+                pending += self._pack(mavlink.MAVLink_heartbeat_message(2, 3, 81, 0, 4, 3))
+                pending += self._pack(mavlink.MAVLink_attitude_message(time_ms, *(0,) * 6))
             self._receive()
-            while len(pending) < STEP_BYTES and (self._out or self._left):
-                answer = self._out.popleft() if self._out else self._parameter(self._left.popleft())
+            while len(pending) < STEP_BYTES and self._answers:
+                answer = self._pack(self._answers.popleft())
                 self.radio += len(answer)
                 pending += answer
-            pending = pending[os.write(self.master, pending[:STEP_BYTES]) :] if pending else b""
-            next_s += STEP_S
-            time.sleep(max(0.0, next_s - time.monotonic()))
-        os.close(self.master)
-        os.close(self._slave)
+            pending = pending[os.write(self.line.master, pending[:STEP_BYTES]) :]
+        self.line.close()
 
     def _receive(self) -> None:
         try:
-            data = os.read(self.master, STEP_BYTES)
+            data = os.read(self.line.master, STEP_BYTES)
         except BlockingIOError:
             return
         for message in self._mav.parse_buffer(data) or ():
             if getattr(message, "target_system", 0) == 1:
                 self.radio += len(message.get_msgbuf())
-                self._answer(message, message.get_srcSystem(), message.get_srcComponent())
+                self._answer(message, (message.get_srcSystem(), message.get_srcComponent()))
 
-    def _answer(self, message: Any, system: int, component: int) -> None:
+    def _answer(self, message: Any, sender: tuple[int, int]) -> None:
         match message.get_type():
             case "PARAM_REQUEST_LIST":
-                self._left = deque(range(PARAMETERS))
+                self._answers.clear()
+                self._answers.extend(map(parameter, range(PARAMETERS)))
             case "PARAM_REQUEST_READ":
-                self._out.append(self._parameter(message.param_index))
+                self._answers.append(parameter(message.param_index))
             case "MISSION_REQUEST_LIST":
                 count = ITEMS if message.mission_type == 0 else 0
-                self._out.append(
-                    self._pack(
-                        mavlink.MAVLink_mission_count_message(
-                            system, component, count, message.mission_type
-                        )
-                    )
-                )
+                answer = mavlink.MAVLink_mission_count_message(*sender, count, message.mission_type)
+                self._answers.append(answer)
             case "MISSION_REQUEST_INT":
-                self._out.append(
-                    self._pack(
-                        mavlink.MAVLink_mission_item_int_message(
-                            system,
-                            component,
-                            message.seq,
-                            6,
-                            16,
-                            0,
-                            1,
-                            0,
-                            0,
-                            0,
-                            0,
-                            470_000_000 + message.seq,
-                            80_000_000,
-                            50.0,
-                            0,
-                        )
-                    )
-                )
-
-    def _parameter(self, index: int) -> bytes:
-        name = f"PARAM_{index:04}".encode()
-        return self._pack(
-            mavlink.MAVLink_param_value_message(name, index + 0.1, 9, PARAMETERS, index)
-        )
+                item = (message.seq, 6, 16, 0, 1, 0, 0, 0, 0, 470_000_000 + message.seq, 80_000_000)
+                answer = mavlink.MAVLink_mission_item_int_message(*sender, *item, 50.0, 0)
+                self._answers.append(answer)
 
     def _pack(self, message: Any) -> bytes:
         data = bytes(message.pack(self._mav))
@@ -136,94 +93,67 @@ class Vehicle(threading.Thread):
         return data
 
 
-class Station:
-    """A ground station with pymavlink that requests missing data again."""
-
-    def __init__(self, port: int, system: int) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.connect(("127.0.0.1", port))
-        self._socket.settimeout(QUIET_S)
-        self._mav: Any = mavlink.MAVLink(None, system, 190)
-
-    def send(self, message: Any) -> None:
-        """Send one message."""
-        self._socket.send(message.pack(self._mav))
-        self._mav.seq = (self._mav.seq + 1) % 256
-
-    def load(self) -> float:
-        """Load all parameters, then the mission; return the time in s."""
-        while self._next("ATTITUDE") is None:
-            self.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
-        begin_s = time.monotonic()
-        parameters: set[int] = set()
-        self.send(mavlink.MAVLink_param_request_list_message(1, 1))
-        while len(parameters) < PARAMETERS:
-            value = self._next("PARAM_VALUE")
-            if value is not None:
-                parameters.add(value.param_index)
-                continue
-            for index in sorted({*range(PARAMETERS)} - parameters)[:10]:
-                self.send(mavlink.MAVLink_param_request_read_message(1, 1, b"", index))
-        self._ask(mavlink.MAVLink_mission_request_list_message(1, 1, 0), "MISSION_COUNT")
-        for number in range(ITEMS):
-            self._ask(
-                mavlink.MAVLink_mission_request_int_message(1, 1, number, 0), "MISSION_ITEM_INT"
-            )
-        self.send(mavlink.MAVLink_mission_ack_message(1, 1, 0, 0))
-        return time.monotonic() - begin_s
-
-    def _ask(self, request: Any, kind: str) -> None:
-        self.send(request)
-        while self._next(kind) is None:
-            self.send(request)
-
-    def _next(self, kind: str) -> Any:
-        """Return the next message of a kind; None after a timeout."""
-        until_s = time.monotonic() + QUIET_S
-        while time.monotonic() < until_s:
-            try:
-                data = self._socket.recv(65535)
-            except (TimeoutError, ConnectionRefusedError):
-                return None
-            for message in self._mav.parse_buffer(data) or ():
-                if message.get_type() == kind:
-                    return message
-        return None
+def parameter(index: int) -> Any:
+    """Return the value of a parameter."""
+    name = f"PARAM_{index:04}".encode()
+    return mavlink.MAVLink_param_value_message(name, index + 0.1, 9, PARAMETERS, index)
 
 
-def measure(options: str, folder: Path) -> None:
-    """Let two stations load everything, one after the other, and print their figures."""
+def load_all(port: int, system: int) -> float:
+    """Load all as a station that repeats unanswered requests; return the time."""
+    link: Any = mavutil.mavlink_connection(f"udpout:127.0.0.1:{port}")
+    link.mav = mavlink.MAVLink(link, system, 190)
+
+    def ask(kind: str, request: Any) -> None:
+        link.mav.send(request)
+        while link.recv_match(type=kind, blocking=True, timeout=QUIET_S) is None:
+            link.mav.send(request)
+
+    ask("ATTITUDE", mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+    begin_s = time.monotonic()
+    missing = {*range(PARAMETERS)}
+    link.mav.param_request_list_send(1, 1)
+    while missing:
+        value = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=QUIET_S)
+        if value is not None:
+            missing.discard(value.param_index)
+            continue
+        for index in sorted(missing)[:10]:
+            link.mav.param_request_read_send(1, 1, b"", index)
+    ask("MISSION_COUNT", mavlink.MAVLink_mission_request_list_message(1, 1, 0))
+    for number in range(ITEMS):
+        ask("MISSION_ITEM_INT", mavlink.MAVLink_mission_request_int_message(1, 1, number, 0))
+    link.mav.mission_ack_send(1, 1, 0, 0)
+    link.close()
+    return time.monotonic() - begin_s
+
+
+def measure(option: str, folder: Path) -> list[tuple[object, ...]]:
+    """Let two stations load everything, one after the other; return their figures."""
     vehicle, port = Vehicle(), free_port()
-    command = [
-        str(Path(sys.executable).parent / "mavgate"), "run", "--plain",
-        "--endpoint", f"serial:{vehicle.path}:9600{options}",
-        "--endpoint", f"udp-listen:127.0.0.1:{port}",
-    ]  # fmt: skip
+    radio = f"serial:{vehicle.line.device}:9600{option}"
+    ends = ("--endpoint", radio, "--endpoint", f"udp-listen:127.0.0.1:{port}")
     environment = os.environ | {"XDG_RUNTIME_DIR": str(folder), "HOME": str(folder)}
-    gateway = subprocess.Popen(
-        command, cwd=folder, env=environment,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    vehicle.start()
-    try:
-        for name in ("first", "second"):
-            station = Station(port, 254 + (name == "first"))
+    rows: list[tuple[object, ...]] = []
+    with running(*MAVGATE, "run", "--plain", *ends, cwd=folder, env=environment):
+        vehicle.start()
+        for name, system in (("first", 255), ("second", 254)):
             before = vehicle.radio
-            took_s = station.load()
-            figures = f"{took_s:.1f} s, {vehicle.radio - before} bytes"
-            print(f"{options or 'without'}: {name} station {figures}")
-    finally:
+            took_s = load_all(port, system)
+            rows.append((option or "without", name, took_s, vehicle.radio - before))
         vehicle.stopped.set()
-        gateway.terminate()
-        gateway.wait()
+    return rows
 
 
 def main() -> None:
     """Measure with the option and without it."""
-    argparse.ArgumentParser(description=__doc__.partition("\n")[0]).parse_args()
-    for options in ("", "?cache=yes"):
+    options, rows = arguments(__doc__).parse_args(), list[tuple[object, ...]]()
+    for option in ("", "?cache=yes"):
         with tempfile.TemporaryDirectory() as folder:
-            measure(options, Path(folder))
+            rows += measure(option, Path(folder))
+    columns = ("option", "station", "s", "bytes on the radio")
+    show(f"{PARAMETERS} parameters and {ITEMS} items over 9,600 baud", columns, rows)
+    write_json(options, {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -23,33 +23,40 @@ is compared with `mavgate run`, with and without a recording, and the first clie
 vehicles a command.
 """
 
-import argparse
 import contextlib
 import json
 import os
 import select
 import shlex
 import socket
-import statistics
 import struct
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 from gateway.compiled.system_calls import receive_many, send_many
 from gateway.wire.mavlink_messages import CRC_EXTRA, TARGET_OFFSETS, base_size
+from tools.harness import (
+    CORES,
+    MAVGATE,
+    PYTHON,
+    Figures,
+    arguments,
+    cpu_s,
+    medians,
+    port_of,
+    running,
+    show,
+    text_of,
+    udp_socket,
+    write_json,
+)
 
 CLIENTS = (1, 4, 16, 64)
 RATE_HZ = 1000
@@ -63,18 +70,12 @@ BATCH = 64
 """Maximum frames sent or received by one call."""
 START_LIMIT_S = 20.0
 SO_TIMESTAMPNS = 35
-CORES = sorted(os.sched_getaffinity(0))
-"""Processor cores: the forwarder runs on the last one, source and clients on the first."""
 KINDS = 20
 """Kinds of frame of each of several vehicles."""
 PAYLOAD_BYTES = 32
 WARM_UP_S = 2.0
 HUB_NAME, RUN, RECORDING = "mavgate", "mavgate run", "recording"
 """Names of the bare hub, and of the whole gateway without and with a recording."""
-WEB = "WebSocket"
-"""Name of the hub with its clients at a WebSocket port."""
-PACKED = "packed"
-"""Name of the hub with packed frames."""
 COMMANDED_S = 3.0
 
 PLAIN = """
@@ -105,8 +106,6 @@ event_loop, *endpoints = sys.argv[1:]
 with asyncio.Runner(loop_factory=importlib.import_module(event_loop).new_event_loop) as runner:
     runner.run(main(endpoints))
 """
-UVLOOP = "uvloop"
-"""Name of the hub on the event loop uvloop."""
 
 REFERENCE = "mavlink-router"
 ROUTERS = {
@@ -124,41 +123,13 @@ HANDSHAKE = (
     b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
 )
 
-COLUMNS = (
-    ("throughput", "delivered_per_s", ",.0f"),
-    ("throughput", "cpu_us_per_message", ".2f"),
-    ("latency", "cpu_percent", ".1f"),
-    ("latency", "p50_us", ".0f"),
-    ("latency", "p99_us", ".0f"),
-)
+COLUMNS = ("delivered_per_s", "cpu_us_per_message", "cpu_percent", "p50_us", "p99_us")
 Command = Callable[[int, list[int]], list[str]]
-
-
-@dataclass(frozen=True)
-class Throughput:
-    """Results of a run with a window."""
-
-    delivered_per_s: float
-    cpu_us_per_message: float
-    lost: int
-
-
-@dataclass(frozen=True)
-class Latency:
-    """Results of a run at a fixed rate."""
-
-    p50_us: float
-    p99_us: float
-    max_us: float
-    cpu_percent: float
-    lost: int
-    gap_us: float
-    """The longest time without a frame at a client."""
 
 
 def plain(port: int, clients: list[int]) -> list[str]:
     """Return the command line of the plain forwarder."""
-    return [sys.executable, "-c", PLAIN, str(port), *map(str, clients)]
+    return [PYTHON, "-c", PLAIN, str(port), *map(str, clients)]
 
 
 def router(command: str) -> Command:
@@ -194,7 +165,7 @@ def hub(options: str = "", event_loop: str = "asyncio") -> Command:
 
 def hub_command(*endpoints: str, event_loop: str = "asyncio") -> list[str]:
     """Return the command line of our hub with some endpoints."""
-    return [sys.executable, "-c", HUB, event_loop, *endpoints]
+    return [PYTHON, "-c", HUB, event_loop, *endpoints]
 
 
 def daemon(mode: str) -> Command:
@@ -208,9 +179,8 @@ def daemon(mode: str) -> Command:
             f'aircraft_folder = "{folder}"\n[hub]\nendpoints = {json.dumps(urls)}\n'
             f'[recording]\nmode = "{mode}"\nfolder = "{folder}"\n'
         )
-        program = str(Path(sys.executable).with_name("mavgate"))
         at = ["--config", str(settings), "--socket", str(folder / "run.sock")]
-        return [program, *at, "run", "--plain", "--port", "none"]
+        return [*MAVGATE, *at, "run", "--plain", "--port", "none"]
 
     return build
 
@@ -245,28 +215,6 @@ def heartbeat() -> bytes:
     """Encode a heartbeat, without which some forwarders do not forward."""
     message = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
     return bytes(message.pack(mavlink.MAVLink(None, SOURCE_SYSTEM, 1)))
-
-
-def udp_socket(port: int = 0) -> socket.socket:
-    """Open a socket on a loopback port, by default a free one."""
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
-    sock.bind(("127.0.0.1", port))
-    sock.setblocking(False)
-    return sock
-
-
-def cpu_ns(pid: int) -> int:
-    """Return the processor time of a process."""
-    return sum(
-        int(task.read_text().split()[0]) for task in Path(f"/proc/{pid}/task").glob("*/schedstat")
-    )
-
-
-def resident_kib(pid: int) -> int:
-    """Return the resident memory of a process."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return int(status.partition("VmRSS:")[2].split()[0])
 
 
 def stamp_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
@@ -310,40 +258,36 @@ class Bench:
             sink.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             self._poll.register(sink, select.POLLIN)
         with udp_socket() as probe:
-            self.port: int = probe.getsockname()[1]
+            self.port = port_of(probe)
         self._source = udp_socket(self.source_port)
-        Bench.source_port = self._source.getsockname()[1]
+        Bench.source_port = port_of(self._source)
         self._source.connect(("127.0.0.1", self.port))
         self._counts = [0] * clients
         self._stamps: list[list[int]] | None = None
         self._sent = Messages(np.frombuffer(b"".join(frames), np.uint8), len(frames))
         self._arrived = Messages(np.zeros(BATCH * 2048, np.uint8), BATCH)
-        self.process = subprocess.Popen(
-            command(self.port, [sink.getsockname()[1] for sink in self._sinks]),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            stdin=subprocess.DEVNULL,
+        self._opened = contextlib.ExitStack()
+        for sock in (*self._sinks, self._source):
+            self._opened.callback(sock.close)
+        self.process = self._opened.enter_context(
+            running(*command(self.port, [port_of(sink) for sink in self._sinks]))
         )
-        if len(CORES) > 1:
-            os.sched_setaffinity(self.process.pid, CORES[-1:])
+        os.sched_setaffinity(self.process.pid, CORES[-1:])
         self._wait_until_up()
 
-    def close(self) -> None:
-        """End the forwarder."""
-        self.process.terminate()
-        try:
-            self.process.wait(5)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        for sock in (*self._sinks, self._source):
-            sock.close()
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
 
-    def throughput(self, seconds: float, window: int) -> Throughput:
+    def __exit__(self, *_: object) -> None:
+        """End the forwarder."""
+        self._opened.close()
+
+    def throughput(self, seconds: float, window: int) -> Figures:
         """Keep a window of frames in transit and measure the rate."""
         self._counts = [0] * len(self._counts)
         sent, lost = 0, 0
-        begin_ns, begin_cpu = time.perf_counter_ns(), cpu_ns(self.process.pid)
+        begin_ns, begin_cpu_s = time.perf_counter_ns(), cpu_s(self.process.pid)
         end_ns = begin_ns + round(seconds * 1e9)
         moved_ns = begin_ns
         while True:
@@ -360,18 +304,22 @@ class Bench:
                 lost, moved_ns = sent - min(self._counts), now_ns
                 if now_ns >= end_ns:
                     break
-        elapsed_s = (moved_ns - begin_ns) / 1e9
-        used_ns = cpu_ns(self.process.pid) - begin_cpu
         delivered = sum(self._counts)
-        lost = sent * len(self._sinks) - delivered
-        return Throughput(delivered / elapsed_s, used_ns / max(1, delivered) / 1000, lost)
+        return {
+            "delivered_per_s": delivered / (1e-9 * (moved_ns - begin_ns)),
+            "cpu_us_per_message": 1e6 * self._cpu_since(begin_cpu_s) / max(1, delivered),
+            "lost": sent * len(self._sinks) - delivered,
+        }
 
-    def latency(self, seconds: float, rate_hz: int) -> Latency:
-        """Send at a fixed rate and compare the kernel's timestamps with the times of sending."""
+    def latency(self, seconds: float, rate_hz: int) -> Figures:
+        """Send at a fixed rate and compare the kernel's timestamps with the times of sending.
+
+        `gap_us` is the longest time without a frame at a client.
+        """
         self._counts = [0] * len(self._counts)
         self._stamps = [[] for _ in self._sinks]
         sent_ns: list[int] = []
-        begin_cpu, begin_ns = cpu_ns(self.process.pid), time.time_ns()
+        begin_cpu_s, begin_ns = cpu_s(self.process.pid), time.time_ns()
         for number in range(round(seconds * rate_hz)):
             due_ns = begin_ns + number * 1_000_000_000 // rate_hz
             while (wait_ns := due_ns - time.time_ns()) > 0:
@@ -379,21 +327,22 @@ class Bench:
                     self._take(sink.fileno())
             sent_ns.append(time.time_ns())
             self._send(self._frames[number % FRAMES])
-        elapsed_ns = time.time_ns() - begin_ns
-        used_ns = cpu_ns(self.process.pid) - begin_cpu
+        share = self._cpu_since(begin_cpu_s) / (1e-9 * (time.time_ns() - begin_ns))
         self._settle()
         stamps, self._stamps = self._stamps, None
         whole = [row for row in stamps if len(row) == len(sent_ns)]
         times_us = np.concatenate([np.subtract(row, sent_ns) for row in whole] or [[0]]) / 1000
-        return Latency(
-            p50_us=float(np.percentile(times_us, 50)),
-            p99_us=float(np.percentile(times_us, 99)),
-            max_us=float(times_us.max()),
-            cpu_percent=100 * used_ns / elapsed_ns,
-            lost=len(sent_ns) * len(stamps) - sum(self._counts),
-            gap_us=max((float(np.diff(row).max()) for row in stamps if len(row) > 1), default=0.0)
-            / 1000,
-        )
+        gaps_ns = [float(np.diff(row).max()) for row in stamps if len(row) > 1]
+        return {
+            "p50_us": float(np.percentile(times_us, 50)),
+            "p99_us": float(np.percentile(times_us, 99)),
+            "cpu_percent": 100 * share,
+            "lost": len(sent_ns) * len(stamps) - sum(self._counts),
+            "gap_us": max(gaps_ns, default=0.0) / 1000,
+        }
+
+    def _cpu_since(self, begin_s: float) -> float:
+        return cpu_s(self.process.pid) - begin_s
 
     def commanded(self, vehicles: int) -> int:
         """Send a command to each of some vehicles; return the number that arrived."""
@@ -420,16 +369,6 @@ class Bench:
                         reached.add((message.target_system, message.target_component))
         return len(reached)
 
-    def run_until(self, delivered: int) -> Iterator[tuple[int, int]]:
-        """Forward until `delivered` messages are delivered; yield count and KiB repeatedly."""
-        total = 0
-        while total < delivered:
-            self.throughput(2.0, WINDOWS[0])
-            if not any(self._counts):
-                raise RuntimeError("the forwarder has stopped")
-            total += sum(self._counts)
-            yield total, resident_kib(self.process.pid)
-
     def _wait_until_up(self) -> None:
         limit = time.monotonic() + START_LIMIT_S
         while time.monotonic() < limit:
@@ -441,7 +380,7 @@ class Bench:
                 self._settle()
                 return
             time.sleep(0.05)
-        self.close()
+        self._opened.close()
         raise RuntimeError(f"{self.process.args!r} forwards nothing")
 
     def _send(self, frame: bytes) -> None:
@@ -491,9 +430,8 @@ class WebBench(Bench):
     """The hub with clients at its WebSocket port that count frames in the messages."""
 
     def __init__(self, clients: int, frames: list[bytes]) -> None:
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self._web_port: int = probe.getsockname()[1]
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            self._web_port = port_of(probe)
         self._rests: list[bytes] = []
         super().__init__(self._command, clients, frames)
 
@@ -563,136 +501,93 @@ Start = Callable[[int, list[bytes]], Bench]
 """Starts a forwarder for a number of clients, with some frames."""
 
 
-def lossless(bench: Bench, seconds: float) -> Throughput:
+def lossless(bench: Bench, seconds: float) -> Figures:
     """Return the fastest run without loss, or else the last one."""
     for window in WINDOWS:
         result = bench.throughput(seconds, window)
-        if not result.lost:
+        if not result["lost"]:
             break
     return result
 
 
-def summed_up(results: list[dict[str, float]]) -> dict[str, float]:
-    """Return the median of the rounds for each figure, and the sum of the losses."""
-    return {
-        key: (sum if key == "lost" else statistics.median)([result[key] for result in results])
-        for key in results[0]
-    }
-
-
-def measure(
-    forwarders: dict[str, Start], clients: int, rounds: int, seconds: float
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Run all forwarders with a number of clients, in turn."""
-    frames = source_frames()
-    found: dict[str, tuple[list[dict[str, float]], list[dict[str, float]]]] = {
-        name: ([], []) for name in forwarders
-    }
+def in_turn(
+    forwarders: Mapping[str, Start], clients: int, vehicles: int, rounds: int,
+    measure: Callable[[Bench], Figures],
+) -> dict[str, Figures]:  # fmt: skip
+    """Measure all forwarders in turn; return the median round of each."""
+    frames = source_frames(vehicles)
+    found: dict[str, list[Figures]] = {name: [] for name in forwarders}
     for _ in range(rounds):
         for name, start in forwarders.items():
-            bench = start(clients, frames)
-            try:
-                found[name][0].append(asdict(lossless(bench, seconds)))
-                found[name][1].append(asdict(bench.latency(seconds, RATE_HZ)))
-            finally:
-                bench.close()
-    return {
-        name: {"throughput": summed_up(fast), "latency": summed_up(late)}
-        for name, (fast, late) in found.items()
-    }
+            with start(clients, frames) as bench:
+                found[name].append(measure(bench))
+    return {name: medians(rows) for name, rows in found.items()}
 
 
-def show(report: dict[str, dict[str, dict[str, dict[str, float]]]]) -> None:
-    """Print the figures, with their ratios to the plain forwarder and to mavlink-router."""
-    table = Table(title="Forwarding MAVLink, 44-byte frames, loopback", box=box.SIMPLE_HEAD)
-    for column in ("clients", "forwarder", "lossless/s", "CPU µs/msg", f"CPU % @{RATE_HZ}/s",
-                   "p50 µs", "p99 µs", "lost"):  # fmt: skip
-        table.add_column(column, justify="right")
-    for clients, by_name in report.items():
-        for name, figures in by_name.items():
-            cells = []
-            for part, key, form in COLUMNS:
-                value = figures[part][key]
-                bases = [by_name[base][part][key] for base in ("plain", REFERENCE)
-                         if base in by_name]  # fmt: skip
-                ratios = " ".join(f"{value / base:.2f}" for base in bases if base)
-                cells.append(f"{value:{form}} ({ratios})")
-            lost = figures["throughput"]["lost"] + figures["latency"]["lost"]
-            table.add_row(clients, name, *cells, f"{lost:.0f}")
-    Console(width=140).print(table)
-    print("in brackets: times the plain forwarder, times mavlink-router")
+def measure_clients(
+    forwarders: Mapping[str, Start], clients: list[int], rounds: int, seconds: float
+) -> dict[str, dict[str, Figures]]:
+    """Measure rate, cost and latency with some numbers of clients."""
 
+    def measure(bench: Bench) -> Figures:
+        fast, late = lossless(bench, seconds), bench.latency(seconds, RATE_HZ)
+        return fast | late | {"lost": fast["lost"] + late["lost"]}
 
-def measure_vehicles(
-    forwarders: dict[str, Start], vehicles: list[int], clients: int, rounds: int, seconds: float
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Measure the cost of frames of some vehicles behind one link, and command each of them."""
-    found: dict[str, dict[str, dict[str, float]]] = {}
-    for count in vehicles:
-        frames, runs = (
-            source_frames(count),
-            {name: list[tuple[float, float]]() for name in forwarders},
-        )
-        reached = dict.fromkeys(forwarders, 0)
-        for _ in range(rounds):
-            for name, start in forwarders.items():
-                bench = start(clients, frames)
-                try:
-                    # The first frame of each kind is routed.
-                    bench.throughput(WARM_UP_S, WINDOWS[0])
-                    fast = bench.throughput(seconds, WINDOWS[0])
-                    late = bench.latency(seconds, RATE_HZ)
-                    runs[name].append((fast.cpu_us_per_message, late.cpu_percent))
-                    reached[name] = bench.commanded(count) if name != "plain" else 0
-                finally:
-                    bench.close()
-        found[str(count)] = {
-            name: {
-                "cpu_us_per_message": statistics.median(fast for fast, _ in figures),
-                "cpu_percent": statistics.median(late for _, late in figures),
-                "commanded": reached[name],
-            }
-            for name, figures in runs.items()
-        }
-    show_vehicles(found)
+    found = {str(count): in_turn(forwarders, count, 1, rounds, measure) for count in clients}
+    show(
+        "Forwarding MAVLink, 44-byte frames, loopback; in brackets: times the plain forwarder, "
+        "times mavlink-router",
+        ("clients", "forwarder", "lossless/s", "CPU µs/msg", f"CPU % @{RATE_HZ}/s", "p50 µs",
+         "p99 µs", "lost"),
+        [
+            (count, name, *(with_ratios(by_name, name, key, "plain", REFERENCE) for key in COLUMNS),
+             figures["lost"])
+            for count, by_name in found.items()
+            for name, figures in by_name.items()
+        ],
+    )  # fmt: skip
     return found
 
 
-def show_vehicles(found: dict[str, dict[str, dict[str, float]]]) -> None:
-    """Print the figures of vehicles behind one link, with their ratios to the bare hub."""
-    table = Table(title=f"Vehicles of {KINDS} kinds of frame behind one link", box=box.SIMPLE_HEAD)
-    for column in ("vehicles", "forwarder", "CPU µs/msg", f"CPU % @{RATE_HZ}/s", "commanded"):
-        table.add_column(column, justify="right")
-    for count, by_name in found.items():
-        for name, figures in by_name.items():
-            cells = [
-                f"{figures[key]:.2f} ({figures[key] / by_name[HUB_NAME][key]:.2f})"
-                for key in ("cpu_us_per_message", "cpu_percent")
-            ]
-            table.add_row(count, name, *cells, f"{figures['commanded']:.0f}")
-    Console(width=120).print(table)
-    print("in brackets: times the bare hub")
+def measure_vehicles(
+    forwarders: Mapping[str, Start], vehicles: list[int], clients: int, rounds: int, seconds: float
+) -> dict[str, dict[str, Figures]]:
+    """Measure the cost of frames of some vehicles behind one link, and command each of them."""
+
+    def measure(bench: Bench, count: int) -> Figures:
+        # The first frame of each kind is routed.
+        bench.throughput(WARM_UP_S, WINDOWS[0])
+        fast, late = bench.throughput(seconds, WINDOWS[0]), bench.latency(seconds, RATE_HZ)
+        return fast | late | {"commanded": bench.commanded(count)}
+
+    found = {
+        str(count): in_turn(forwarders, clients, count, rounds, partial(measure, count=count))
+        for count in vehicles
+    }
+    keys = ("cpu_us_per_message", "cpu_percent")
+    show(
+        f"Vehicles of {KINDS} kinds of frame behind one link; in brackets: times the bare hub",
+        ("vehicles", "forwarder", "CPU µs/msg", f"CPU % @{RATE_HZ}/s", "commanded"),
+        [
+            (count, name, *(with_ratios(by_name, name, key, HUB_NAME) for key in keys),
+             figures["commanded"])
+            for count, by_name in found.items()
+            for name, figures in by_name.items()
+        ],
+    )  # fmt: skip
+    return found
 
 
-def watch_memory(messages: int) -> dict[str, int]:
-    """Forward many messages through the hub to 16 clients and measure its memory."""
-    bench = Bench(hub(), 16, source_frames())
-    track: list[tuple[int, int]] = []
-    try:
-        for total, kib in bench.run_until(messages):
-            track.append((total, kib))
-            print(f"{total:>12,} delivered  {kib:>8,} KiB", flush=True)
-    finally:
-        bench.close()
-    return {"delivered": track[-1][0], "first_kib": track[0][1], "last_kib": track[-1][1]}
+def with_ratios(by_name: Mapping[str, Figures], name: str, key: str, *bases: str) -> str:
+    """Return a figure, with its ratios to those of other forwarders."""
+    value = by_name[name][key]
+    ratios = [value / by_name[base][key] for base in bases if by_name.get(base, {}).get(key)]
+    return f"{text_of(value)} ({' '.join(f'{ratio:.2f}' for ratio in ratios)})"
 
 
 def main() -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the figures to this file too")
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=2.0, help="duration of each run")
+    parser = arguments(__doc__, rounds=3, seconds=2.0)
     parser.add_argument("--clients", type=int, nargs="+", default=CLIENTS)
     parser.add_argument("--uvloop", action="store_true", help="compare the hub on uvloop")
     for name in ROUTERS:
@@ -704,47 +599,29 @@ def main() -> None:
     parser.add_argument(
         "--vehicles", type=int, nargs="+", help="measure these numbers of vehicles of one link"
     )
-    parser.add_argument(
-        "--memory", type=int, metavar="MESSAGES", help="only measure memory over this many messages"
-    )
     options = parser.parse_args()
     os.sched_setaffinity(0, CORES[:1])
-    report: dict[str, object] = {"load_before": os.getloadavg(), "cores": os.cpu_count()}
-    forwarders: dict[str, Start] = {
-        "plain": partial(Bench, plain),
-        HUB_NAME: partial(Bench, hub()),
-        PACKED: partial(Bench, hub("?pack=1100")),
-        WEB: WebBench,
-    }
+    forwarders: dict[str, Start] = {"plain": partial(Bench, plain), HUB_NAME: partial(Bench, hub())}
+    if options.vehicles:
+        forwarders[RUN] = partial(Bench, daemon("manual"))
+        forwarders[RECORDING] = partial(Bench, daemon("always"))
+    else:
+        forwarders |= {"packed": partial(Bench, hub("?pack=1100")), "WebSocket": WebBench}
     if options.uvloop:
-        forwarders[UVLOOP] = partial(Bench, hub(event_loop=UVLOOP))
-    for name, arguments in ROUTERS.items():
+        forwarders["uvloop"] = partial(Bench, hub(event_loop="uvloop"))
+    for name, words in ROUTERS.items():
         if command := getattr(options, name.replace("-", "_")):
-            forwarders[name] = partial(Bench, router(f"{command} {arguments}"))
+            forwarders[name] = partial(Bench, router(f"{command} {words}"))
     for given in options.router:
         name, _, command = given.partition("=")
         forwarders[name] = partial(Bench, router(command))
-    if options.memory:
-        report["memory"] = watch_memory(options.memory)
-    elif options.vehicles:
-        for name in (PACKED, WEB):
-            del forwarders[name]
-        forwarders |= {
-            RUN: partial(Bench, daemon("manual")),
-            RECORDING: partial(Bench, daemon("always")),
-        }
-        report["vehicles"] = measure_vehicles(
+    if options.vehicles:
+        found = measure_vehicles(
             forwarders, options.vehicles, options.clients[0], options.rounds, options.seconds
         )
     else:
-        figures = {
-            str(clients): measure(forwarders, clients, options.rounds, options.seconds)
-            for clients in options.clients
-        }
-        show(figures)
-        report["forwarding"] = figures
-    if options.json:
-        options.json.write_text(json.dumps(report, indent=2) + "\n")
+        found = measure_clients(forwarders, options.clients, options.rounds, options.seconds)
+    write_json(options, found)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measure latency and CPU share from the serial byte to the datagram.
 
-    python tools/bench_latency.py
+    python -m tools.bench_latency
 
 Several aircraft send all payloads of their nodes: IMU and barometer samples, fixes with their
 quality, the reports of nodes and receiver. A frame with an IMU sample is written to a
@@ -12,37 +12,41 @@ or encoding; `--forwarder` names another such program, in any language. The maxi
 highest rate is the longest pause, including pauses of the machine, which the baseline has as well.
 """
 
-import argparse
-import contextlib
 import itertools
 import json
 import math
 import os
 import select
 import shlex
-import socket
-import statistics
-import subprocess
-import sys
 import tempfile
 import time
-import tty
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
-from rich import box
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
 from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
+from tools.harness import (
+    MAVGATE,
+    PYTHON,
+    Figures,
+    SerialLine,
+    arguments,
+    cpu_s,
+    medians,
+    port_of,
+    running,
+    show,
+    udp_socket,
+    write_json,
+)
 
 RATES_HZ = (100, 1000)
 VEHICLES = 3
@@ -50,9 +54,7 @@ BARO_HZ, FIX_HZ, REPORT_HZ = 25, 5, 1
 """Rates of each aircraft's other payloads; REPORT_HZ is that of the receiver's report too."""
 WARM_UP_S = 3.0
 START_LIMIT_S = 120.0
-CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
 GATEWAY = "mavgate"
-WITH_UVLOOP = "mavgate, uvloop"
 OF_LINES = "mavgate, JSON lines"
 """Name of the run with one aircraft that sends each sample as a line of JSON."""
 
@@ -172,42 +174,30 @@ def frames(rate_hz: int) -> Iterator[bytes]:
     return (moment.sample for moment in Nodes().moments(rate_hz, 1))
 
 
-def cpu_seconds(pid: int) -> float:
-    """Return the CPU time of a process."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / CLOCK_TICKS
-
-
 class Line:
-    """A pseudo-terminal with a program at its other end, and the UDP port for its answers."""
+    """A program at a serial line, and the UDP port for its answers.
 
-    def __init__(self, name: str, command: list[str], moments: Iterator[Moment]) -> None:
-        self._is_gateway = name in (GATEWAY, WITH_UVLOOP, OF_LINES)
-        self._moments = moments
+    The command has `{line}` and `{port}` for both. A gateway answers each IMU sample, any other
+    program each frame.
+    """
+
+    def __init__(self, command: list[str], moments: Iterator[Moment], *, is_gateway: bool) -> None:
+        self._is_gateway, self._moments = is_gateway, moments
         self._waiting: dict[int, deque[float | None]] = {}
         """Times of unanswered frames, by system; None for frames that are not measured."""
         self._latencies_us: list[float] = []
         self.unanswered = 0
         """Frames of the last exchange without an answer."""
-        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sock.bind(("127.0.0.1", 0))
-        self._sock.setblocking(False)
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        values = {"line": os.ttyname(self._slave), "port": self._sock.getsockname()[1]}
-        self.process = subprocess.Popen(
-            [word.format(**values) for word in command],
-            stderr=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-        )
+        self._line, self._sock = SerialLine(), udp_socket()
+        values = {"line": self._line.device, "port": port_of(self._sock)}
+        self._program = running(*(word.format(**values) for word in command))
+        self.process = self._program.__enter__()
 
     def close(self) -> None:
         """End the program."""
-        self.process.terminate()
-        self.process.wait(10)
+        self._program.__exit__(None, None, None)
         self._sock.close()
-        os.close(self._master)
-        os.close(self._slave)
+        self._line.close()
 
     def await_answer(self, rate_hz: int) -> None:
         """Feed the line until the program answers, then read all answers."""
@@ -251,11 +241,11 @@ class Line:
         moment = next(self._moments)
         queue = self._waiting.setdefault(moment.system if self._is_gateway else 0, deque())
         queue.append(time.perf_counter())
-        os.write(self._master, moment.sample)
+        os.write(self._line.master, moment.sample)
         for frame in moment.others:
             if not self._is_gateway:
                 queue.append(None)
-            os.write(self._master, frame)
+            os.write(self._line.master, frame)
 
     def _receive(self) -> bool:
         """Read one datagram; return whether it answers a frame."""
@@ -271,58 +261,36 @@ class Line:
 
 
 def measure(
-    name: str, command: list[str], rate_hz: int, options: argparse.Namespace
-) -> dict[str, float]:
+    command: list[str], moments: Iterator[Moment], rate_hz: int, seconds: float, *, is_gateway: bool
+) -> Figures:
     """Run a program on a separate line and measure it."""
-    of_nodes = Nodes().moments(rate_hz, options.vehicles)
-    line = Line(name, command, line_moments(rate_hz) if name == OF_LINES else of_nodes)
+    line = Line(command, moments, is_gateway=is_gateway)
     try:
         line.await_answer(rate_hz)
         line.exchange(rate_hz, WARM_UP_S)
-        cpu, wall = cpu_seconds(line.process.pid), time.perf_counter()
-        latencies_us = line.exchange(rate_hz, options.seconds)
-        share = (cpu_seconds(line.process.pid) - cpu) / (time.perf_counter() - wall)
+        begin_cpu_s, begin_s = cpu_s(line.process.pid), time.perf_counter()
+        latencies_us = line.exchange(rate_hz, seconds)
+        share = (cpu_s(line.process.pid) - begin_cpu_s) / (time.perf_counter() - begin_s)
     finally:
         line.close()
-    p50, p99 = np.percentile(latencies_us, [50, 99])
+    p50, p99 = map(float, np.percentile(latencies_us, [50, 99]))
     return {
-        "p50_us": float(p50),
-        "p99_us": float(p99),
-        "max_us": max(latencies_us),
-        "cpu_percent": 100 * share,
-        "unanswered": line.unanswered,
-    }
+        "p50_us": p50, "p99_us": p99, "max_us": max(latencies_us), "cpu_percent": 100 * share,
+        "lost": line.unanswered,
+    }  # fmt: skip
 
 
-def programs(folder: Path, options: argparse.Namespace) -> dict[str, list[str]]:
-    """Return the command line of each program, with placeholders for the line and the port."""
-    loops = {GATEWAY: "asyncio"} | ({WITH_UVLOOP: "uvloop"} if options.uvloop else {})
-    commands = {"plain forwarder": [sys.executable, "-c", BASELINE, "{line}", "{port}"]}
-    for name, event_loop in loops.items():
-        config = folder / f"{event_loop}.toml"
-        config.write_text(CONFIG.format(event_loop=event_loop))
-        gateway = f"-m gateway.cli run --plain --config {config} --port {{line}}"
-        endpoint = ["--endpoint", "udp:127.0.0.1:{port}"]
-        commands[name] = [sys.executable, *gateway.split(), *endpoint]
-    config = folder / "asyncio.toml"
-    gateway = f"-m gateway.cli run --plain --config {config} --source lines:{{line}}"
-    commands[OF_LINES] = [sys.executable, *gateway.split(), "--endpoint", "udp:127.0.0.1:{port}"]
-    return commands | {command.split()[0]: shlex.split(command) for command in options.forwarder}
-
-
-def summed_up(rounds: list[dict[str, float]]) -> dict[str, float]:
-    """Return the median round of each figure, the longest pause, and all unanswered frames."""
-    ways: dict[str, Callable[[list[float]], float]] = {"max_us": max, "unanswered": sum}
-    return {
-        key: ways.get(key, statistics.median)([one[key] for one in rounds]) for key in rounds[0]
-    }
+def gateway(folder: Path, event_loop: str, *input_: str) -> list[str]:
+    """Return the command of a gateway with an input."""
+    config = folder / f"{event_loop}.toml"
+    config.write_text(CONFIG.format(event_loop=event_loop))
+    endpoint = ("--endpoint", "udp:127.0.0.1:{port}")
+    return [*MAVGATE, "run", "--plain", "--config", str(config), *input_, *endpoint]
 
 
 def main() -> None:
     """Run every rate and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=5.0, help="of each single run")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser = arguments(__doc__, rounds=3, seconds=5.0)
     parser.add_argument("--vehicles", type=int, default=VEHICLES)
     parser.add_argument(
         "--forwarder", action="append", default=[], metavar="COMMAND",
@@ -331,43 +299,36 @@ def main() -> None:
     parser.add_argument(
         "--uvloop", action="store_true", help="measure the gateway with hub.event_loop = uvloop too"
     )
-    parser.add_argument("--json", type=Path, help="write the figures to this file too")
     options = parser.parse_args()
-    found: dict[tuple[int, str], list[dict[str, float]]] = {}
-    with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        commands = programs(folder, options)
-        runs = list(itertools.product(range(options.rounds), RATES_HZ, commands))
-        for _, rate_hz, name in track(runs, "measuring"):
-            figures = measure(name, commands[name], rate_hz, options)
-            found.setdefault((rate_hz, name), []).append(figures)
-    results = {key: summed_up(rounds) for key, rounds in found.items()}
-    show(results, options)
-    if options.json:
-        rows = [{"rate_hz": rate, "program": name, **r} for (rate, name), r in results.items()]
-        options.json.write_text(json.dumps(rows, indent=1) + "\n")
-
-
-def show(results: dict[tuple[int, str], dict[str, float]], options: argparse.Namespace) -> None:
-    """Print the figures as a table, and the longest pauses."""
-    title = f"serial byte in to datagram out, {options.vehicles} aircraft"
-    table = Table(title=title, box=box.SIMPLE_HEAD)
-    for column in ("IMU/s", "program", "p50 µs", "p99 µs", "max µs", "CPU %", "unanswered"):
-        table.add_column(column, justify="left" if column == "program" else "right")
-    for (rate_hz, name), row in results.items():
-        latencies = (f"{row[key]:.0f}" for key in ("p50_us", "p99_us", "max_us"))
-        table.add_row(
-            str(rate_hz), name, *latencies, f"{row['cpu_percent']:.1f}", f"{row['unanswered']:.0f}"
-        )
-    console = Console()
-    console.print(table)
-    # At the highest rate, a frame waits for almost all of a pause, so the maximum is the longest.
-    fastest, lasted_s = max(RATES_HZ), options.rounds * options.seconds
-    for (rate_hz, name), row in results.items():
-        if rate_hz == fastest:
-            console.print(
-                f"longest pause of {name}: {row['max_us'] / 1e3:.1f} ms in {lasted_s:.0f} s"
+    found: dict[tuple[int, str], list[Figures]] = {}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        gateways = {
+            GATEWAY: gateway(folder, "asyncio", "--port", "{line}"),
+            OF_LINES: gateway(folder, "asyncio", "--source", "lines:{line}"),
+        }
+        if options.uvloop:
+            gateways["mavgate, uvloop"] = gateway(folder, "uvloop", "--port", "{line}")
+        commands = {"plain forwarder": [PYTHON, "-c", BASELINE, "{line}", "{port}"], **gateways}
+        commands |= {command.split()[0]: shlex.split(command) for command in options.forwarder}
+        runs = [*itertools.product(range(options.rounds), RATES_HZ, commands)]
+        for _, rate_hz, program in track(runs, "measuring"):
+            moments = Nodes().moments(rate_hz, options.vehicles)
+            figures = measure(
+                commands[program],
+                line_moments(rate_hz) if program == OF_LINES else moments,
+                rate_hz,
+                options.seconds,
+                is_gateway=program in gateways,
             )
+            found.setdefault((rate_hz, program), []).append(figures)
+    rows = [(*key, medians(rounds, maxima=["max_us"])) for key, rounds in found.items()]
+    show(
+        f"serial byte in to datagram out, {options.vehicles} aircraft",
+        ("IMU/s", "program", "p50 µs", "p99 µs", "max µs", "CPU %", "unanswered"),
+        [(rate_hz, program, *figures.values()) for rate_hz, program, figures in rows],
+    )
+    write_json(options, {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -8,13 +8,9 @@ with a browser that draws on the gateway's own cores. The memory of an hour is t
 stored state, fed with simulated time.
 """
 
-import argparse
 import contextlib
-import json
 import os
-import re
 import socket
-import sys
 import tempfile
 import threading
 import time
@@ -25,16 +21,13 @@ from typing import Any
 import numpy as np
 from playwright.sync_api import Browser, Page, sync_playwright
 from pymavlink.dialects.v20 import common as mavlink
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.panel.panel_server import make_parts
 from gateway.panel.panel_settings import PanelSettings
 from tests.kit.process import Process
 from tests.ports import free_port
-from tools.bench_latency import GATEWAY, Line, Nodes, cpu_seconds
+from tools.bench_latency import Line, Nodes
+from tools.harness import MAVGATE, Figures, arguments, cpu_s, memory_mb, show, write_json
 
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
@@ -48,13 +41,12 @@ RATE_HZ = 25
 VIEWERS = (1, 5)
 GATEWAY_HZ = 200
 TURNS = 3
-SETTLE_MS = 3000
+SETTLE_S = 3.0
 MINUTES = (10, 20, 40, 60, 80, 120)
 """Minutes after which memory is measured; the path is full after 67."""
 GOAL_P99_MS = 100
 GOAL_RATIO = 1.1
 GOAL_CLICK_MS = 200
-console = Console()
 
 WATCH = """
 window.late_ms = [];
@@ -122,12 +114,6 @@ class Vehicle(threading.Thread):
         yield mavlink.MAVLink_vfr_hud_message(14.0, 14.0, 90, 0, 500.0, sent_s)
 
 
-def memory_mb(pid: int) -> float:
-    """Return the memory of a process."""
-    text = Path(f"/proc/{pid}/status").read_text()
-    return int(re.findall(r"VmRSS:\s+(\d+)", text)[0]) / 1000
-
-
 def open_pages(browser: Browser, link: str, count: int) -> list[Page]:
     """Open the page several times and wait for the aircraft."""
     pages = [browser.new_page(viewport={"width": 1024, "height": 768}) for _ in range(count)]
@@ -137,75 +123,71 @@ def open_pages(browser: Browser, link: str, count: int) -> list[Page]:
     return pages
 
 
-def measure_page(browser: Browser, folder: Path, seconds: float) -> list[dict[str, float]]:
+@contextlib.contextmanager
+def panel_of_vehicle(folder: Path) -> Iterator[tuple[Process, Vehicle]]:
+    """Run a panel and the vehicle that sends to it."""
+    vehicle = Vehicle(free_port())
+    vehicle.start()
+    words = ("panel", "--connect", f"udp-listen:127.0.0.1:{vehicle.port}", "--tcp-port", "0")
+    with Process(folder, *words, config="[panel]\nmap_styles = []\n") as panel:
+        yield panel, vehicle
+    vehicle.end()
+
+
+def measure_page(browser: Browser, folder: Path, seconds: float) -> list[Figures]:
     """Measure delay, CPU and memory with one viewer and with several."""
-    port = free_port()
     found = []
-    connect = f"udp-listen:127.0.0.1:{port}"
-    options = ("panel", "--connect", connect, "--tcp-port", "0")
-    with Process(folder, *options, config="[panel]\nmap_styles = []\n") as panel:
-        process, link = panel.process, panel.link()
-        vehicle = Vehicle(port)
-        vehicle.start()
+    with panel_of_vehicle(folder) as (panel, vehicle):
+        pid, link = panel.process.pid, panel.link()
         for count in VIEWERS:
             pages = open_pages(browser, link, count)
-            pages[0].wait_for_timeout(SETTLE_MS)
+            pages[0].wait_for_timeout(1000 * SETTLE_S)
             pages[0].evaluate(WATCH.replace("EPOCH", str(vehicle.epoch_ms)))
-            cpu, begin = cpu_seconds(process.pid), time.monotonic()
-            memory = memory_mb(process.pid)
+            begin_cpu_s, begin_s, before_mb = cpu_s(pid), time.monotonic(), memory_mb(pid)
             pages[0].wait_for_timeout(seconds * 1000)
             late_ms = pages[0].evaluate("window.late_ms")
-            share = (cpu_seconds(process.pid) - cpu) / (time.monotonic() - begin)
-            p50, p99 = np.percentile(late_ms, [50, 99])
+            share = (cpu_s(pid) - begin_cpu_s) / (time.monotonic() - begin_s)
+            p50, p99 = map(float, np.percentile(late_ms, [50, 99]))
+            after_mb = memory_mb(pid)
             found.append(
                 {
-                    "viewers": count,
-                    "drawn": len(late_ms),
-                    "drawn_hz": len(late_ms) / seconds,
-                    "p50_ms": float(p50),
-                    "p99_ms": float(p99),
-                    "cpu_percent": 100 * share,
-                    "memory_mb": memory_mb(process.pid),
-                    "memory_growth_mb": memory_mb(process.pid) - memory,
+                    "viewers": count, "drawn_hz": len(late_ms) / seconds, "p50_ms": p50,
+                    "p99_ms": p99, "cpu_percent": 100 * share, "memory_mb": after_mb,
+                    "memory_growth_mb": after_mb - before_mb,
                 }
-            )
+            )  # fmt: skip
             for page in pages:
                 page.close()
-        vehicle.end()
     return found
 
 
-def measure_clicks(browser: Browser, folder: Path) -> dict[str, float]:
+def measure_clicks(browser: Browser, folder: Path) -> Figures:
     """Measure the time from a click in the rail until the view is drawn."""
-    vehicle = Vehicle(free_port())
-    vehicle.start()
-    options = ("panel", "--connect", f"udp-listen:127.0.0.1:{vehicle.port}", "--tcp-port", "0")
-    with Process(folder, *options, config="[panel]\nmap_styles = []\n") as panel:
+    with panel_of_vehicle(folder) as (panel, _):
         (page,) = open_pages(browser, panel.link(), 1)
-        views = page.locator(".rail button").evaluate_all("all => all.map((b) => b.dataset.view)")
+        views = page.locator(".rail button[data-view]").evaluate_all(
+            "all => all.map((b) => b.dataset.view)"
+        )
         for view in views:
             page.locator(f".rail button[data-view='{view}']").click()
             page.locator(f"section[data-view='{view}'] > *").first.wait_for()
         times_ms = [page.evaluate(CLICK, view) for _ in range(CLICKS) for view in views]
         page.close()
-    vehicle.end()
-    p50, p95 = np.percentile(times_ms, [50, 95])
-    return {"p50_ms": float(p50), "p95_ms": float(p95), "longest_ms": max(times_ms)}
+    p50, p95 = map(float, np.percentile(times_ms, [50, 95]))
+    return {"p50_ms": p50, "p95_ms": p95, "longest_ms": max(times_ms)}
 
 
-def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict[str, Any]:
-    """Measure the gateway's delay without a panel and with an open page, in turn."""
+def measure_gateway(browser: Browser, folder: Path, seconds: float) -> Figures:
+    """Measure the gateway's p99 without a panel and with an open page, in turn."""
     config = folder / "gateway.toml"
     config.write_text(
         f'aircraft_folder = "{folder}/aircraft"\n'
         f"[vehicle.rates]\nattitude_quaternion_hz = 1000\n"
         f'[recording]\nfolder = "{folder}/recordings"\n[panel]\nport = 0\nmap_styles = []\n'
     )
-    command = [
-        "env", f"XDG_RUNTIME_DIR={folder}", sys.executable, "-m", "gateway.cli",
-        "run", "--plain", "--config", str(config),
-        "--port", "{line}", "--endpoint", "udp:127.0.0.1:{port}",
-    ]  # fmt: skip
+    words = ("run", "--plain", "--config", str(config), "--port", "{line}")
+    command = ["env", f"XDG_RUNTIME_DIR={folder}", *MAVGATE, *words]
+    command += ["--endpoint", "udp:127.0.0.1:{port}"]
     late: dict[str, list[float]] = {"without": [], "read": [], "drawn": []}
     moments = Nodes().moments(GATEWAY_HZ, 1)
     ended = 0.0
@@ -219,12 +201,12 @@ def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict[str,
         ended = time.perf_counter()
         return found
 
-    line = Line(GATEWAY, command, moments)
+    line = Line(command, moments, is_gateway=True)
     try:
         line.await_answer(GATEWAY_HZ)
         ended = time.perf_counter()
         for _ in range(TURNS):
-            turn(SETTLE_MS / 1000)
+            turn(SETTLE_S)
             late["without"] += turn(seconds)
             with Process(folder, "panel", config=config.read_text()) as panel:
                 link = panel.link()
@@ -233,16 +215,16 @@ def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict[str,
                     page.goto(link + path)
                     if key == "read":
                         page.evaluate(READ)
-                    turn(SETTLE_MS / 1000)
+                    turn(SETTLE_S)
                     late[key] += turn(seconds)
                     page.close()
     finally:
         line.close()
     p99 = {key: float(np.percentile(values, 99)) for key, values in late.items()}
-    return {"p99_us": p99, "ratio": p99["read"] / p99["without"]}
+    return p99 | {"ratio": p99["read"] / p99["without"]}
 
 
-def measure_hours() -> list[dict[str, float]]:
+def measure_hours() -> list[Figures]:
     """Measure the memory of the panel for one aircraft at 25 Hz, after each of `MINUTES`."""
     parts = make_parts(PanelSettings(), Path(), None, None)
     sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -257,42 +239,34 @@ def measure_hours() -> list[dict[str, float]]:
     return found
 
 
-def show(found: dict[str, Any]) -> None:
+def show_all(found: dict[str, Any]) -> None:
     """Print the figures as tables, each with its goal."""
-    table = Table(title=f"datagram in to drawn in the browser, {RATE_HZ} Hz", box=box.SIMPLE_HEAD)
-    for column in ("viewers", "drawn Hz", "p50 ms", "p99 ms", "panel's CPU %", "MB", "grown MB"):
-        table.add_column(column, justify="right")
-    for row in found["page"]:
-        names = ("drawn_hz", "p50_ms", "p99_ms", "cpu_percent", "memory_mb", "memory_growth_mb")
-        table.add_row(str(row["viewers"]), *(f"{row[name]:.1f}" for name in names))
-    console.print(table, f"goal: p99 at most {GOAL_P99_MS} ms with one viewer\n")
-    clicks = found["clicks"]
-    console.print(
-        f"click to drawn view: p50 {clicks['p50_ms']:.0f} ms, p95 {clicks['p95_ms']:.0f} ms, "
-        f"longest {clicks['longest_ms']:.0f} ms",
-        f"goal: below {GOAL_CLICK_MS} ms\n",
+    show(
+        f"datagram in to drawn in the browser, {RATE_HZ} Hz; "
+        f"goal: p99 at most {GOAL_P99_MS} ms with one viewer",
+        ("viewers", "drawn Hz", "p50 ms", "p99 ms", "panel's CPU %", "MB", "grown MB"),
+        [row.values() for row in found["page"]],
     )
-    table = Table(title="the gateway's own delay, p99", box=box.SIMPLE_HEAD)
-    for column in ("without a panel µs", "with it and a viewer µs", "ratio", "drawn here too µs"):
-        table.add_column(column, justify="right")
-    p99, ratio = found["gateway"]["p99_us"], found["gateway"]["ratio"]
-    table.add_row(
-        f"{p99['without']:.0f}", f"{p99['read']:.0f}", f"{ratio:.2f}", f"{p99['drawn']:.0f}"
+    show(
+        f"click to drawn view; goal: below {GOAL_CLICK_MS} ms",
+        ("p50 ms", "p95 ms", "longest ms"),
+        [found["clicks"].values()],
     )
-    console.print(table, f"goal: ratio at most {GOAL_RATIO}\n")
-    table = Table(title="memory of one aircraft over two hours", box=box.SIMPLE_HEAD)
-    for row in found["hours"]:
-        table.add_column(f"{row['minute']} min", justify="right")
-    table.add_row(*(f"{row['memory_mb']:.1f} MB" for row in found["hours"]))
-    console.print(table)
+    show(
+        f"the gateway's own delay, p99; goal: ratio at most {GOAL_RATIO}",
+        ("without a panel µs", "with it and a viewer µs", "drawn here too µs", "ratio"),
+        [found["gateway"].values()],
+    )
+    show(
+        "memory of the state of one aircraft",
+        ("min", "MB"),
+        [row.values() for row in found["hours"]],
+    )
 
 
 def main() -> None:
     """Measure all and print it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=20.0, help="per figure")
-    parser.add_argument("--json", type=Path, help="write the figures to this file too")
-    options = parser.parse_args()
+    options = arguments(__doc__, seconds=20.0).parse_args()
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         found = {
@@ -302,9 +276,8 @@ def main() -> None:
             "hours": measure_hours(),
         }
         browser.close()
-    show(found)
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n")
+    show_all(found)
+    write_json(options, found)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Measure the processor time of an IMU sample from serial bytes to MAVLink frames.
 
-    python tools/bench_vehicle.py
+    python -m tools.bench_vehicle
 
 Feeds twenty seconds of samples at three rates, first to the whole pipeline (bytes of a receiver in,
 frames out, no sockets), then to the vehicle alone, and prints processor time. The baseline, in the
@@ -11,14 +11,10 @@ program, is slow at first: its caches are cold. So both baseline and pipeline ar
 a sleep before each message and each sample.
 """
 
-import sys
 import time
 from itertools import islice
-from pathlib import Path
 
 from pymavlink.dialects.v20 import common as mavlink
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gateway.aircraft import AircraftSettings
 from gateway.pipeline import Pipeline, PipelineSettings

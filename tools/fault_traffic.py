@@ -1,24 +1,26 @@
 """Hostile traffic for `fault_hub.py`: forged frames, too many requests, too many clients.
 
-    python fault_traffic.py PORT KIND
+    python -m tools.fault_traffic PORT KIND
 
 The hub trusts clients at its address 127.0.0.1, and not those at 127.0.0.2, both on this port;
 system 1 answers, and system 42 is the healthy source.
 """
 
+import asyncio
 import itertools
 import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 
 from pymavlink.dialects.v20 import common as mavlink
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from gateway.clock import GatewayClock
+from gateway.hub.hub import Hub
+from gateway.hub.settings import HubSettings
 from gateway.vehicle.services.ftp import Opcode, Packet
-from tools.bench_hub import SOURCE_SYSTEM, source_frames
+from tools.bench_hub import HANDSHAKE, SOURCE_SYSTEM, source_frames
 
 TRUSTED, UNTRUSTED = "127.0.0.1", "127.0.0.2"
 PORTS = 31
@@ -120,6 +122,40 @@ def twins(port: int) -> Batch:
             yield partial(sock.send, frame)
 
 
+def visit(port: int, visitors: int) -> Batch:
+    """Send one heartbeat each from new ports, as some stations in turn."""
+    for system in itertools.cycle(range(1, 1 + visitors)):
+        with caller(TRUSTED, port) as client:
+            yield partial(client.send, heartbeat(system))
+
+
+def odd(port: int) -> Batch:
+    """Send empty datagrams, and the longest ones with begins of frames or without."""
+    client = caller(TRUSTED, port)
+    client.send(heartbeat(200))
+    for data in itertools.cycle((b"", b"\xfe" * 65507, b"\xfd" * 65507, bytes(65507))):
+        yield partial(client.send, data)
+
+
+def read(port: int, opening: bytes = b"") -> Batch:
+    """Read a stream."""
+    link = socket.create_connection((TRUSTED, port))
+    link.sendall(opening)
+    while True:
+        yield lambda: link.recv(4096)
+
+
+def join(port: int) -> Batch:
+    """Connect another gateway by two links."""
+
+    async def joined() -> None:
+        links = tuple(f"udp:127.0.0.{host}:{port}" for host in (1, 3))
+        Hub(HubSettings(endpoints=links), lambda _: None, GatewayClock()).start()
+        await asyncio.Event().wait()
+
+    yield lambda: asyncio.run(joined())
+
+
 LIST = packed(mavlink.MAVLink_param_request_list_message(1, 1))
 PING = packed(mavlink.MAVLink_ping_message(5, 1, 0, 0))
 KINDS: dict[str, tuple[Callable[[int], Batch], int]] = {
@@ -131,6 +167,12 @@ KINDS: dict[str, tuple[Callable[[int], Batch], int]] = {
     "bursts": (bursts, 21),
     "crowd": (crowd, 1000),
     "twins": (twins, 200),
+    "die": (lambda port: visit(port, 1), 20),
+    "visit": (lambda port: visit(port, 200), 1000),
+    "odd": (odd, 200),
+    "read": (read, 1000),
+    "read-web": (lambda port: read(port, HANDSHAKE), 1000),
+    "join": (join, 200),
 }
 """Function and rate in Hz of each kind."""
 

@@ -44,14 +44,14 @@ def write_json(options: argparse.Namespace, report: Mapping[str, Any]) -> None:
         options.json.write_text(json.dumps({"load": os.getloadavg(), **report}, indent=1) + "\n")
 
 
-def show(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+def show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
     """Print rows as a table; numbers have three digits or more."""
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    table = Table(box=box.SIMPLE_HEAD)
     for column in columns:
         table.add_column(column, justify="right")
     for row in rows:
         table.add_row(*map(text_of, row))
-    Console(width=150).print(table)
+    Console(width=150).print(title, table, sep="\n")
 
 
 def text_of(value: object) -> str:

@@ -9,7 +9,7 @@ A second means the data that the child records in one, which may take longer on 
 Syncs to its disk never end: a kill loses only data that was not yet passed to the kernel. If even
 that waits for the disk, more may be lost, so `--any-loss` checks only the written data.
 
-    python tools/kill_recorder.py [--kills 200] [--seed 1]
+    python -m tools.kill_recorder [--kills 200] [--seed 1]
 """
 
 import argparse
@@ -34,8 +34,9 @@ from gateway.live.session import RecordingSettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.table import TableFault, TableHeader, TableReader
 from gateway.recordings.tlog import TlogScanner
-from gateway.records import FusedSample, ImuFlags, ImuRaw, ImuSample, NavFlags, NavState, NodeId
+from gateway.records import FusedSample
 from gateway.wire.recorded_frames import Batch
+from tests.kit.records import raw_at, sample_at, state_at
 
 RATE_HZ = 200
 """Fused samples a second, each with two frames."""
@@ -58,15 +59,9 @@ def make_frame(number: int) -> bytes:
 
 def make_sample(number: int) -> FusedSample:
     """Make a sample that contains its number."""
-    v = (0.1, 0.2, number / 3)
     time_us = number * 1000
-    raw = ImuRaw(
-        *(time_us, NodeId(1, 0), number, (1, 2, 3), (4, 5, 6), (7, 8, 9)),
-        *(10, 8, 500, 1090, ImuFlags.MAG_NEW),
-    )
-    sample = ImuSample(time_us, v, v, v, 20.0, ImuFlags.MAG_NEW)
-    state = NavState(time_us, (1.0, *v), v, 47.0, 8.0, 4.0, v, v, v, v, NavFlags(0))
-    return FusedSample(1, raw, sample, state)
+    raw = raw_at(time_us, node_time_us=number)
+    return FusedSample(1, raw, sample_at(time_us), state_at(time_us, vel_n_mps=(0, 0, number / 3)))
 
 
 def never_sync(_: int) -> None:

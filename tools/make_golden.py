@@ -1,6 +1,6 @@
 """Write the golden flights of `tests/golden`: a short simulated log, and its fused states.
 
-    python tools/make_golden.py [--expected-only]
+    python -m tools.make_golden [--expected-only]
 
 The expected files are a change indicator: run this after a change of an estimator, commit the
 difference, and explain it in the commit.
@@ -10,13 +10,11 @@ import argparse
 import csv
 import gzip
 import io
-import sys
 import tempfile
 from pathlib import Path
 
 from typer.testing import CliRunner
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.cli.app import app
 from gateway.records import BaroRaw, GpsFix
 from gateway.sensing.calibration import NodeCalibration

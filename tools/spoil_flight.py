@@ -1,22 +1,12 @@
-"""Add a disturbance that occurs in the field to the log of a flight.
+"""Disturbances that occur in the field, added to the log of a flight."""
 
-    python tools/spoil_flight.py FLIGHT.csv.gz --how imu_gap -o SPOILT.csv.gz
-
-The disturbed log has the format of the tracker logs that `mavgate fuse` reads.
-"""
-
-import argparse
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from msgspec.structs import replace as replace_struct
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.estimation.columns import (
     ACCEL,
     ACCEL_UNCALIBRATED,
@@ -28,7 +18,7 @@ from gateway.estimation.columns import (
     MAG,
 )
 from gateway.geometry.geodesy import SEMI_MAJOR_M
-from tools.flights import GPS_NAMES, IMU_NAMES, Flight, read_flight
+from tools.flights import IMU_NAMES, Flight
 
 IMU_GAP_S = 4.0
 HANG_S = 1.5
@@ -263,25 +253,12 @@ def wrong_latency(flight: Flight, known_s: float | None = None) -> Spoilt:
 
 
 SPOILS: dict[str, Callable[[Flight], Spoilt]] = {
-    "zero_rows": zero_rows,
-    "late_gps": late_gps,
-    "no_velocity": no_velocity,
-    "no_height": no_height,
-    "no_mag": no_mag,
-    "no_baro": no_baro,
-    "imu_gap": imu_gap,
-    "mid_air": mid_air,
-    "gyro_off": gyro_off,
-    "uncalibrated": uncalibrated,
-    "half_rate": half_rate,
-    "odd_samples": odd_samples,
-    "imu_hangs": imu_hangs,
-    "mag_hangs": mag_hangs,
-    "bias_step": bias_step,
-    "blow": blow,
-    "field_jump": field_jump,
-    "gps_jump": gps_jump,
-    "wrong_latency": wrong_latency,
+    spoil.__name__: spoil
+    for spoil in (
+        *(zero_rows, late_gps, no_velocity, no_height, no_mag, no_baro, imu_gap, mid_air),
+        *(gyro_off, uncalibrated, half_rate, odd_samples, imu_hangs, mag_hangs, bias_step, blow),
+        *(field_jump, gps_jump, wrong_latency),
+    )
 }
 GPS_SPOILS = ("late_gps", "no_velocity", "no_height", "gps_jump", "wrong_latency")
 MAG_SPOILS = ("no_mag", "mag_hangs", "field_jump")
@@ -295,42 +272,3 @@ def applies(how: str, flight: Flight) -> bool:
     if how in MAG_SPOILS:
         return bool(np.isfinite(log.imu[:, MAG]).any())
     return how != "no_baro" or len(log.baro_alt_m) > 0
-
-
-def write_flight(flight: Flight, path: Path) -> None:
-    """Write the samples as a tracker log."""
-    log = flight.log
-    n = len(log.imu_time_us)
-    table = pd.DataFrame({"time_s": log.imu_time_us * 1e-6})
-    table[IMU_NAMES] = log.imu[:, : len(IMU_NAMES)]
-    for name in ("baro_alt_m", "gps_time_s", *GPS_NAMES):
-        table[name] = np.nan
-    at = np.searchsorted(log.imu_time_us, log.baro_time_us).clip(max=n - 1)
-    table.loc[at, "baro_alt_m"] = log.baro_alt_m
-    at = np.searchsorted(log.imu_time_us, log.gps_time_us).clip(max=n - 1)
-    table.loc[at, "gps_time_s"] = log.gps_time_us * 1e-6
-    for k, name in enumerate(GPS_NAMES):
-        table.loc[at, name] = log.gps[:, GPS_LAT + k]
-    reference = flight.reference
-    words = f"gps_latency_s={reference.gps_latency_s} declination_deg={reference.declination_deg}"
-    text = f"# {flight.name} {words}\n" + table.to_csv(index=False, float_format="%.9g")
-    path.write_bytes(text.encode())
-
-
-def main() -> None:
-    """Read a log, add the disturbance, and write it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("flight", type=Path, help="a tracker log")
-    parser.add_argument("--how", choices=SPOILS, required=True)
-    parser.add_argument("-o", "--out", type=Path, required=True)
-    arguments = parser.parse_args()
-    flight = read_flight(arguments.flight)
-    if not applies(arguments.how, flight):
-        parser.error(f"{flight.name} lacks the sensor that {arguments.how} changes")
-    spoilt = SPOILS[arguments.how](flight)
-    write_flight(spoilt.flight, arguments.out)
-    print(f"{arguments.out}: the disturbance ends at {spoilt.ends_s:.2f} s")
-
-
-if __name__ == "__main__":
-    main()

@@ -40,29 +40,8 @@ NO_TEXT: Final = {
     "pyserial": "Copyright (c) 2001-2020 Chris Liechti <cliechti@gmx.net>",
 }
 """Copyright of packages under BSD-3-Clause that do not contain the text of the licence."""
-BSD_3_CLAUSE: Final = """\
-Redistribution and use in source and binary forms, with or without modification, are permitted
-provided that the following conditions are met:
-
-1. Redistributions of source code must retain the above copyright notice, this list of conditions
-   and the following disclaimer.
-2. Redistributions in binary form must reproduce the above copyright notice, this list of conditions
-   and the following disclaimer in the documentation and/or other materials provided with the
-   distribution.
-3. Neither the name of the copyright holder nor the names of its contributors may be used to endorse
-   or promote products derived from this software without specific prior written permission.
-
-THIS SOFTWARE IS PROVIDED BY THE COPYRIGHT HOLDERS AND CONTRIBUTORS "AS IS" AND ANY EXPRESS OR
-IMPLIED WARRANTIES, INCLUDING, BUT NOT LIMITED TO, THE IMPLIED WARRANTIES OF MERCHANTABILITY AND
-FITNESS FOR A PARTICULAR PURPOSE ARE DISCLAIMED. IN NO EVENT SHALL THE COPYRIGHT HOLDER OR
-CONTRIBUTORS BE LIABLE FOR ANY DIRECT, INDIRECT, INCIDENTAL, SPECIAL, EXEMPLARY, OR CONSEQUENTIAL
-DAMAGES (INCLUDING, BUT NOT LIMITED TO, PROCUREMENT OF SUBSTITUTE GOODS OR SERVICES; LOSS OF USE,
-DATA, OR PROFITS; OR BUSINESS INTERRUPTION) HOWEVER CAUSED AND ON ANY THEORY OF LIABILITY, WHETHER
-IN CONTRACT, STRICT LIABILITY, OR TORT (INCLUDING NEGLIGENCE OR OTHERWISE) ARISING IN ANY WAY OUT OF
-THE USE OF THIS SOFTWARE, EVEN IF ADVISED OF THE POSSIBILITY OF SUCH DAMAGE.
-"""
-
-
+LICENCES: Final = Path(__file__).with_name("licences")
+BSD_3_CLAUSE: Final = (LICENCES / "BSD-3-Clause.txt").read_text()
 BUNDLED: Final = (
     (
         "Natural Earth, coasts and borders at 1:50 million and populated places",
@@ -74,20 +53,7 @@ BUNDLED: Final = (
         "world-atlas, which makes TopoJSON of the coasts and borders",
         "ISC",
         "the same file",
-        """\
-Copyright 2013-2019 Michael Bostock
-
-Permission to use, copy, modify, and/or distribute this software for any purpose with or without fee
-is hereby granted, provided that the above copyright notice and this permission notice appear in all
-copies.
-
-THE SOFTWARE IS PROVIDED "AS IS" AND THE AUTHOR DISCLAIMS ALL WARRANTIES WITH REGARD TO THIS
-SOFTWARE INCLUDING ALL IMPLIED WARRANTIES OF MERCHANTABILITY AND FITNESS. IN NO EVENT SHALL THE
-AUTHOR BE LIABLE FOR ANY SPECIAL, DIRECT, INDIRECT, OR CONSEQUENTIAL DAMAGES OR ANY DAMAGES
-WHATSOEVER RESULTING FROM LOSS OF USE, DATA OR PROFITS, WHETHER IN AN ACTION OF CONTRACT, NEGLIGENCE
-OR OTHER TORTIOUS ACTION, ARISING OUT OF OR IN CONNECTION WITH THE USE OR PERFORMANCE OF THIS
-SOFTWARE.
-""",
+        (LICENCES / "world-atlas.txt").read_text(),
     ),
 )
 """Data in this repository: origin, licence, use, and text of the licence."""
@@ -113,27 +79,13 @@ def page() -> str:
         "Written by `python -m tools.third_party` from the lock files, which have the versions."
     ]
     for lock, use in LOCKS.items():
-        rows = [("package", "licence")]
-        rows += [(name, licence_of(name)) for name in locked_in(ROOT / lock)]
+        rows = [(name, licence_of(name)) for name in locked_in(ROOT / lock)]
         width = max(len(name) for name, _ in rows)
-        table = [f"| {name:{width}} | {licence} |" for name, licence in rows]
-        lines += [
-            "",
-            f"## `{lock}`",
-            "",
-            f"{use}.",
-            "",
-            table[0],
-            f"| {'-' * width} | --- |",
-            *table[1:],
-        ]
-    lines += [
-        "",
-        "## Data in this repository",
-        "",
-        "| data | licence | use |",
-        "| --- | --- | --- |",
-    ]
+        lines += ["", f"## `{lock}`", "", f"{use}.", ""]
+        lines += [f"| {'package':{width}} | licence |", f"| {'-' * width} | --- |"]
+        lines += [f"| {name:{width}} | {licence} |" for name, licence in rows]
+    lines += ["", "## Data in this repository", ""]
+    lines += ["| data | licence | use |", "| --- | --- | --- |"]
     lines += [f"| {data} | {licence} | {use} |" for data, licence, use, _ in BUNDLED]
     lines += ["", *(text.rstrip() for *_, text in BUNDLED if text)]
     return "\n".join(lines) + "\n"
