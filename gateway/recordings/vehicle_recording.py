@@ -29,17 +29,15 @@ class VehicleRecording:
         self.first_us = 0
         """Time of the first record; 0 before it is read."""
         self._answers = LogAnswers()
-        self._batches: Iterator[Batch] | None = self.flight.chosen()
-        self.system_id: int = options.system_id or 0
-        if not self.system_id or not self.flight.is_mavlink:
-            self.system_id = _only_vehicle(files, self.flight.senders)
+        senders = self.flight.senders
+        chosen = options.system_id if self.flight.is_mavlink else None
+        self.system_id = chosen or _only_vehicle(files, senders)
 
     def batches(self) -> Iterator[Batch]:
         """Yield the records of all senders; afterwards parameters and plans are known."""
-        batches, self._batches = self._batches or self.flight.chosen(), None
         self._answers = LogAnswers()
         has_begun = False
-        for batch in batches:
+        for batch in self.flight.chosen():
             if len(batch) and not has_begun:
                 self.first_us, has_begun = int(batch.time_us[0]), True
             self._answers.add(batch, self.flight.senders)

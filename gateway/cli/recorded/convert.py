@@ -40,14 +40,13 @@ from gateway.recordings.workshop.anonymising import (
     Anonymity,
 )
 from gateway.recordings.workshop.convert import AS_RECORDED, WRITERS, FlightToWrite, Fusing
-from gateway.recordings.workshop.editing import FrameEdit, Renumbering
+from gateway.recordings.workshop.editing import FrameEdit, Renumbering, TlogEdits
 from gateway.recordings.workshop.selection import (
     MAX_MARGIN_S,
     FrameChoice,
     StateChoice,
     message_ids_of,
 )
-from gateway.recordings.workshop.tlog_editing import TlogEdits
 from gateway.wire.system_ids import LAST_ID
 
 app = typer.Typer()
@@ -170,7 +169,6 @@ def convert(
     _write(
         files, output, columns, how,
         edits if message or output.suffix == ".tlog" else TlogEdits(edits.limits), force=force,
-        message_id=next(iter(choice.messages)) if message and output.suffix != ".tlog" else None,
     )  # fmt: skip
     _print_edits(edits.frames)
 
@@ -184,7 +182,6 @@ def _write(
     fusing: Fusing = AS_RECORDED,
     *,
     force: bool,
-    message_id: int | None = None,
 ) -> None:
     """Write a flight in the format of the suffix, and print the remarks and the size.
 
@@ -192,13 +189,11 @@ def _write(
     """
     with progress_of(files) as advance:
         options = read_options(read_settings(), columns, progress=advance, **how)
-        flight = FlightToWrite(
-            files, options, edits, fusing, title=output.stem, message_id=message_id
-        )
+        flight = FlightToWrite(files, options, edits, fusing, title=output.stem)
         inputs = [*files, columns, CONFIG.get()]
         size = write_new(output, WRITERS[output.suffix](flight), overwrite=force, inputs=inputs)
     print_remarks(flight.remarks)
-    if (lacks := flight.lacks(output.suffix)) and message_id is None:
+    if lacks := flight.lacks(output.suffix):
         print_remarks([f"Dropped: {lacks}"])
     by = "".join(f"; {fusion.summary}" for fusion in flight.fusions)
     console_of().print(f"{output}: {size / 1e6:.3f} MB{by}")

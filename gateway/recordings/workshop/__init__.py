@@ -3,8 +3,8 @@
 | step           | modules                                                                        |
 | -------------- | ------------------------------------------------------------------------------ |
 | stream         | `merging`, `joining`: one stream of batches or rows from several files         |
-| chain          | `trimming`, `selection`: which records; `editing`, `anonymising`: their frames |
-|                | `tlog_editing` applies the chain, `private_fields` is a table of fields        |
+| chain          | `editing`: the chain; `trimming`, `selection`: which records; `anonymising`:   |
+|                | their frames, by the table of fields of `private_fields`                       |
 | writer         | `convert`: one writer per format, chosen by the ending of the file             |
 | single content | `extracts`, `timed_extracts`; `comparison` of two recordings                   |
 

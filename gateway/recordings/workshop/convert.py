@@ -4,9 +4,12 @@ import heapq
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import Final
+from weakref import finalize
 
 from gateway.recordings.autopilot_record import AutopilotLog, RecordTranslator
 from gateway.recordings.files import (
@@ -41,10 +44,11 @@ from gateway.recordings.recorded_clock import Stamper
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, aircraft_of
 from gateway.recordings.table import encode_block, encode_head
+from gateway.recordings.tlog import encode_record
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
+from gateway.recordings.workshop.editing import NOTHING_LEFT, TlogEdits
 from gateway.recordings.workshop.joining import joined_tables
-from gateway.recordings.workshop.merging import batched
-from gateway.recordings.workshop.tlog_editing import TlogEditor, TlogEdits
+from gateway.recordings.workshop.merging import batched, intact, joined
 from gateway.recordings.workshop.trimming import trimmed
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.recorded_frames import Batch, RecordedFrame
@@ -77,7 +81,8 @@ AS_RECORDED: Final = Fusing()
 class FlightToWrite:
     """Recordings that are written as one file: as MAVLink or as rows, depending on the format.
 
-    Raises OSError if a file cannot be read.
+    MAVLink is made of tables and of autopilots' logs in a temporary file, since its senders must be
+    known before its frames are used. Raises OSError if a file cannot be read.
     """
 
     def __init__(
@@ -88,9 +93,8 @@ class FlightToWrite:
         fusing: Fusing = AS_RECORDED,
         *,
         title: str = "flight",
-        message_id: int | None = None,
     ) -> None:
-        self.files, self.options, self.title, self.message_id = files, options, title, message_id
+        self.files, self.options, self.title = files, options, title
         self._edits, self._fusing = edits, fusing
         kinds = {format_of(file) for file in files}
         if len(kinds) > 1:
@@ -108,10 +112,21 @@ class FlightToWrite:
         self.logs: list[AutopilotLog] = []
         """The logs of autopilots among the files, once they are read."""
         self._remarks: list[str] = []
-        self.senders = Senders()
-        """Senders of the MAVLink; known once its frames are requested."""
         if kinds == {TABLE} and options.system_id is not None:
             self.files = self._files_of(options.system_id)
+
+    @property
+    def message_id(self) -> int | None:
+        """The message of which a format with one type of message is written; None for the rows."""
+        return next(iter(self._edits.choice.messages), None)
+
+    @cached_property
+    def senders(self) -> Senders:
+        """Senders of the MAVLink."""
+        found = Senders()
+        for source in self._sources:
+            found.merge(source.senders)
+        return found
 
     def frames(self) -> Iterator[RecordedFrame]:
         """Yield the selected MAVLink: as recorded, or as the gateway would send it."""
@@ -119,49 +134,56 @@ class FlightToWrite:
 
     def tlog(self) -> Iterator[bytes]:
         """Yield the selected MAVLink as a tlog, with the edits applied."""
-        sources, edits = self._sources, self._edits
+        edits, total = self._edits, 0
+        sources = self._sources if self.is_mavlink else []
         for edit in edits.frames:
             edit.prepare(sources, edits.choice)
-        editor = TlogEditor(edits, self.remark)
-        yield from editor.apply(self._batches(editor, sources), self.senders)
+        batches = self._recorded() if self.is_mavlink else batched(self._sent())
+        senders = self.senders if self.is_mavlink else Senders()
+        for batch in edits.chosen(batches, senders, self.remark):
+            total += len(batch)
+            yield edits.edited(batch)
+        if total == edits.left_out:
+            raise FlightError(NOTHING_LEFT)
 
     def chosen(self, counted_id: int | None = None) -> Iterator[Batch]:
-        """Yield the selected MAVLink, of all messages, not edited; its senders are known.
+        """Yield the selected MAVLink, of all messages, not edited.
 
         The remark on the number of kept records counts those of one message if it is given.
         """
         choice = replace(self._edits.choice, messages=frozenset())
-        editor = TlogEditor(replace(self._edits, choice=choice), self.remark)
-        batches: Iterable[Batch] = self._batches(editor, self._sources)
-        if not self.is_mavlink:
-            # The senders of MAVLink that is made are known once all of it is.
-            batches = [*batches]
-            for batch in batches:
-                self.senders.add(batch)
-        return editor.chosen(batches, self.senders, counted_id)
+        edits = replace(self._edits, choice=choice)
+        return edits.chosen(self._recorded(), self.senders, self.remark, counted_id)
 
-    def _batches(self, editor: TlogEditor, sources: list[TlogSource]) -> Iterator[Batch]:
-        if self.is_mavlink:
-            return editor.joined(sources, self.options.progress)
-        return batched(self._sent())
+    def _recorded(self) -> Iterator[Batch]:
+        progress = self.options.progress if self.is_mavlink else None
+        # An edit computes the checksum again, so that damaged frames would look intact.
+        strict = bool(self._edits.frames)
+        read = partial(intact, remark=self.remark, progress=progress, strict=strict)
+        return joined(self._sources, read, self._edits.merge, self.remark)
 
     @cached_property
     def _sources(self) -> list[TlogSource]:
-        """The files opened as MAVLink, once; this also finds their senders."""
+        """The files opened as MAVLink, once."""
         if not self.is_mavlink:
-            return []
+            folder = Path(mkdtemp(prefix="mavgate-"))
+            finalize(self, rmtree, folder, ignore_errors=True)
+            with (folder / "made.tlog").open("wb") as file:
+                file.writelines(encode_record(one.time_us, one.frame) for one in self._sent())
+            return [open_tlog(folder / "made.tlog")]
         sources = [open_tlog(file) for file in self.files]
         for source in sources:
             # A part that had just been created when the power failed may be empty.
             if not source.senders.origins and ".tlog" not in source.path.suffixes:
                 raise FlightError(f"{source.path}: {NO_RECORDING}")
-            self.senders.merge(source.senders)
             self._remarks += [f"{source.path}: {text}" for text in source.remarks]
-        if not self.senders.origins:
+        systems = {origin >> 8 for source in sources for origin in source.senders.origins}
+        if not systems:
             raise FlightError(f"{', '.join(map(str, self.files))}: {NO_RECORDING}")
         # A tlog may also contain only the frames of a ground station.
-        if self.options.system_id not in {origin >> 8 for origin in self.senders.origins}:
-            check_vehicle(self.files, self.options.system_id, self.senders.systems())
+        if self.options.system_id not in systems:
+            vehicles = {one for source in sources for one in source.senders.systems()}
+            check_vehicle(self.files, self.options.system_id, sorted(vehicles))
         return sources
 
     def vehicle_messages(
@@ -219,8 +241,10 @@ class FlightToWrite:
 
     def lacks(self, ending: str) -> str:
         """Describe the content that a format cannot hold, once all is written; empty if none."""
-        if self.logs and ending == ".tlog":
+        if ending == ".tlog" and self.logs:
             return "; ".join(filter(None, (log.lacks for log in self.logs)))
+        if ending != ".tlog" and self.message_id is not None:
+            return ""
         lacks = LACKS[ending]
         return lacks.of_tlogs if self.has_messages else lacks.of_tables
 

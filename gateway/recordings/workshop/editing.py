@@ -1,15 +1,26 @@
-"""Edits of single frames: the interface of each, and the change of system ids."""
+"""The chain of edits between the files that are read and the tlog that is written."""
 
 import struct
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gateway.recordings.files import FlightError, TlogSource
-from gateway.recordings.workshop.selection import FrameChoice
+from gateway.recordings.tlog import encode_record
+from gateway.recordings.workshop.selection import (
+    ChosenState,
+    FrameChoice,
+    StateChoice,
+    while_in_state,
+    within,
+)
+from gateway.recordings.workshop.trimming import NOTHING_WITHIN, Limits
+from gateway.units import counted
+from gateway.vehicle_state.senders import Senders
 from gateway.vehicle_state.status_texts import text_of
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_messages import MESSAGE_NAMES, ids_of
@@ -19,6 +30,7 @@ from gateway.wire.system_ids import FIELDS, LAST_ID, rename_systems
 
 BoolArray = NDArray[np.bool_]
 
+NOTHING_LEFT: Final = "no record matches all of these options"
 PARAMETER_IDS: Final = ids_of("PARAM_VALUE", "PARAM_SET")
 ID_PARAMETERS: Final = frozenset({
     "SYSID_THISMAV", "MAV_SYSID", "MAV_SYS_ID", "SYSID_MYGCS", "MAV_GCS_SYSID", "FOLL_SYSID",
@@ -51,6 +63,85 @@ class FrameEdit:
     def leave_out(self, message: str, reason: str = "") -> None:
         """Count a frame that is left out."""
         self.left_out[message, reason] += 1
+
+
+@dataclass(frozen=True, slots=True)
+class TlogEdits:
+    """The links of a chain; the memory needed does not depend on the size of the files."""
+
+    limits: Limits = (None, None)
+    choice: FrameChoice = field(default_factory=FrameChoice)
+    state: StateChoice | None = None
+    """If given, keep only the time while a vehicle is in a state."""
+    merge: bool | None = None
+    """Leave out copies of frames that are in several files; default: if the files overlap."""
+    frames: tuple[FrameEdit, ...] = ()
+    """Edits of each frame, in their order."""
+
+    @property
+    def are_none(self) -> bool:
+        """Whether the records are not edited, but perhaps cut."""
+        return self == TlogEdits(self.limits, merge=self.merge)
+
+    @property
+    def left_out(self) -> int:
+        """Number of frames that the edits have left out so far."""
+        return sum(edit.left_out.total() for edit in self.frames)
+
+    def chosen(
+        self,
+        batches: Iterable[Batch],
+        senders: Senders,
+        remark: Callable[[str], None],
+        counted_id: int | None = None,
+    ) -> Iterator[Batch]:
+        """Yield the selected records, not edited; raises FlightError if no record is left.
+
+        The remark on their number counts those of one message if it is given.
+        """
+        total = kept = of_message = 0
+
+        def all_records() -> Iterator[Batch]:
+            nonlocal total
+            for batch in batches:
+                total += len(batch)
+                yield batch
+
+        cut: Iterable[Batch] = within(all_records(), self.limits)
+        state = None
+        if self.state is not None:
+            state = ChosenState(senders, self.state, self.choice.systems)
+            cut = while_in_state(cut, state)
+        for batch in map(self.choice.apply, cut):
+            kept += len(batch)
+            of_message += int(np.count_nonzero(batch.message_ids == counted_id))
+            yield batch
+        unknown = "" if state is None else state.unknown
+        if not kept:
+            is_cut = self.limits != (None, None) and self.are_none
+            raise FlightError(unknown or (NOTHING_WITHIN if is_cut else NOTHING_LEFT))
+        if unknown:
+            remark(unknown)
+        if not self.are_none:
+            kept = kept - self.left_out if counted_id is None else of_message
+            remark(f"kept {kept} of {counted(total, 'record')}")
+
+    def edited(self, batch: Batch) -> bytes:
+        """Return the records of a batch after all edits of frames; others keep their bytes."""
+        affected = [edit.affects(batch) for edit in self.frames]
+        for edit in self.frames:
+            batch = edit.retimed(batch)
+        if not len(batch) or not np.any(affected):
+            return batch.encoded()
+        pieces = []
+        is_affected = np.any(affected, axis=0).tolist()
+        for record, may_change in zip(batch.records(), is_affected, strict=True):
+            frame: bytes | None = record.frame
+            for edit in self.frames if may_change else ():
+                frame = None if frame is None else edit.edit(frame)
+            if frame is not None:
+                pieces.append(encode_record(record.time_us, frame))
+        return b"".join(pieces)
 
 
 class Renumbering(FrameEdit):

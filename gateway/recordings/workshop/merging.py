@@ -14,7 +14,7 @@ agree, except where the user states that it is one flight: a clock may be set to
 
 import heapq
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from operator import itemgetter
@@ -22,11 +22,14 @@ from typing import Final
 
 import numpy as np
 
+from gateway.recordings.files import Progress, TlogSource
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.units import US_PER_S, counted
 from gateway.wire.frame_scan import TIME_SIZE
 from gateway.wire.recorded_frames import Batch, IntArray, RecordedFrame
 
+Remark = Callable[[str], None]
+"""Adds a remark for the user."""
 MAX_SAMPLE: Final = 50_000
 """Maximum number of frames in the sample of a file, about 10 MB."""
 WINDOW_US: Final = US_PER_S
@@ -174,6 +177,32 @@ class Alignment:
         """Return the offset to add to the times of each file."""
         return [0 if offset is None else offset.offset_us for offset in self.offsets]
 
+    @property
+    def shifts_after_1970_us(self) -> list[int]:
+        """Return the shifts, increased if one would move a file before the year 1970."""
+        begins = zip(self.samples, self.shifts_us, strict=True)
+        earliest_us = min((one.first_us or 0) + shift_us for one, shift_us in begins)
+        return [shift_us - min(earliest_us, 0) for shift_us in self.shifts_us]
+
+    def report_faults(self, sources: Sequence[TlogSource], remark: Remark) -> None:
+        """Report the files that are taken for other flights."""
+        for number, fault in self.faults.items():
+            if self.offsets[number] is None:
+                text = f"is taken for another flight, as {fault}; its times are kept"
+                remark(f"{sources[number].path}: {text}")
+
+    def report_offsets(self, sources: Sequence[TlogSource], remark: Remark) -> None:
+        """Report the shift of each file after the first one."""
+        for number, offset in enumerate(self.offsets[1:], 1):
+            path = sources[number].path
+            if offset is not None:
+                remark(
+                    f"{path}: shifted by {offset.offset_us / US_PER_S:+.3f} s to the clock "
+                    f"of {sources[0].path}, by {counted(offset.copies, 'copied frame')}"
+                )
+            elif number not in self.faults:
+                remark(f"{path}: has too few copies to compare clocks; times are kept")
+
     def order(self, shifts_us: Sequence[int]) -> list[int]:
         """Return the files' numbers by start time; files without records come last."""
         begins = [
@@ -223,6 +252,60 @@ class Copies:
         entries.append((time_us, {file}))
         self._order.append((time_us, frame))
         return False
+
+
+def intact(
+    source: TlogSource, remark: Remark, progress: Progress | None = None, *, strict: bool = False
+) -> Iterator[Batch]:
+    """Yield the records of a file, and report the bytes that belong to no record."""
+    runs = size = end = 0
+    for batch in source.batches(progress, strict=strict):
+        for damage in batch.damage:
+            # A run may continue in the next batch.
+            runs += damage.offset != end or not runs
+            end = damage.offset + damage.size
+            size += damage.size
+        runs += batch.unfinished > 0
+        size += batch.unfinished
+        yield batch
+    if size:
+        remark(
+            f"{source.path}: left out {counted(size, 'byte')} in {counted(runs, 'place')}, "
+            "which contain no record"
+        )
+
+
+def joined(
+    sources: Sequence[TlogSource],
+    read: Callable[[TlogSource], Iterator[Batch]],
+    merge: bool | None,
+    remark: Remark,
+) -> Iterator[Batch]:
+    """Yield the records of all files in order of time; a merge leaves out copies.
+
+    By default files are merged if they overlap. `read` returns the records of a file.
+    """
+    if len(sources) == 1:
+        yield from read(sources[0])
+        return
+    alignment = Alignment(is_one_flight=bool(merge))
+    for source in sources:
+        alignment.add(source.batches())
+    if merge is not False:
+        alignment.report_faults(sources, remark)
+    if merge is None:
+        is_joined = alignment.faults and not any(alignment.offsets)
+        merge = not is_joined and alignment.overlap_us(alignment.shifts_us) > WINDOW_US
+    shifts_us = alignment.shifts_after_1970_us if merge else [0] * len(sources)
+    if alignment.overlap_us(shifts_us) <= 0:
+        for number in alignment.order(shifts_us):
+            yield from read(sources[number])
+        return
+    copies = Copies() if merge else None
+    yield from batched(by_time([*map(read, sources)], shifts_us, copies))
+    if copies is not None:
+        alignment.report_offsets(sources, remark)
+        remark(f"left out {counted(copies.count, 'copied frame')}")
 
 
 def by_time(

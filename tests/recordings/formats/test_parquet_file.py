@@ -11,6 +11,8 @@ from gateway.recordings import files
 from gateway.recordings.columns import COLUMNS
 from gateway.recordings.formats import parquet as parquet_file
 from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
+from gateway.recordings.workshop.editing import TlogEdits
+from gateway.recordings.workshop.selection import FrameChoice
 from tests.kit.cli import run
 from tests.kit.recordings import START_US, STEP_US, make_records, write_tlog
 from tests.recordings.flights import OPTIONS, commented_table
@@ -94,7 +96,8 @@ def test_parquet_is_written_piece_by_piece(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(parquet_file, "ROWS", 50)
     monkeypatch.setattr(files, "CHUNK", 5000)
     path = write_tlog(tmp_path / "a.tlog", make_records(3000))
-    flight = FlightToWrite([path], OPTIONS, message_id=0)
+    edits = TlogEdits(choice=FrameChoice(messages=frozenset({0})))
+    flight = FlightToWrite([path], OPTIONS, edits)
     sizes = [len(piece) for piece in WRITERS[".parquet"](flight)]
     assert len(sizes) > 10
     assert max(sizes[:-1]) < 10_000

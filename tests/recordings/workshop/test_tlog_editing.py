@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.files import FlightError, open_tlog
 from gateway.recordings.tlog import TlogScanner
-from gateway.recordings.workshop.editing import Renumbering
+from gateway.recordings.workshop.editing import Renumbering, TlogEdits
 from gateway.recordings.workshop.merging import MAX_SAMPLE, Alignment, FrameSample, batched
 from gateway.recordings.workshop.selection import (
     MAX_MARGIN_S,
@@ -23,7 +23,6 @@ from gateway.recordings.workshop.selection import (
     message_ids_of,
     while_in_state,
 )
-from gateway.recordings.workshop.tlog_editing import TlogEdits
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
