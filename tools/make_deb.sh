@@ -33,16 +33,10 @@ case $architecture in
     *) echo "package: no wheels are made for $architecture; use amd64 or arm64" >&2; exit 1 ;;
 esac
 
-# Wheels of the architecture, also those that this machine cannot run.
-platforms=
-for oldest in 2_34 2_31 2_28 2_27 2_26 2_24 2_17 2_12 2_5; do
-    platforms="$platforms --platform manylinux_${oldest}_$machine"
-done
 install() {
-    # shellcheck disable=SC2086 # the list is meant to be split
+    # shellcheck disable=SC2046 # the list is meant to be split
     "$python" -m pip install --disable-pip-version-check --no-compile --no-deps --target "$lib" \
-        --only-binary=:all: --ignore-requires-python --implementation cp --python-version "$minor" $platforms \
-        --platform manylinux2014_"$machine" --platform linux_"$machine" "$@"
+        --ignore-requires-python $(wheels_for "$machine" "$minor") "$@"
 }
 
 step "mavgate and its compiled kernels" install "$output"/mavgate-*_"$machine".whl

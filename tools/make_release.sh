@@ -46,12 +46,9 @@ step "wheels for x86-64 and aarch64" wheels
 
 # A source archive has the metadata of the wheel.
 source_archive() {
-    (cd "$work" && rm -rf archive && mkdir archive)
-    git archive --prefix="mavgate-$version/" HEAD | tar -x -C "$work/archive"
     unzip -p "$output/mavgate-$version-py3-none-manylinux_2_17_x86_64.whl" \
-        "mavgate-$version.dist-info/METADATA" >"$work/archive/mavgate-$version/PKG-INFO"
-    tar -C "$work/archive" --sort=name --owner=0 --group=0 --numeric-owner --mode=go=rX,u+rw \
-        --mtime="@$SOURCE_DATE_EPOCH" -cf - "mavgate-$version" |
+        "mavgate-$version.dist-info/METADATA" >"$work/PKG-INFO"
+    git -c tar.umask=0022 archive --prefix="mavgate-$version/" --add-file="$work/PKG-INFO" HEAD |
         gzip -9 --no-name >"$output/mavgate-$version.tar.gz"
 }
 step "source archive" source_archive

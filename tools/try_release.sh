@@ -14,6 +14,8 @@ roots=$PWD/build/roots
 wheels=$PWD/build/wheels
 test_packages=" pytest pytest-asyncio pytest-xdist execnet pluggy iniconfig hypothesis sortedcontainers packaging pygments crsf-parser construct-typing typing-extensions pynmeagps "
 mkdir -p "$roots" "$wheels"
+. tools/steps.sh
+trap 'rm -f "$step_log"' EXIT
 
 skip() {
     echo "$1: skipped: $2"
@@ -24,10 +26,6 @@ download() {
     folder=$wheels/$1-$2
     [ ! -e "$folder/complete" ] || return 0
     mkdir -p "$folder"
-    platforms=
-    for oldest in 2_34 2_31 2_28 2_27 2_26 2_24 2_17 2_12 2_5; do
-        platforms="$platforms --platform manylinux_${oldest}_$1"
-    done
     # Two have no wheel.
     # shellcheck disable=SC2086 # the list is meant to be split
     {
@@ -36,9 +34,8 @@ download() {
         "$python" -m tools.locked_for requirements-dev.lock "$2" "$1" --only $test_packages
     } >"$folder/wheels.lock"
     "$python" -m tools.locked_for requirements-dev.lock "$2" "$1" --only cobs construct >"$folder/sources.lock"
-    # shellcheck disable=SC2086 # the list is meant to be split
-    "$python" -m pip download --quiet --disable-pip-version-check --no-deps --only-binary=:all: \
-        --implementation cp --python-version "$2" $platforms --platform "manylinux2014_$1" \
+    # shellcheck disable=SC2046 # the list is meant to be split
+    "$python" -m pip download --quiet --disable-pip-version-check --no-deps $(wheels_for "$1" "$2") \
         --require-hashes --requirement "$folder/wheels.lock" --dest "$folder" 2>"$folder/log" ||
         { cat "$folder/log" >&2; exit 1; }
     "$python" -m pip download --quiet --disable-pip-version-check --no-deps --no-binary=:all: --no-build-isolation \
