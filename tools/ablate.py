@@ -70,7 +70,9 @@ FILTER: Final = "gateway.estimation.eskf"
 VALIDITY: Final = ("predict.store_integrals", "predict.look_back", "fix_model.past_state")
 SENSORS: Final = ("faults.check_sensor", "faults.check_sensors", "faults.is_hanging")
 MECHANISMS: Final = (
-    Mechanism("noise by vibration", "filter", "add_vibration", NOTHING, ("predict.add_vibration",)),
+    Mechanism(
+        "noise by vibration", "predict", "add_vibration", NOTHING, ("predict.add_vibration",),
+    ),
     Mechanism(
         "changes of bias and barometer", "predict", "unexpected_density", NO_NUMBER,
         ("predict.unexpected_density", "predict.follow_bias_steps"),

@@ -10,33 +10,17 @@ import numpy as np
 
 from gateway.compiled import address_of
 from gateway.compiled.entry_point import EntryPoint
-from gateway.estimation.columns import (
-    GPS_COLUMNS,
-    IMU_COLUMNS,
-    NAV_COLUMNS,
-    GpsRow,
-    gps_row,
-    imu_row,
-    nav_state,
-)
+from gateway.estimation import columns as col
+from gateway.estimation import record as rec
 from gateway.estimation.eskf import filter as kernels
 from gateway.estimation.eskf.latency import KNOWN_STD_S, latency_std, latency_to_use
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import State
-from gateway.estimation.record import (
-    FloatArray,
-    IntArray,
-    Packed,
-    copy_record,
-    filled_record,
-    new_record,
-    pack_record,
-    unpack_record,
-)
+from gateway.estimation.record import FloatArray, IntArray
 from gateway.estimation.reference import EarthField, EarthLocation, ReferenceSettings
 from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 
-_ROW: Final = struct.Struct(f"={IMU_COLUMNS}d")
+_ROW: Final = struct.Struct(f"={col.IMU_COLUMNS}d")
 """Writes the row of one sample in half the time that numpy needs for a tuple."""
 
 Aiding = tuple[int, BaroSample | GpsFix]
@@ -65,7 +49,7 @@ def log_arrays(log: SampleLog) -> tuple[SampleLog, kernels.LogArrays]:
     numbers["imu_count"] = len(log.imu_time_us)
     numbers["baro_count"] = len(log.baro_time_us)
     numbers["gps_count"] = len(log.gps_time_us)
-    return log, filled_record(kernels.LogArrays, numbers)
+    return log, rec.filled_record(kernels.LogArrays, numbers)
 
 
 class FoundLatency(NamedTuple):
@@ -104,8 +88,8 @@ class CompiledEstimator:
         self._reference = reference
         self._earth = EarthField(reference)
         self._time_us = np.zeros(1, np.int64)
-        self._row, self._fix = np.zeros(IMU_COLUMNS), np.zeros(GPS_COLUMNS)
-        self._output = np.empty(NAV_COLUMNS)
+        self._row, self._fix = np.zeros(col.IMU_COLUMNS), np.zeros(col.GPS_COLUMNS)
+        self._output = np.empty(col.NAV_COLUMNS)
         # Setting an item of an array would take five times as long.
         self._time_view, self._row_view = self._time_us.data, self._row.data
         self._time_at, self._row_at = address_of(self._time_us), address_of(self._row)
@@ -118,7 +102,7 @@ class CompiledEstimator:
         self._begin()
 
     def _begin(self) -> None:
-        self._use(new_record(self._kernels.state))
+        self._use(rec.new_record(self._kernels.state))
         self._kernels.begin_state(self._at, self._gains_at)
 
     def _use(self, record: Any) -> None:
@@ -129,20 +113,20 @@ class CompiledEstimator:
 
     def snapshot(self) -> bytes:
         """Return the complete state, including the position on the Earth."""
-        return msgspec.msgpack.encode((pack_record(self._state), self._earth.state))
+        return msgspec.msgpack.encode((rec.pack_record(self._state), self._earth.state))
 
     def restore(self, snapshot: bytes) -> None:
         """Continue from a snapshot; raises ValueError for another estimator's."""
-        kind = tuple[Packed, EarthLocation | None]
+        kind = tuple[rec.Packed, EarthLocation | None]
         packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
-        self._use(unpack_record(self._kernels.state, packed))
+        self._use(rec.unpack_record(self._kernels.state, packed))
 
     def update_imu(self, sample: ImuSample) -> NavState:
         """Advance by one IMU sample, and return the state at its time; see `select.Estimator`."""
         self._time_view[0] = sample.time_us
-        _ROW.pack_into(self._row_view, 0, *imu_row(sample))
+        _ROW.pack_into(self._row_view, 0, *col.imu_row(sample))
         self._step()
-        return nav_state(sample.time_us, self._output)
+        return col.nav_state(sample.time_us, self._output)
 
     def update_baro(self, sample: BaroSample) -> None:
         """Use one barometer sample; only the Kalman filter does."""
@@ -151,12 +135,12 @@ class CompiledEstimator:
 
     def update_gps(self, fix: GpsFix) -> None:
         """Use one GPS fix at its arrival; it is compared with the state at its time of validity."""
-        self._fix[:] = gps_row(fix, self._reference, self._earth)
+        self._fix[:] = col.gps_row(fix, self._reference, self._earth)
         self._kernels.gps_step(self._at, self._gains_at, fix.time_us, self._fix_at)
 
-    def fix_row(self, fix: GpsFix) -> GpsRow:
+    def fix_row(self, fix: GpsFix) -> col.GpsRow:
         """Return the row of one fix of a log that is processed as arrays."""
-        return gps_row(fix, self._reference, self._earth)
+        return col.gps_row(fix, self._reference, self._earth)
 
     def run_in_arrival_order(
         self,
@@ -186,7 +170,7 @@ class CompiledEstimator:
         arrays = (
             np.ascontiguousarray(time_us),
             np.ascontiguousarray(imu),
-            np.empty((len(time_us), NAV_COLUMNS)),
+            np.empty((len(time_us), col.NAV_COLUMNS)),
         )
         starts = [(address_of(array), array.strides[0]) for array in arrays]
         begin = 0
@@ -221,7 +205,7 @@ class KernelEstimator(CompiledEstimator):
     @property
     def state(self) -> State:
         """A copy of the state."""
-        return copy_record(self._state)
+        return rec.copy_record(self._state)
 
     @property
     def gps_latency_s(self) -> tuple[float, float]:
@@ -257,7 +241,7 @@ class KernelEstimator(CompiledEstimator):
         ndarray, shape (n, NAV_COLUMNS)
             One row per IMU sample.
         """
-        out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
+        out = np.empty((len(log.imu_time_us), col.NAV_COLUMNS))
         log, arrays = log_arrays(log)
         kernels.run(self._at, self._gains_at, address_of(arrays), address_of(out))
         return out

@@ -29,25 +29,8 @@ import numpy as np
 
 from gateway.compiled import array_at, compiled, record_at
 from gateway.compiled.entry_point import EntryPoint
-from gateway.estimation.columns import (
-    ACCEL_FILTERED,
-    FLAG,
-    FRESH_GPS_S,
-    GPS_COLUMNS,
-    GPS_DECLINATION,
-    GPS_LAT,
-    GPS_USABLE,
-    GPS_VEL,
-    GYRO_FILTERED,
-    IMU_COLUMNS,
-    NAV_COLUMNS,
-    NAV_FLAGS,
-    NAV_LAT,
-    NAV_QUAT,
-    NAV_RATE,
-    NAV_VEL,
-    imu_vectors,
-)
+from gateway.estimation import columns as col
+from gateway.estimation.columns import FLAG, imu_vectors
 from gateway.estimation.kernel import CompiledEstimator, Kernels
 from gateway.estimation.record import (
     FloatArray,
@@ -262,10 +245,10 @@ def update_imu(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> b
         if sound:
             follow_rate(s, p, dt_s)
             force, rate = accel, gyro
-            if row[ACCEL_FILTERED] == 0.0:
+            if row[col.ACCEL_FILTERED] == 0.0:
                 c = s.lowpass
                 force = filter_step((c[0], c[1], c[2], c[3], c[4]), s.delays[0], accel)
-            if row[GYRO_FILTERED] == 0.0:
+            if row[col.GYRO_FILTERED] == 0.0:
                 c = s.highpass
                 rate = filter_step((c[0], c[1], c[2], c[3], c[4]), s.delays[1], gyro)
             follow_rest(s, accel, gyro, dt_s)
@@ -278,13 +261,13 @@ def update_imu(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> b
 @compiled
 def update_gps(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> None:
     """Blend one fix, extrapolated by its latency: eq. 1 to 8."""
-    if row[GPS_USABLE] == 0.0:
+    if row[col.GPS_USABLE] == 0.0:
         return
-    s.declination_rad = row[GPS_DECLINATION]
-    lat, lon, alt = as_vec(row[GPS_LAT : GPS_LAT + 3])
+    s.declination_rad = row[col.GPS_DECLINATION]
+    lat, lon, alt = as_vec(row[col.GPS_LAT : col.GPS_LAT + 3])
     if not math.isfinite(alt):
         alt = s.fix_from[2] if math.isfinite(s.fix_from[2]) else 0.0
-    vel = as_vec(row[GPS_VEL : GPS_VEL + 3])
+    vel = as_vec(row[col.GPS_VEL : col.GPS_VEL + 3])
     if not math.isfinite(vel[0] + vel[1] + vel[2]):
         vel = bearing_velocity(s, (lat, lon, alt), time_us)
     write_vec(s.fix_from, (lat, lon, alt))
@@ -362,7 +345,7 @@ def follow_rest(s: PaperState, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
     share = min(1.0, dt_s / REST_S)
     write_vec(s.gyro_mean, part_way(as_vec(s.gyro_mean), gyro, share))
     write_vec(s.accel_mean, part_way(as_vec(s.accel_mean), accel, share))
-    fresh = s.fix_us != NEVER_US and (s.time_us - s.fix_us) / US_PER_S < FRESH_GPS_S
+    fresh = s.fix_us != NEVER_US and (s.time_us - s.fix_us) / US_PER_S < col.FRESH_GPS_S
     quiet = (
         math.sqrt(norm_sq(difference(gyro, as_vec(s.gyro_mean)))) < REST[0]
         and math.sqrt(norm_sq(difference(accel, as_vec(s.accel_mean)))) < REST[1]
@@ -413,7 +396,7 @@ def flags_of(s: PaperState, sound: bool) -> int:
         age_s = (s.time_us - s.fix_us) / US_PER_S
         if age_s < POSITION_HOLD_S:
             flags |= FLAG.POSITION_VALID | FLAG.VELOCITY_VALID | FLAG.ALTITUDE_VALID
-        fresh = age_s < FRESH_GPS_S
+        fresh = age_s < col.FRESH_GPS_S
         flags |= FLAG.USING_GPS if fresh else FLAG.DEAD_RECKONING | FLAG.DEGRADED
     return flags if sound else flags | FLAG.SENSOR_FAULT | FLAG.DEGRADED
 
@@ -460,23 +443,23 @@ def imu_steps(state: int, gains: int, count: int, times: int, samples: int, outp
     """Advance by IMU samples, with an output row each; standard deviations are NaN."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
     time_us = array_at(times, (count,), INT)
-    rows = array_at(samples, (count, IMU_COLUMNS), FLOAT)
-    out = array_at(outputs, (count, NAV_COLUMNS), FLOAT)
+    rows = array_at(samples, (count, col.IMU_COLUMNS), FLOAT)
+    out = array_at(outputs, (count, col.NAV_COLUMNS), FLOAT)
     for i in range(count):
         sound = update_imu(s, p, time_us[i], rows[i])
         out[i, :] = NAN
-        write_quat(out[i, NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
-        write_vec(out[i, NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
-        write_vec(out[i, NAV_LAT : NAV_LAT + 3], as_vec(s.location))
-        write_vec(out[i, NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
-        out[i, NAV_FLAGS] = float(flags_of(s, sound))
+        write_quat(out[i, col.NAV_QUAT : col.NAV_QUAT + 4], as_quat(s.q_nb))
+        write_vec(out[i, col.NAV_RATE : col.NAV_RATE + 3], as_vec(s.rate_b))
+        write_vec(out[i, col.NAV_LAT : col.NAV_LAT + 3], as_vec(s.location))
+        write_vec(out[i, col.NAV_VEL : col.NAV_VEL + 3], as_vec(s.vel_n))
+        out[i, col.NAV_FLAGS] = float(flags_of(s, sound))
 
 
 @EntryPoint
 def gps_step(state: int, gains: int, arrival_us: int, fix: int) -> None:
     """Use one fix."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
-    update_gps(s, p, arrival_us, array_at(fix, (GPS_COLUMNS,), FLOAT))
+    update_gps(s, p, arrival_us, array_at(fix, (col.GPS_COLUMNS,), FLOAT))
 
 
 class PaperEstimator(CompiledEstimator):

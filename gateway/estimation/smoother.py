@@ -21,37 +21,9 @@ import numpy as np
 
 from gateway.compiled import address_of, array_at, compiled, record_at
 from gateway.compiled.entry_point import EntryPoint
-from gateway.estimation.columns import (
-    CLIPPED,
-    FLAG,
-    HEADING_VALID_RAD,
-    IMU_COLUMNS,
-    NAV_ALT,
-    NAV_ATTITUDE_STD,
-    NAV_COLUMNS,
-    NAV_FLAGS,
-    NAV_LAT,
-    NAV_LON,
-    NAV_POS_STD,
-    NAV_QUAT,
-    NAV_VEL,
-    NAV_VEL_STD,
-    imu_vectors,
-)
-from gateway.estimation.eskf.filter import (
-    FLOAT,
-    GAINS_LAYOUT,
-    INT,
-    LEVEL_VALID_RAD,
-    LOG_LAYOUT,
-    STATE_LAYOUT,
-    move,
-    row_at,
-    update_aiding,
-    update_imu,
-    write_output,
-    write_position,
-)
+from gateway.estimation import columns as col
+from gateway.estimation.columns import FLAG, imu_vectors
+from gateway.estimation.eskf import filter as live
 from gateway.estimation.eskf.latency import begin_certain
 from gateway.estimation.eskf.predict import COVARIANCE_INTERVAL_S, apply_transition, propagate
 from gateway.estimation.eskf.settings import Gains
@@ -97,7 +69,7 @@ AIDED: Final = 2
 BLOCK: Final = 256
 """Number of nodes whose gains are computed at once."""
 
-STATE_SIZE: Final = STATE_LAYOUT.itemsize
+STATE_SIZE: Final = live.STATE_LAYOUT.itemsize
 MATRIX: Final = STATES * STATES
 BYTE: Final = np.dtype(np.uint8)
 
@@ -169,7 +141,7 @@ def move_copy(s: State, p: Gains, time_us: int, row: FloatArray, used: bool, F: 
         return
     gyro, accel, _ = imu_vectors(row)
     dt, s.imu_s = s.time_s - s.imu_s, s.time_s
-    move(s, p, gyro, accel, row[CLIPPED], dt)
+    live.move(s, p, gyro, accel, row[col.CLIPPED], dt)
     if s.pending_s >= COVARIANCE_INTERVAL_S:
         predict_copy(s, p, F)
 
@@ -192,22 +164,18 @@ def write_row(s: State, copy: State, p: Gains, reset: bool, row: FloatArray) -> 
     After a reset of the filter, its own output is written.
     """
     chosen = s if reset else copy
-    write_output(chosen, p, row)
+    live.write_output(chosen, p, row)
     if s.aided == 0:
-        write_position(s, p, row)
-    flags = int(row[NAV_FLAGS]) | (FLAG.ATTITUDE_VALID if chosen.started == 1 else 0)
+        live.write_position(s, p, row)
+    flags = int(row[col.NAV_FLAGS]) | (FLAG.ATTITUDE_VALID if chosen.started == 1 else 0)
     if chosen.heading_known == 1 and chosen.heading_true == 1:
         flags |= FLAG.HEADING_VALID
-    row[NAV_FLAGS] = float(flags)
+    row[col.NAV_FLAGS] = float(flags)
     if reset:
         return
-    for k in range(3):
-        row[NAV_ATTITUDE_STD + k] = beyond(row[NAV_ATTITUDE_STD + k], copy.P[ATT + k, ATT + k])
-    if s.aided == 0:
-        return
-    for k in range(3):
-        row[NAV_VEL_STD + k] = beyond(row[NAV_VEL_STD + k], copy.P[VEL + k, VEL + k])
-        row[NAV_POS_STD + k] = beyond(row[NAV_POS_STD + k], copy.P[POS + k, POS + k])
+    for k in range(3 if s.aided == 0 else MOVING_STATES):
+        # The columns of attitude, velocity and position follow one another like the states.
+        row[col.NAV_ATTITUDE_STD + k] = beyond(row[col.NAV_ATTITUDE_STD + k], copy.P[k, k])
 
 
 @compiled
@@ -237,18 +205,18 @@ def run_forward(
     Outputs are the rows; for each interval the covariance at its begin, the transition, the
     predicted covariance and the correction; for each sample the bits `RESET` and `AIDED`.
     """
-    s = record_at(states, STATE_LAYOUT)
-    copy = record_at(states + STATE_SIZE, STATE_LAYOUT)
+    s = record_at(states, live.STATE_LAYOUT)
+    copy = record_at(states + STATE_SIZE, live.STATE_LAYOUT)
     both = array_at(states, (2, STATE_SIZE), BYTE)
-    p = record_at(gains, GAINS_LAYOUT)
-    log = record_at(log_at, LOG_LAYOUT)
-    nodes = array_at(nodes_at, (node_count,), INT)
-    imu_time_us = array_at(log.imu_time_us, (log.imu_count,), INT)
+    p = record_at(gains, live.GAINS_LAYOUT)
+    log = record_at(log_at, live.LOG_LAYOUT)
+    nodes = array_at(nodes_at, (node_count,), live.INT)
+    imu_time_us = array_at(log.imu_time_us, (log.imu_count,), live.INT)
     marks = array_at(marks_at, (log.imu_count,), BYTE)
     baros = fixes = 0
     for k in range(node_count - 1):
-        P = array_at(covariances + 8 * k * MATRIX, (STATES, STATES), FLOAT)
-        F = array_at(transitions + 8 * k * MATRIX, (STATES, STATES), FLOAT)
+        P = array_at(covariances + 8 * k * MATRIX, (STATES, STATES), live.FLOAT)
+        F = array_at(transitions + 8 * k * MATRIX, (STATES, STATES), live.FLOAT)
         propagate(s, p)
         for i in range(STATES):
             for j in range(STATES):
@@ -257,19 +225,19 @@ def run_forward(
         for i in range(STATE_SIZE):
             both[1, i] = both[0, i]
         for i in range(nodes[k], nodes[k + 1]):
-            now_us, row = imu_time_us[i], row_at(log.imu, i, IMU_COLUMNS)
-            baros, fixes = update_aiding(s, p, log, now_us, baros, fixes)
+            now_us, row = imu_time_us[i], live.row_at(log.imu, i, col.IMU_COLUMNS)
+            baros, fixes = live.update_aiding(s, p, log, now_us, baros, fixes)
             s.blend_n[:] = 0.0
-            update_imu(s, p, now_us, row)
+            live.update_imu(s, p, now_us, row)
             move_copy(copy, p, now_us, row, s.imu_s == s.time_s, F)
             reset = share_raised(s, copy)
             marks[i] = (RESET if reset else 0) | (AIDED if s.aided == 1 else 0)
-            write_row(s, copy, p, reset, row_at(outputs, i, NAV_COLUMNS))
+            write_row(s, copy, p, reset, live.row_at(outputs, i, col.NAV_COLUMNS))
         propagate(s, p)
         predict_copy(copy, p, F)
-        predicted = array_at(predictions + 8 * k * MATRIX, (STATES, STATES), FLOAT)
+        predicted = array_at(predictions + 8 * k * MATRIX, (STATES, STATES), live.FLOAT)
         end_stretch(s, copy, F, predicted)
-        correction(s, copy, row_at(corrections, k, STATES))
+        correction(s, copy, live.row_at(corrections, k, STATES))
 
 
 def smooth(estimator: KernelEstimator, log: SampleLog) -> tuple[FloatArray, float]:
@@ -304,7 +272,7 @@ def smooth(estimator: KernelEstimator, log: SampleLog) -> tuple[FloatArray, floa
     states[0] = state
     nodes = _nodes(log.imu_time_us)
     count = len(nodes) - 1
-    out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
+    out = np.empty((len(log.imu_time_us), col.NAV_COLUMNS))
     P, F, predicted = (np.empty((count, STATES, STATES)) for _ in range(3))
     d, marks = np.empty((count, STATES)), np.zeros(len(out), np.uint8)
     log, arrays = log_arrays(log)
@@ -385,32 +353,30 @@ def _correct(
     share[cut, 0] = reset[cut]
     following = np.where(reset[:, None], begins[stretch + 1], ends[stretch])
     off = (1.0 - share) * begins[stretch] + share * following
-    quat = slice(NAV_QUAT, NAV_QUAT + 4)
+    quat = slice(col.NAV_QUAT, col.NAV_QUAT + 4)
     out[:, quat] = _rotated(off[:, ATT : ATT + 3], out[:, quat])
     # Without GPS, position and velocity are those of the newest fix, and not states.
-    out[aided, NAV_VEL : NAV_VEL + 3] += off[aided, VEL : VEL + 3]
+    out[aided, col.NAV_VEL : col.NAV_VEL + 3] += off[aided, VEL : VEL + 3]
     if aided.any():
-        lat_deg = float(out[np.argmax(aided), NAV_LAT])
+        lat_deg = float(out[np.argmax(aided), col.NAV_LAT])
         meridian_m, parallel_m = radii_m(lat_deg, 0.0)
-        out[aided, NAV_LAT] += np.degrees(off[aided, POS] / meridian_m)
-        lon_deg = out[aided, NAV_LON] + np.degrees(off[aided, POS + 1] / parallel_m)
-        out[aided, NAV_LON] = wrap_180(lon_deg)
-        out[aided, NAV_ALT] -= off[aided, POS + 2]
-    variance = ((1.0 - share) * variances[stretch] + share * variances[stretch + 1])[
-        :, :MOVING_STATES
-    ]
-    variance = np.where(reset[:, None], 0.0, np.maximum(variance, 0.0))
+        out[aided, col.NAV_LAT] += np.degrees(off[aided, POS] / meridian_m)
+        lon_deg = out[aided, col.NAV_LON] + np.degrees(off[aided, POS + 1] / parallel_m)
+        out[aided, col.NAV_LON] = wrap_180(lon_deg)
+        out[aided, col.NAV_ALT] -= off[aided, POS + 2]
+    smoothed = (1.0 - share) * variances[stretch] + share * variances[stretch + 1]
+    variance = np.where(reset[:, None], 0.0, np.maximum(smoothed[:, :MOVING_STATES], 0.0))
     variance[:, ATT : ATT + 3] += AXES_RAD**2
-    for column, first in ((NAV_ATTITUDE_STD, ATT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
-        use = slice(None) if first == ATT else aided
-        std = np.hypot(out[use, column : column + 3], np.sqrt(variance[use, first : first + 3]))
-        out[use, column : column + 3] = std
-    attitude_std = out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3]
-    flags = out[:, NAV_FLAGS].astype(np.int64)
+    # The columns of attitude, velocity and position follow one another like the states.
+    columns = out[:, col.NAV_ATTITUDE_STD : col.NAV_ATTITUDE_STD + MOVING_STATES]
+    std = np.hypot(columns, np.sqrt(variance))
+    attitude_std = columns[:, :3] = std[:, :3]
+    columns[aided, 3:] = std[aided, 3:]
+    flags = out[:, col.NAV_FLAGS].astype(np.int64)
     # NaN, before the start of the filter, compares false.
-    flags[~(attitude_std[:, :2].max(axis=1) < LEVEL_VALID_RAD)] &= ~FLAG.ATTITUDE_VALID
-    flags[~(attitude_std[:, 2] < HEADING_VALID_RAD)] &= ~FLAG.HEADING_VALID
-    out[:, NAV_FLAGS] = flags
+    flags[~(attitude_std[:, :2].max(axis=1) < live.LEVEL_VALID_RAD)] &= ~FLAG.ATTITUDE_VALID
+    flags[~(attitude_std[:, 2] < col.HEADING_VALID_RAD)] &= ~FLAG.HEADING_VALID
+    out[:, col.NAV_FLAGS] = flags
 
 
 def _rotated(turn: FloatArray, q: FloatArray) -> FloatArray:

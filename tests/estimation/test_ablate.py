@@ -23,7 +23,8 @@ def test_mechanism_is_used_in_its_module_and_its_replacement_fits(mechanism: Mec
     _, module_name, name, replacement, _ = mechanism
     module = import_module(f"{FILTER}.{module_name}")
     original = getattr(module, name)
-    assert name in names_used_in(module)
+    # `filter` uses the functions of the other modules by these.
+    assert name in names_used_in(module) | names_used_in(import_module(f"{FILTER}.filter"))
     if is_compiled(original):
         assert isinstance(replacement, FunctionType)
         assert is_compiled(replacement)

@@ -11,77 +11,10 @@ import numpy as np
 
 from gateway.compiled import array_at, compiled, record_at
 from gateway.compiled.entry_point import EntryPoint
-from gateway.estimation.columns import (
-    ACCEL_UNCALIBRATED,
-    BARO_STALE_S,
-    CLIPPED,
-    FLAG,
-    FRESH_GPS_S,
-    GPS_COLUMNS,
-    GYRO_UNCALIBRATED,
-    HEADING_VALID_RAD,
-    IMU_COLUMNS,
-    MAG_UNCALIBRATED,
-    MEANS,
-    NAV_ALT,
-    NAV_ATTITUDE_STD,
-    NAV_COLUMNS,
-    NAV_FLAGS,
-    NAV_LAT,
-    NAV_LON,
-    NAV_POS_STD,
-    NAV_QUAT,
-    NAV_RATE,
-    NAV_VEL,
-    NAV_VEL_STD,
-    gps_flags,
-    imu_vectors,
-)
-from gateway.estimation.eskf.faults import (
-    ACCEL_LIMIT_MPS2,
-    GAP_S,
-    GYRO_LIMIT_RADPS,
-    UNKNOWN_REPEAT_S,
-    UNSEEN_MPS2,
-    bridge_gap,
-    check_sensors,
-    close_gap,
-    follow_step,
-    gap_limit_s,
-    interpolate,
-    is_hanging,
-    is_start,
-    substitute_accel,
-    substitute_gyro,
-)
+from gateway.estimation import columns as col
+from gateway.estimation.columns import FLAG, gps_flags, imu_vectors
+from gateway.estimation.eskf import faults, integrity, magnetometer, predict, rest, update
 from gateway.estimation.eskf.fixes import update_gps
-from gateway.estimation.eskf.integrity import (
-    accel_bias_var,
-    discard_calibration,
-    end_aiding,
-    gyro_bias_var,
-    level_by_gravity,
-    lose_attitude,
-    reset_accel_bias,
-    reset_gyro_bias,
-)
-from gateway.estimation.eskf.magnetometer import (
-    STALE_MAG_S,
-    hard_iron_var,
-    is_sound_field,
-    reset_hard_iron,
-    update_mag,
-)
-from gateway.estimation.eskf.predict import (
-    COVARIANCE_INTERVAL_S,
-    NO_HEADING_VAR,
-    add_vibration,
-    integrate,
-    is_accel_degraded,
-    propagate,
-    store_integrals,
-)
-from gateway.estimation.eskf.rest import begin_means, detect_rest, is_moving
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
@@ -96,12 +29,6 @@ from gateway.estimation.eskf.state import (
     POS,
     VEL,
     State,
-)
-from gateway.estimation.eskf.update import (
-    LEVEL_INTERVAL_S,
-    restart_baro,
-    update_height,
-    update_rest,
 )
 from gateway.estimation.record import FloatArray, as_quat, as_vec, layout, write_quat, write_vec
 from gateway.estimation.reference import NO_DECLINATION_RAD
@@ -138,9 +65,9 @@ def start(s: State, p: Gains) -> None:
     write_quat(s.q_nb, (1.0, 0.0, 0.0, 0.0))
     write_quat(s.q_ib, (1.0, 0.0, 0.0, 0.0))
     for k in range(3):
-        s.P[GYRO_BIAS + k, GYRO_BIAS + k] = gyro_bias_var(s, p)
-        s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] = accel_bias_var(s, p)
-        s.P[HARD_IRON + k, HARD_IRON + k] = hard_iron_var(s, p)
+        s.P[GYRO_BIAS + k, GYRO_BIAS + k] = integrity.gyro_bias_var(s, p)
+        s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] = integrity.accel_bias_var(s, p)
+        s.P[HARD_IRON + k, HARD_IRON + k] = magnetometer.hard_iron_var(s, p)
         s.P[GYRO_SCALE + k, GYRO_SCALE + k] = UNAIDED_SCALE * UNAIDED_SCALE
         s.gps_error_var[k] = p.gps_error_var if k < 2 else p.gps_height_error_var
         s.P[GPS_ERROR + k, GPS_ERROR + k] = s.gps_error_var[k]
@@ -148,7 +75,7 @@ def start(s: State, p: Gains) -> None:
     s.gps_climb_error_var = p.gps_climb_error_var
     s.P[GPS_CLIMB, GPS_CLIMB] = s.gps_climb_error_var
     s.mag_latency_s = p.mag_latency_s
-    s.P[MAG_LATENCY, MAG_LATENCY] = p.mag_latency_var
+    s.P[MAG_LATENCY, MAG_LATENCY] = p.mag_latency_std_sq
     s.declination_rad = p.declination_rad
     s.earth_dip_rad = s.earth_norm_ut = NAN
     s.fix_excess = 1.0
@@ -162,7 +89,7 @@ def clear_times(s: State) -> None:
     s.mag_s = s.mag_used_s = s.fix_s = s.update_s = s.level_s = NEVER_S
     s.baro_s = s.rejected_s = s.track_s = s.zero_s = NEVER_S
     s.reject_s, s.zero_velocity_wrong = 0.0, 0
-    close_gap(s)
+    faults.close_gap(s)
 
 
 @compiled
@@ -172,7 +99,7 @@ def update_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
     A late sample is ignored; a clock that has gone back far counts as restarted.
     """
     gyro, accel, mag = imu_vectors(row)
-    s.means = 1 if row[MEANS] != 0.0 else 0
+    s.means = 1 if row[col.MEANS] != 0.0 else 0
     check_calibration(s, p, row)
     if s.started == 0:
         begin(s, p, time_us, gyro, accel)
@@ -180,30 +107,30 @@ def update_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
     dt = (time_us - s.time_us) * 1e-6
     if dt <= 0.0:
         s.fault = 1
-        if dt < -GAP_S:
+        if dt < -faults.GAP_S:
             restart_clock(s, time_us)
         return
     s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
     since_s = s.time_s - s.imu_s
-    if is_hanging(s, gyro, accel, is_moving(s, p), dt):
+    if faults.is_hanging(s, gyro, accel, rest.is_moving(s, p), dt):
         s.fault = 1
-    elif since_s > gap_limit_s(s):
-        end_gap(s, p, gyro, accel, row[CLIPPED], since_s)
+    elif since_s > faults.gap_limit_s(s):
+        end_gap(s, p, gyro, accel, row[col.CLIPPED], since_s)
     else:
         s.imu_s = s.time_s
-        advance(s, p, gyro, accel, mag, row[CLIPPED], since_s)
+        advance(s, p, gyro, accel, mag, row[col.CLIPPED], since_s)
 
 
 @compiled
 def end_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, since_s: float) -> None:
     """Bridge a gap at the first valid sample after it."""
-    sound = is_below(gyro, GYRO_LIMIT_RADPS) and is_below(accel, ACCEL_LIMIT_MPS2)
+    sound = is_below(gyro, faults.GYRO_LIMIT_RADPS) and is_below(accel, faults.ACCEL_LIMIT_MPS2)
     if not sound or norm_sq(gyro) + norm_sq(accel) == 0.0:
         s.fault = 1
         return
-    bridge_gap(s, p, gyro, accel, since_s)
-    follow_step(s, gyro, since_s)
-    check_sensors(s, gyro, accel, clipped, since_s)
+    faults.bridge_gap(s, p, gyro, accel, since_s)
+    faults.follow_step(s, gyro, since_s)
+    faults.check_sensors(s, gyro, accel, clipped, since_s)
     s.imu_s, s.sound_s = s.time_s, 0.0
 
 
@@ -213,32 +140,32 @@ def advance(
 ) -> None:
     """Advance by one sample without a gap before it."""
     if move(s, p, gyro, accel, clipped, dt):
-        detect_rest(s, p, gyro, accel, dt)
-    if s.pending_s >= COVARIANCE_INTERVAL_S:
-        propagate(s, p)
+        rest.detect_rest(s, p, gyro, accel, dt)
+    if s.pending_s >= predict.COVARIANCE_INTERVAL_S:
+        predict.propagate(s, p)
     level(s, p)
     misplaced = s.mag_misplaced
-    if is_sound_field(s, mag, dt):
-        update_mag(s, p, mag)
+    if magnetometer.is_sound_field(s, mag, dt):
+        magnetometer.update_mag(s, p, mag)
     elif s.mag_misplaced > misplaced:
         # The heading, and the sensor errors estimated with it, are from wrong axes.
-        discard_calibration(s, p)
-        lose_attitude(s, p)
+        integrity.discard_calibration(s, p)
+        integrity.lose_attitude(s, p)
 
 
 @compiled
 def begin(s: State, p: Gains, time_us: int, gyro: Vec3, accel: Vec3) -> None:
     """Start at the first valid sample; gravity gives the level within the first second."""
-    if not is_start(s, gyro, accel):
+    if not faults.is_start(s, gyro, accel):
         return
     s.started, s.base_us, s.time_us, s.time_s, s.imu_s = 1, time_us, time_us, 0.0, 0.0
-    begin_means(s, gyro, accel)
+    rest.begin_means(s, gyro, accel)
     for k in range(3):
         s.imu_held[k], s.imu_held[3 + k] = gyro[k], accel[k]
         s.force_lp_i[0, k] = s.force_lp_i[1, k] = accel[k]
     write_vec(s.rate_b, gyro)
-    s.usual_repeat_s = UNKNOWN_REPEAT_S
-    lose_attitude(s, p)
+    s.usual_repeat_s = faults.UNKNOWN_REPEAT_S
+    integrity.lose_attitude(s, p)
 
 
 @compiled
@@ -247,46 +174,46 @@ def restart_clock(s: State, time_us: int) -> None:
     s.base_us, s.time_us, s.time_s, s.imu_s = time_us, time_us, 0.0, 0.0
     clear_times(s)
     if s.aided == 1:
-        end_aiding(s)
+        integrity.end_aiding(s)
 
 
 @compiled
 def check_calibration(s: State, p: Gains, row: FloatArray) -> None:
     """Discard the estimated errors of a sensor whose calibration has changed."""
-    bits = 1 if row[GYRO_UNCALIBRATED] != 0.0 else 0
-    bits |= 2 if row[ACCEL_UNCALIBRATED] != 0.0 else 0
-    bits |= 4 if row[MAG_UNCALIBRATED] != 0.0 else 0
+    bits = 1 if row[col.GYRO_UNCALIBRATED] != 0.0 else 0
+    bits |= 2 if row[col.ACCEL_UNCALIBRATED] != 0.0 else 0
+    bits |= 4 if row[col.MAG_UNCALIBRATED] != 0.0 else 0
     changed = bits ^ s.uncalibrated
     s.uncalibrated = bits
     if changed & 1:
-        reset_gyro_bias(s, p)
+        integrity.reset_gyro_bias(s, p)
     if changed & 2:
-        reset_accel_bias(s, p)
+        integrity.reset_accel_bias(s, p)
     if changed & 4:
-        reset_hard_iron(s, p)
+        magnetometer.reset_hard_iron(s, p)
 
 
 @compiled
 def move(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bool:
     """Integrate one sample or its substitute; return whether both sensors were valid."""
-    sound_gyro, sound_accel = check_sensors(s, gyro, accel, clipped, dt)
+    sound_gyro, sound_accel = faults.check_sensors(s, gyro, accel, clipped, dt)
     sound = sound_gyro and sound_accel
     if sound:
-        follow_step(s, gyro, dt)
-        mean_gyro, mean_accel = interpolate(s, s.imu_before, gyro, accel, dt)
-        add_vibration(s, p, gyro, accel, dt)
+        faults.follow_step(s, gyro, dt)
+        mean_gyro, mean_accel = faults.interpolate(s, s.imu_before, gyro, accel, dt)
+        predict.add_vibration(s, p, gyro, accel, dt)
         gyro, accel = mean_gyro, mean_accel
     if not sound_gyro:
-        gyro = substitute_gyro(s)
+        gyro = faults.substitute_gyro(s)
     if not sound_accel:
-        accel = substitute_accel(s)
-    integrate(s, p, gyro, accel, dt)
+        accel = faults.substitute_accel(s)
+    predict.integrate(s, p, gyro, accel, dt)
     if clipped != 0.0:
         # The part above the range may be as large as the clipped reading.
         for k in range(3):
             s.pending_noise[0] += (dt * s.imu_held[k]) ** 2
             s.pending_noise[1] += (dt * s.imu_held[3 + k]) ** 2
-    store_integrals(s)
+    predict.store_integrals(s)
     return sound
 
 
@@ -294,16 +221,16 @@ def move(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, dt: float)
 def level(s: State, p: Gains) -> None:
     """Update by rest, and by gravity if GPS does not give the velocity."""
     since_s = s.time_s - s.level_s
-    if since_s < LEVEL_INTERVAL_S:
+    if since_s < update.LEVEL_INTERVAL_S:
         return
     s.level_s = s.time_s
     if s.aided == 1 and s.time_s - s.fix_s > p.dead_reckoning_s:
-        propagate(s, p)
-        end_aiding(s)
+        predict.propagate(s, p)
+        integrity.end_aiding(s)
     if s.aided == 0:
-        level_by_gravity(s, p, min(since_s, 1.0))
+        integrity.level_by_gravity(s, p, min(since_s, 1.0))
     if s.at_rest == 1:
-        update_rest(s, p)
+        update.update_rest(s, p)
 
 
 @compiled
@@ -314,23 +241,23 @@ def update_baro(s: State, p: Gains, alt_m: float) -> None:
     s.baro_down_m = -alt_m
     if s.has_height == 0:
         s.pos_n[2] = -alt_m
-    elif s.time_s - s.baro_s > BARO_STALE_S:
-        restart_baro(s, p)
+    elif s.time_s - s.baro_s > col.BARO_STALE_S:
+        update.restart_baro(s, p)
     else:
-        update_height(s, p)
+        update.update_height(s, p)
     s.baro_s = s.time_s
 
 
 @compiled
 def write_output(s: State, p: Gains, row: FloatArray) -> None:
     """Write the output row, see `columns`."""
-    write_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
-    write_vec(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
-    row[NAV_FLAGS] = float(flags_of(s, p))
-    write_vec(row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3], UNKNOWN_VEC3)
+    write_quat(row[col.NAV_QUAT : col.NAV_QUAT + 4], as_quat(s.q_nb))
+    write_vec(row[col.NAV_RATE : col.NAV_RATE + 3], as_vec(s.rate_b))
+    row[col.NAV_FLAGS] = float(flags_of(s, p))
+    write_vec(row[col.NAV_ATTITUDE_STD : col.NAV_ATTITUDE_STD + 3], UNKNOWN_VEC3)
     if s.started == 1:
-        write_std(row, NAV_ATTITUDE_STD, s, ATT)
-        row[NAV_ATTITUDE_STD + 2] = heading_std_rad(s)
+        write_std(row, col.NAV_ATTITUDE_STD, s, ATT)
+        row[col.NAV_ATTITUDE_STD + 2] = heading_std_rad(s)
     write_position(s, p, row)
 
 
@@ -345,7 +272,7 @@ def write_std(row: FloatArray, column: int, s: State, first: int) -> None:
 def heading_std_rad(s: State) -> float:
     """Return the standard deviation of the heading with its systematic errors."""
     if s.heading_known == 0:
-        return math.sqrt(NO_HEADING_VAR)
+        return math.sqrt(predict.NO_HEADING_VAR)
     variance = max(s.P[ATT + 2, ATT + 2], 0.0) + COMPASS_RAD * COMPASS_RAD
     if s.heading_true == 0:
         variance += NO_DECLINATION_RAD * NO_DECLINATION_RAD
@@ -355,51 +282,51 @@ def heading_std_rad(s: State) -> float:
 @compiled
 def write_position(s: State, p: Gains, row: FloatArray) -> None:
     """Write position, velocity and their standard deviations; unknown ones are NaN."""
-    write_vec(row[NAV_VEL : NAV_VEL + 3], UNKNOWN_VEC3)
-    row[NAV_VEL_STD : NAV_POS_STD + 3] = NAN
-    row[NAV_LAT] = row[NAV_LON] = NAN
+    write_vec(row[col.NAV_VEL : col.NAV_VEL + 3], UNKNOWN_VEC3)
+    row[col.NAV_VEL_STD : col.NAV_POS_STD + 3] = NAN
+    row[col.NAV_LAT] = row[col.NAV_LON] = NAN
     if s.has_height == 1 or s.baro_s != NEVER_S:
         height_std_m = math.sqrt(s.P[POS + 2, POS + 2]) if s.has_height == 1 else PRESSURE_STD_M
-        row[NAV_ALT], row[NAV_POS_STD + 2] = -s.pos_n[2], height_std_m
+        row[col.NAV_ALT], row[col.NAV_POS_STD + 2] = -s.pos_n[2], height_std_m
     else:
-        row[NAV_ALT] = NAN
+        row[col.NAV_ALT] = NAN
     if s.has_origin == 0:
         return
     north, east = s.pos_n[0] + s.blend_n[0], s.pos_n[1] + s.blend_n[1]
-    row[NAV_LAT], row[NAV_LON] = offset_deg(s.origin[0], s.origin[1], 0.0, north, east)
+    row[col.NAV_LAT], row[col.NAV_LON] = offset_deg(s.origin[0], s.origin[1], 0.0, north, east)
     if s.aided == 1:
-        write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
-        write_std(row, NAV_VEL_STD, s, VEL)
+        write_vec(row[col.NAV_VEL : col.NAV_VEL + 3], as_vec(s.vel_n))
+        write_std(row, col.NAV_VEL_STD, s, VEL)
         for k in range(2):
-            row[NAV_POS_STD + k] = math.hypot(math.sqrt(s.P[POS + k, POS + k]), s.blend_n[k])
-    elif s.time_s - s.fix_s < FRESH_GPS_S:
-        write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.fix_vel))
+            row[col.NAV_POS_STD + k] = math.hypot(math.sqrt(s.P[POS + k, POS + k]), s.blend_n[k])
+    elif s.time_s - s.fix_s < col.FRESH_GPS_S:
+        write_vec(row[col.NAV_VEL : col.NAV_VEL + 3], as_vec(s.fix_vel))
         for k in range(3):
-            unseen_mps = UNSEEN_MPS2 * (s.time_s - s.fix_s + s.gps_latency_s)
+            unseen_mps = faults.UNSEEN_MPS2 * (s.time_s - s.fix_s + s.gps_latency_s)
             usual = p.gps_velocity_var if k < 2 else p.gps_climb_var + s.gps_climb_error_var
-            row[NAV_VEL_STD + k] = math.sqrt(usual + unseen_mps * unseen_mps)
+            row[col.NAV_VEL_STD + k] = math.sqrt(usual + unseen_mps * unseen_mps)
             if k < 2:
                 fix_std_m = math.sqrt(s.gps_error_var[k] + p.gps_position_var)
-                row[NAV_POS_STD + k] = math.hypot(fix_std_m, s.blend_n[k])
+                row[col.NAV_POS_STD + k] = math.hypot(fix_std_m, s.blend_n[k])
 
 
 @compiled
 def flags_of(s: State, p: Gains) -> int:
     """Return the flags, see `NavFlags`."""
     flags: int = FLAG.AT_REST if s.at_rest == 1 else 0
-    if s.time_s - s.mag_s < STALE_MAG_S:
+    if s.time_s - s.mag_s < magnetometer.STALE_MAG_S:
         flags |= FLAG.MAG_DISTURBED if s.mag_disturbed == 1 else FLAG.USING_MAG
     if s.mag_misplaced == 1:
         flags |= FLAG.MAG_DISTURBED | FLAG.MAG_MISPLACED | FLAG.DEGRADED
-    if s.time_s - s.baro_s < BARO_STALE_S:
+    if s.time_s - s.baro_s < col.BARO_STALE_S:
         flags |= FLAG.USING_BARO
     if s.fault == 1:
         flags |= FLAG.SENSOR_FAULT
-    if s.fault == 1 or is_accel_degraded(s):
+    if s.fault == 1 or predict.is_accel_degraded(s):
         flags |= FLAG.DEGRADED
     if s.started == 1 and max(s.P[ATT, ATT], s.P[ATT + 1, ATT + 1]) < LEVEL_VALID_RAD**2:
         flags |= FLAG.ATTITUDE_VALID
-    if s.heading_known == 1 and s.heading_true == 1 and heading_std_rad(s) < HEADING_VALID_RAD:
+    if s.heading_known == 1 and s.heading_true == 1 and heading_std_rad(s) < col.HEADING_VALID_RAD:
         flags |= FLAG.HEADING_VALID
     if s.has_height == 1 or s.baro_s != NEVER_S:
         flags |= FLAG.ALTITUDE_VALID
@@ -436,8 +363,8 @@ def imu_steps(
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
     time_us = array_at(times_us, (count,), INT)
     for i in range(count):
-        update_imu(s, p, time_us[i], row_at(samples, i, IMU_COLUMNS))
-        write_output(s, p, row_at(outputs, i, NAV_COLUMNS))
+        update_imu(s, p, time_us[i], row_at(samples, i, col.IMU_COLUMNS))
+        write_output(s, p, row_at(outputs, i, col.NAV_COLUMNS))
 
 
 @EntryPoint
@@ -450,7 +377,7 @@ def baro_step(state: int, gains: int, alt_m: float) -> None:
 def gps_step(state: int, gains: int, arrival_us: int, fix: int) -> None:
     """Use one fix."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
-    update_gps(s, p, arrival_us, row_at(fix, 0, GPS_COLUMNS))
+    update_gps(s, p, arrival_us, row_at(fix, 0, col.GPS_COLUMNS))
 
 
 class LogArrays:
@@ -482,7 +409,7 @@ def update_aiding(
         update_baro(s, p, baro_alt_m[baros])
         baros += 1
     while fixes < log.gps_count and gps_time_us[fixes] <= until_us:
-        update_gps(s, p, gps_time_us[fixes], row_at(log.gps, fixes, GPS_COLUMNS))
+        update_gps(s, p, gps_time_us[fixes], row_at(log.gps, fixes, col.GPS_COLUMNS))
         fixes += 1
     return baros, fixes
 
@@ -496,5 +423,5 @@ def run(state: int, gains: int, log_at: int, outputs: int) -> None:
     baros = fixes = 0
     for i in range(log.imu_count):
         baros, fixes = update_aiding(s, p, log, imu_time_us[i], baros, fixes)
-        update_imu(s, p, imu_time_us[i], row_at(log.imu, i, IMU_COLUMNS))
-        write_output(s, p, row_at(outputs, i, NAV_COLUMNS))
+        update_imu(s, p, imu_time_us[i], row_at(log.imu, i, col.IMU_COLUMNS))
+        write_output(s, p, row_at(outputs, i, col.NAV_COLUMNS))

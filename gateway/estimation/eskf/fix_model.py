@@ -193,7 +193,7 @@ def is_unlikely(s: State, p: Gains, row: FloatArray, off: Vec3, lag: float) -> b
         position_row(s, k, once, twice, lag)
         total = innovation_variance(s, position_variance(s, p, row, k, p.gps_correlation_s))
         worst = max(worst, off[k] * off[k] / total)
-    return worst > p.gate_sq
+    return worst > p.gate_sigma_sq
 
 
 @compiled
@@ -242,5 +242,5 @@ def update_fix(
         if math.isfinite(off_pos[k]):
             position_row(s, k, once, twice, lag)
             variance = position_variance(s, p, row, k, since_s) + s.glitch_var[POSITION]
-            update_scalar(s, off_pos[k], variance, p.gate_sq)
+            update_scalar(s, off_pos[k], variance, p.gate_sigma_sq)
     inject(s)

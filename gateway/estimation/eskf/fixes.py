@@ -4,34 +4,9 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.columns import (
-    GPS_ALT,
-    GPS_DECLINATION,
-    GPS_DIP,
-    GPS_LAT,
-    GPS_LON,
-    GPS_STRENGTH,
-    GPS_USABLE,
-    GPS_VEL,
-)
-from gateway.estimation.eskf.alignment import (
-    MAX_PAIR_S,
-    MEMORY_S,
-    NOISE_MPS,
-    PAIR_S,
-    TRACK_NOISE_MPS,
-    add_velocity,
-)
+from gateway.estimation import columns as col
+from gateway.estimation.eskf import alignment, fix_model
 from gateway.estimation.eskf.faults import gap_limit_s
-from gateway.estimation.eskf.fix_model import (
-    LEAST_FIX_INTERVAL_S,
-    is_unlikely,
-    past_state,
-    position_row,
-    position_variance,
-    set_error_variances,
-    update_fix,
-)
 from gateway.estimation.eskf.integrity import check_attitude, lose_attitude
 from gateway.estimation.eskf.latency import compare_latencies
 from gateway.estimation.eskf.magnetometer import raise_hard_iron, turn_heading
@@ -55,7 +30,7 @@ from gateway.records import NAN, Vec3
 
 FASTEST_MPS: Final = 1000.0
 """Velocity above which it is an error."""
-BASELINE_S: Final = 2.0 * PAIR_S
+BASELINE_S: Final = 2.0 * alignment.PAIR_S
 """Least interval of positions for a velocity: closer ones differ mostly by noise."""
 ZERO_S: Final = 3.0
 ZERO_MPS: Final = 2.0
@@ -85,9 +60,9 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
     if s.started == 0 or not is_new_fix(s, row):
         return
     learn_declination(s, row)
-    set_error_variances(s, p, row)
+    fix_model.set_error_variances(s, p, row)
     arrival_s = (arrival_us - s.base_us) * 1e-6
-    reported = as_vec(row[GPS_VEL : GPS_VEL + 3])
+    reported = as_vec(row[col.GPS_VEL : col.GPS_VEL + 3])
     if is_below(reported, FASTEST_MPS) and s.sound_s > AFTER_GAP_S:
         compare_latencies(s, p.gps_latency_s, arrival_s, reported)
     wanted_s = arrival_s - s.gps_latency_s
@@ -106,7 +81,7 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
             s.fix_s = arrival_s
         return
     if sound:
-        noise_mps = NOISE_MPS if is_level_sound(reported) else TRACK_NOISE_MPS
+        noise_mps = alignment.NOISE_MPS if is_level_sound(reported) else alignment.TRACK_NOISE_MPS
         pair_velocity(s, p, vel_s, vel, noise_mps)
     valid_s = look_back(s, wanted_s)
     if sound:
@@ -140,8 +115,8 @@ def is_new_fix(s: State, row: FloatArray) -> bool:
     A log may repeat a fix until the next one, and a receiver may be stuck. A moving receiver never
     reports the same position twice; at rest a repetition may be real.
     """
-    lat, lon, vel = row[GPS_LAT], row[GPS_LON], as_vec(row[GPS_VEL : GPS_VEL + 3])
-    if row[GPS_USABLE] == 0.0 or not math.isfinite(lat + lon):
+    lat, lon, vel = row[col.GPS_LAT], row[col.GPS_LON], as_vec(row[col.GPS_VEL : col.GPS_VEL + 3])
+    if row[col.GPS_USABLE] == 0.0 or not math.isfinite(lat + lon):
         return False
     has_velocity = is_below(vel, FASTEST_MPS)
     repeated = lat == s.newest_lat_deg and lon == s.newest_lon_deg
@@ -159,11 +134,11 @@ def is_new_fix(s: State, row: FloatArray) -> bool:
 @compiled
 def learn_declination(s: State, row: FloatArray) -> None:
     """Set the Earth's field at a fix, and convert a magnetic heading to a true one."""
-    if math.isfinite(row[GPS_DIP] + row[GPS_STRENGTH]):
-        s.earth_dip_rad, s.earth_norm_ut = row[GPS_DIP], row[GPS_STRENGTH]
-    if not math.isfinite(row[GPS_DECLINATION]):
+    if math.isfinite(row[col.GPS_DIP] + row[col.GPS_STRENGTH]):
+        s.earth_dip_rad, s.earth_norm_ut = row[col.GPS_DIP], row[col.GPS_STRENGTH]
+    if not math.isfinite(row[col.GPS_DECLINATION]):
         return
-    s.declination_rad = row[GPS_DECLINATION]
+    s.declination_rad = row[col.GPS_DECLINATION]
     if s.heading_known == 1 and s.heading_true == 0:
         s.heading_true = 1
         turn_heading(s, s.declination_rad)
@@ -173,7 +148,7 @@ def learn_declination(s: State, row: FloatArray) -> None:
 def position_of(s: State, row: FloatArray) -> Vec3:
     """Return a fix in metres from the origin, down positive; the first fix sets the origin."""
     if s.has_origin == 0:
-        s.origin[0], s.origin[1], s.has_origin = row[GPS_LAT], row[GPS_LON], 1
+        s.origin[0], s.origin[1], s.has_origin = row[col.GPS_LAT], row[col.GPS_LON], 1
     elif math.hypot(s.pos_n[0], s.pos_n[1]) > ORIGIN_RENEWAL_M:
         lat, lon = offset_deg(s.origin[0], s.origin[1], 0.0, s.pos_n[0], s.pos_n[1])
         north, east = displacement_m(s.origin[0], s.origin[1], lat, lon, 0.0)
@@ -183,8 +158,8 @@ def position_of(s: State, row: FloatArray) -> Vec3:
         s.pos_n[0] -= north
         s.pos_n[1] -= east
         s.origin[0], s.origin[1] = lat, lon
-    north, east = displacement_m(s.origin[0], s.origin[1], row[GPS_LAT], row[GPS_LON], 0.0)
-    return (north, east, -row[GPS_ALT])
+    north, east = displacement_m(s.origin[0], s.origin[1], row[col.GPS_LAT], row[col.GPS_LON], 0.0)
+    return (north, east, -row[col.GPS_ALT])
 
 
 @compiled
@@ -223,7 +198,7 @@ def complete_velocity(s: State, valid_s: float, pos: Vec3, vel: Vec3) -> tuple[V
         write_vec(f, pos)
         if is_below(vel, FASTEST_MPS):
             return vel, valid_s
-        known = 0.0 <= dt <= MAX_PAIR_S
+        known = 0.0 <= dt <= alignment.MAX_PAIR_S
         climb = track[2] if known and math.isfinite(track[2]) else 0.0
         if is_level_sound(vel):
             return (vel[0], vel[1], climb), valid_s
@@ -242,9 +217,9 @@ def pair_velocity(s: State, p: Gains, vel_s: float, vel: Vec3, noise_mps: float)
         # The level was found by gravity alone, which turns and accelerations may have distorted.
         lose_attitude(s, p)
     at_s = look_back(s, vel_s)
-    dt = add_velocity(s, p, at_s, vel, as_vec(s.then), noise_mps)
+    dt = alignment.add_velocity(s, p, at_s, vel, as_vec(s.then), noise_mps)
     if dt > 0.0:
-        check_attitude(s, p, dt, s.sound_s >= MEMORY_S)
+        check_attitude(s, p, dt, s.sound_s >= alignment.MEMORY_S)
 
 
 @compiled
@@ -259,16 +234,18 @@ def fuse_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, lag: flo
     """Update by a fix; an outlier is rejected, unless such fixes have agreed for long."""
     propagate(s, p)
     start_height(s, p, pos[2] + s.vel_n[2] * lag)
-    past_pos, past_vel = past_state(s, lag)
+    past_pos, past_vel = fix_model.past_state(s, lag)
     off_pos = difference(difference(pos, past_pos), as_vec(s.gps_error_n))
     past_vel = (past_vel[0], past_vel[1], past_vel[2] + s.gps_climb_error_mps)
     off_vel = difference(vel, past_vel)
-    far = math.hypot(off_pos[0], off_pos[1]) >= p.gate_m and is_unlikely(s, p, row, off_pos, lag)
+    far = math.hypot(off_pos[0], off_pos[1]) >= p.gate_m and fix_model.is_unlikely(
+        s, p, row, off_pos, lag
+    )
     agreed = far and have_agreed(s, p, pos, vel)
     if agreed:
         restart_at(s, p, pos, as_vec(s.fix_vel), lag)
     else:
-        update_fix(s, p, row, off_pos, off_vel, lag)
+        fix_model.update_fix(s, p, row, off_pos, off_vel, lag)
     if agreed or not far:
         accept_fix(s)
 
@@ -290,7 +267,7 @@ def follow_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, lag: float) -> No
 
     Its height moves the height and the offset of the barometer as one of many.
     """
-    since_s = max(s.time_s - s.fix_s, LEAST_FIX_INTERVAL_S)
+    since_s = max(s.time_s - s.fix_s, fix_model.LEAST_FIX_INTERVAL_S)
     s.fix_s = s.time_s
     for k in range(2):
         s.pos_n[k] = pos[k] + (s.fix_vel[k] * lag if math.isfinite(s.fix_vel[k]) else 0.0)
@@ -299,9 +276,9 @@ def follow_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, lag: float) -> No
         start_height(s, p, down_m)
     elif math.isfinite(down_m):
         propagate(s, p)
-        position_row(s, 2, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+        fix_model.position_row(s, 2, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
         off_m = down_m - s.pos_n[2] - s.gps_error_n[2]
-        update_scalar(s, off_m, position_variance(s, p, row, 2, since_s), p.gate_sq)
+        update_scalar(s, off_m, fix_model.position_variance(s, p, row, 2, since_s), p.gate_sigma_sq)
         inject(s)
 
 

@@ -228,7 +228,7 @@ def update_mag(s: State, p: Gains, mag_b: Vec3) -> None:
     if weight == 0.0:
         return
     steep = max(1.0, (math.cos(STEEP_DIP_RAD) * norm / level) ** 2)
-    variance = p.mag_var * steep / weight
+    variance = p.mag_noise_var * steep / weight
     propagate(s, p)
     if s.heading_known == 0:
         start_heading(s, p, field_n, variance)
@@ -261,7 +261,7 @@ def update_hard_iron(s: State, p: Gains, mag_b: Vec3, weight: float, dt: float) 
         return
     propagate(s, p)
     variance = 4.0 * norm_sq(mag_b) * NORM_NOISE_UT**2 / weight
-    update_scalar(s, off, variance * max(1.0, CORRELATION_S / dt), p.gate_sq)
+    update_scalar(s, off, variance * max(1.0, CORRELATION_S / dt), p.gate_sigma_sq)
     inject(s)
 
 
@@ -314,7 +314,7 @@ def start_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
     reset_state(s, ATT + 2, NO_HEADING_VAR)
     clear_row(s)
     heading_row(s, field_n)
-    update_scalar(s, 0.0, variance, p.gate_sq)
+    update_scalar(s, 0.0, variance, p.gate_sigma_sq)
     s.heading_known = 1
     s.heading_true = 1 if math.isfinite(s.declination_rad) else 0
 
@@ -327,7 +327,7 @@ def update_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
     correlation_s = CORRELATION_S if s.aided == 1 else UNAIDED_CORRELATION_S
     since_s = min(s.time_s - s.mag_used_s, STALE_MAG_S)
     off = wrap_pi(declination(s) - math.atan2(field_n[1], field_n[0]))
-    update_scalar(s, off, variance * max(1.0, correlation_s / since_s), p.gate_sq)
+    update_scalar(s, off, variance * max(1.0, correlation_s / since_s), p.gate_sigma_sq)
 
 
 @compiled

@@ -250,12 +250,12 @@ def propagate(s: State, p: Gains) -> None:
     angle_var, velocity_var = s.pending_noise[0], s.pending_noise[1]
     kept = math.exp(-dt / p.gps_error_s)
     for k in range(3):
-        s.P[ATT + k, ATT + k] += angle_var + p.gyro_density * dt
-        s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_density * dt
-        s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_density * dt
-        s.P[HARD_IRON + k, HARD_IRON + k] += p.hard_iron_density * dt
+        s.P[ATT + k, ATT + k] += angle_var + p.gyro_noise_density * dt
+        s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_walk_density * dt
+        s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_walk_density * dt
+        s.P[HARD_IRON + k, HARD_IRON + k] += p.hard_iron_walk_density * dt
         if s.aided == 1:
-            s.P[VEL + k, VEL + k] += velocity_var + p.accel_density * dt
+            s.P[VEL + k, VEL + k] += velocity_var + p.accel_noise_density * dt
             s.P[POS + k, POS + k] += s.pos_density[k] * dt
         scale_state(s.P, GPS_ERROR + k, kept)
         s.P[GPS_ERROR + k, GPS_ERROR + k] += s.gps_error_var[k] * (1.0 - kept * kept)
@@ -264,7 +264,7 @@ def propagate(s: State, p: Gains) -> None:
         s.P[POS + 2, POS + 2] += CLIMB_DENSITY * dt
     speed_sq = norm_sq(as_vec(s.vel_n))
     s.P[BARO_OFFSET, BARO_OFFSET] += (
-        p.baro_density + p.baro_dynamic_density * speed_sq * speed_sq
+        p.baro_walk_density + p.baro_dynamic_density * speed_sq * speed_sq
     ) * dt
     kept = math.exp(-dt / p.gps_climb_error_s)
     scale_state(s.P, GPS_CLIMB, kept)

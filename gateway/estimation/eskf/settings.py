@@ -1,13 +1,12 @@
 """Settings of the filter, also as variances and densities in SI units."""
 
-import math
 from typing import Annotated, Final
 
 import msgspec
 
 from gateway.estimation.record import filled_record
 from gateway.estimation.reference import EarthField, ReferenceSettings
-from gateway.settings import Settings, setting
+from gateway.settings import Settings, fields_of, setting
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
 DYNAMIC_S: Final = 30.0
@@ -176,7 +175,7 @@ class EskfSettings(Settings, frozen=True):
 class Gains:
     """The settings as variances and densities in SI units; see `EskfSettings`."""
 
-    gyro_density: float
+    gyro_noise_density: float
     """rad2/s."""
     gyro_vibration_sq: float
     gyro_scale_var: float
@@ -184,17 +183,17 @@ class Gains:
     """rad2 per rad."""
     gyro_bias_var: float
     gyro_bias_uncalibrated_var: float
-    gyro_bias_density: float
+    gyro_bias_walk_density: float
     gyro_bias_change_radps: float
-    accel_density: float
+    accel_noise_density: float
     """m2/s3."""
     accel_vibration_sq: float
     accel_scale_sq: float
     accel_bias_var: float
     accel_bias_uncalibrated_var: float
-    accel_bias_density: float
+    accel_bias_walk_density: float
     gravity_tau_s: float
-    gravity_var: float
+    gravity_noise_var: float
     gravity_motion_sq: float
     gps_position_var: float
     gps_height_var: float
@@ -209,21 +208,21 @@ class Gains:
     gps_correlation_s: float
     gps_latency_s: float
     gps_relock_s: float
-    mag_var: float
+    mag_noise_var: float
     mag_latency_s: float
-    mag_latency_var: float
+    mag_latency_std_sq: float
     hard_iron_var: float
     hard_iron_uncalibrated_var: float
-    hard_iron_density: float
+    hard_iron_walk_density: float
     field_norm_tolerance: float
     field_dip_tolerance_rad: float
     declination_rad: float
     """NaN if it is looked up at the position of a fix."""
-    baro_var: float
-    baro_density: float
+    baro_noise_var: float
+    baro_walk_density: float
     baro_dynamic_density: float
     dead_reckoning_s: float
-    gate_sq: float
+    gate_sigma_sq: float
     gate_m: float
     rest_gyro_radps: float
     rest_accel_mps2: float
@@ -233,50 +232,18 @@ class Gains:
 
 
 def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
-    """Convert the settings to SI units; those with the same name are already in SI units."""
-    same = msgspec.structs.asdict(reference) | msgspec.structs.asdict(settings)
-    same["declination_rad"] = EarthField(reference).declination_rad
-    return filled_record(Gains, same | _variances(settings))
+    """Convert the settings to SI units; a gain has the name of its setting with another unit.
 
-
-def _variances(s: EskfSettings) -> dict[str, float]:
-    return {
-        "gyro_density": (s.gyro_noise_degprs * RAD_PER_DEG) ** 2,
-        "gyro_vibration_sq": s.gyro_vibration**2,
-        "gyro_scale_var": s.gyro_scale**2,
-        "gyro_turn_var": (s.gyro_turn_deg * RAD_PER_DEG) ** 2,
-        "gyro_bias_var": (s.gyro_bias_degps * RAD_PER_DEG) ** 2,
-        "gyro_bias_uncalibrated_var": (s.gyro_bias_uncalibrated_degps * RAD_PER_DEG) ** 2,
-        "gyro_bias_density": (s.gyro_bias_walk_degpsprs * RAD_PER_DEG) ** 2,
-        "gyro_bias_change_radps": s.gyro_bias_change_degps * RAD_PER_DEG,
-        "accel_density": s.accel_noise_mpsprs**2,
-        "accel_vibration_sq": s.accel_vibration**2,
-        "accel_scale_sq": s.accel_scale**2,
-        "accel_bias_var": s.accel_bias_mps2**2,
-        "accel_bias_uncalibrated_var": s.accel_bias_uncalibrated_mps2**2,
-        "accel_bias_density": s.accel_bias_walk_mps2prs**2,
-        "gravity_var": s.gravity_noise_mps2**2,
-        "gravity_motion_sq": s.gravity_motion**2,
-        "rest_gyro_radps": math.radians(s.rest_gyro_degps),
-        "bias_limit_radps": math.radians(s.bias_limit_degps),
-        "gps_position_var": s.gps_position_m**2,
-        "gps_height_var": s.gps_height_m**2,
-        "gps_error_var": s.gps_error_m**2,
-        "gps_height_error_var": s.gps_height_error_m**2,
-        "gps_velocity_var": s.gps_velocity_mps**2,
-        "gps_climb_var": s.gps_climb_mps**2,
-        "gps_climb_error_var": s.gps_climb_error_mps**2,
-        "gps_jitter_sq": s.gps_jitter_s**2,
-        "mag_var": (s.mag_noise_deg * RAD_PER_DEG) ** 2,
-        "mag_latency_var": s.mag_latency_std_s**2,
-        "hard_iron_var": s.hard_iron_ut**2,
-        "hard_iron_uncalibrated_var": s.hard_iron_uncalibrated_ut**2,
-        "hard_iron_density": s.hard_iron_walk_utprs**2,
-        "field_dip_tolerance_rad": math.radians(s.field_dip_tolerance_deg),
-        "baro_var": s.baro_noise_m**2,
-        "baro_density": s.baro_walk_mprs**2,
-        "baro_dynamic_density": 2.0
-        / DYNAMIC_S
-        * (s.baro_dynamic * 0.5 / STANDARD_GRAVITY_MPS2) ** 2,
-        "gate_sq": s.gate_sigma**2,
-    }
+    A variance or density is the square of its setting.
+    """
+    values = msgspec.structs.asdict(reference) | msgspec.structs.asdict(settings)
+    # Reversed, because of two settings that differ only in their units the first is squared.
+    for field in reversed(fields_of(EskfSettings)):
+        name = field.name.rpartition("_")[0] if field.unit else field.name
+        value = values[field.name] * (RAD_PER_DEG if field.unit.startswith("deg") else 1.0)
+        values |= dict.fromkeys((f"{name}_rad", f"{name}_radps"), value)
+        values |= dict.fromkeys((f"{name}_var", f"{name}_sq", f"{name}_density"), value**2)
+    values["declination_rad"] = EarthField(reference).declination_rad
+    dynamic = settings.baro_dynamic * 0.5 / STANDARD_GRAVITY_MPS2
+    values["baro_dynamic_density"] = 2.0 / DYNAMIC_S * dynamic**2
+    return filled_record(Gains, values)

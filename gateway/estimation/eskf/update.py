@@ -183,7 +183,7 @@ def gravity_variance(s: State, p: Gains) -> float:
     """Return the variance of one horizontal axis of the filtered force, m2/s4."""
     settling = 2.0 * p.gravity_tau_s / s.force_lp_s
     motion = p.gravity_motion_sq * (1.0 + settling * settling) * s.force_dev_sq
-    return p.gravity_var + motion + sustained_sq(s)
+    return p.gravity_noise_var + motion + sustained_sq(s)
 
 
 @compiled
@@ -203,7 +203,7 @@ def update_gravity(s: State, p: Gains, dt: float) -> None:
         consider(s, ATT + 2, 1)
         s.h[ATT + 1 - k] = down if k == 0 else -down
         set_accel_bias(s, k, -1.0)
-        update_scalar(s, -north if k == 0 else -east, variance, p.gate_sq)
+        update_scalar(s, -north if k == 0 else -east, variance, p.gate_sigma_sq)
     inject(s)
 
 
@@ -219,7 +219,7 @@ def update_rest(s: State, p: Gains) -> None:
         for k in range(3):
             clear_row(s)
             s.h[VEL + k] = 1.0
-            update_scalar(s, -s.vel_n[k], REST_VELOCITY_VAR, p.gate_sq)
+            update_scalar(s, -s.vel_n[k], REST_VELOCITY_VAR, p.gate_sigma_sq)
     inject(s)
 
 
@@ -230,7 +230,9 @@ def update_height(s: State, p: Gains) -> None:
     clear_row(s)
     s.h[POS + 2] = 1.0
     s.h[BARO_OFFSET] = -1.0
-    update_scalar(s, s.baro_down_m + s.baro_offset_m - s.pos_n[2], p.baro_var, p.gate_sq)
+    update_scalar(
+        s, s.baro_down_m + s.baro_offset_m - s.pos_n[2], p.baro_noise_var, p.gate_sigma_sq
+    )
     inject(s)
 
 
@@ -243,4 +245,4 @@ def restart_baro(s: State, p: Gains) -> None:
     for j in range(STATES):
         s.P[BARO_OFFSET, j] = s.P[POS + 2, j]
         s.P[j, BARO_OFFSET] = s.P[j, POS + 2]
-    s.P[BARO_OFFSET, BARO_OFFSET] = s.P[POS + 2, POS + 2] + p.baro_var
+    s.P[BARO_OFFSET, BARO_OFFSET] = s.P[POS + 2, POS + 2] + p.baro_noise_var
