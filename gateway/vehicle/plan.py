@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.records import GpsFix, GpsFixType
 from gateway.settings import Settings, setting
 from gateway.units import DEG_PER_DEGE7, DEGE7_PER_DEG
+from gateway.vehicle.encoding import INT32_MAX, whole
 
 MAX_LAT_DEG: Final = 90.0
 MAX_LON_DEG: Final = 180.0
@@ -45,6 +46,8 @@ RALLY: Final[int] = mavlink.MAV_MISSION_TYPE_RALLY
 MAX_ITEMS: Final = {MISSION: 1000, FENCE: 500, RALLY: 100}
 """Maximum items by type: more than a flight needs, with little memory for each aircraft."""
 ACCEPTED: Final[int] = mavlink.MAV_MISSION_ACCEPTED
+INVALID_X: Final = mavlink.MAV_MISSION_INVALID_PARAM5_X
+INVALID_Y: Final = mavlink.MAV_MISSION_INVALID_PARAM6_Y
 FLOAT_FRAMES: Final = {
     mavlink.MAV_FRAME_GLOBAL_INT: mavlink.MAV_FRAME_GLOBAL,
     mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
@@ -63,8 +66,7 @@ def is_on_earth(lat_deg: float, lon_deg: float) -> bool:
 
 def height_amsl_m(height_m: float, frame: int, home_alt_m: float) -> float:
     """Convert a height in a MAV_FRAME to one above mean sea level; NaN if it is unknown."""
-    relative = frame in RELATIVE_FRAMES
-    height = height_m + home_alt_m if relative else height_m
+    height = height_m + home_alt_m if frame in RELATIVE_FRAMES else height_m
     return height if math.isfinite(height) else math.nan
 
 
@@ -201,7 +203,7 @@ def read_item(message: Any) -> Item:
     x, y = message.x, message.y
     if message.get_type() == "MISSION_ITEM":
         scale = _scale(message.frame)
-        x, y = (_integer(value * scale) for value in (x, y))
+        x, y = (whole(value * scale, -INT32_MAX, INT32_MAX, INT32_MAX) for value in (x, y))
     params = (message.param1, message.param2, message.param3, message.param4)
     frame, command, autocontinue = message.frame, message.command, message.autocontinue
     return Item(frame, command, autocontinue, params, x, y, message.z)
@@ -238,24 +240,15 @@ def _scale(frame: int) -> float:
 def check_item(item: Item, kind: int) -> int:
     """Return the MAV_MISSION_RESULT for an item of an upload; any command may be in a mission."""
     known = {FENCE: FENCE_COMMANDS, RALLY: RALLY_COMMANDS}.get(kind, mavlink.enums["MAV_CMD"])
-    result: int = ACCEPTED
-    if item.command not in known:
-        result = mavlink.MAV_MISSION_UNSUPPORTED
-    elif item.command in LOCATED_COMMANDS:
-        if item.frame not in GLOBAL_FRAMES:
-            result = mavlink.MAV_MISSION_UNSUPPORTED_FRAME
-        elif not is_on_earth(item.x / DEGE7_PER_DEG, 0.0):
-            result = mavlink.MAV_MISSION_INVALID_PARAM5_X
-        elif not is_on_earth(0.0, item.y / DEGE7_PER_DEG):
-            result = mavlink.MAV_MISSION_INVALID_PARAM6_Y
-        elif math.isinf(item.z):
-            result = mavlink.MAV_MISSION_INVALID_PARAM7
-    return result
-
-
-def _integer(value: float) -> int:
-    limit = 2**31 - 1
-    return round(max(-limit, min(limit, value))) if math.isfinite(value) else limit
+    located = item.command in LOCATED_COMMANDS
+    faults = (
+        (item.command not in known, mavlink.MAV_MISSION_UNSUPPORTED),
+        (located and item.frame not in GLOBAL_FRAMES, mavlink.MAV_MISSION_UNSUPPORTED_FRAME),
+        (located and not is_on_earth(item.x / DEGE7_PER_DEG, 0.0), INVALID_X),
+        (located and not is_on_earth(0.0, item.y / DEGE7_PER_DEG), INVALID_Y),
+        (located and math.isinf(item.z), mavlink.MAV_MISSION_INVALID_PARAM7),
+    )
+    return next((result for is_wrong, result in faults if is_wrong), ACCEPTED)
 
 
 class StoredPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

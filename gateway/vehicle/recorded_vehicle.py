@@ -164,7 +164,11 @@ class _Commands(Service):
         """Return the frames that a request selects, in the order of their numbers."""
         read = [(self._mavlink.decode(bytearray(frame)), frame) for frame in frames]
         chosen = [(message, frame) for message, frame in read if wanted.selects(message)]
-        if wanted.message_id == AVAILABLE_MODES and wanted.is_for_all and chosen:
+        if (
+            wanted.message_id == AVAILABLE_MODES
+            and not any(map(whole, wanted.selectors))
+            and chosen
+        ):
             # A station that requests all of them waits until the last one has come.
             is_complete = len(chosen) >= chosen[0][0].number_modes
             chosen = chosen if is_complete else []

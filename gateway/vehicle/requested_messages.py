@@ -16,8 +16,7 @@ parameters. The descriptions of MAVLink's messages define which field they selec
 """
 
 import math
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -63,30 +62,22 @@ _EXACT: Final = (
 """Messages of which no value selects all."""
 
 
-def _fields_of(kind: Any) -> tuple[str, ...]:
-    own = _FIELDS.get(kind.msgname, (kind.instance_field,) if kind.instance_field else ())
-    return (*own, _CAMERA) if _CAMERA in kind.fieldnames else own
-
-
 DISTINGUISHED_BY: Final[dict[int, tuple[str, ...]]] = {
     message_id: fields for message_id, kind in mavlink.mavlink_map.items()
-    if (fields := _fields_of(kind))
+    if (fields := (
+        *_FIELDS.get(kind.msgname, (kind.instance_field,) if kind.instance_field else ()),
+        *((_CAMERA,) if _CAMERA in kind.fieldnames else ()),
+    ))
 }  # fmt: skip
 """Fields that distinguish messages of one type and sender, by message id."""
 
 
-@dataclass(frozen=True, slots=True)
-class MessageRequest:
+class MessageRequest(NamedTuple):
     """A request for a message."""
 
     message_id: int
     selectors: tuple[float, ...] = ()
     """Values that select among the messages of this type; those that are left out are 0."""
-
-    @property
-    def is_for_all(self) -> bool:
-        """Whether it selects all messages of its type."""
-        return not any(map(whole, self.selectors))
 
     def selects(self, message: Any) -> bool:
         """Return whether a message of the requested type is selected; a missing field is 0."""

@@ -1,7 +1,7 @@
 """A client's request, its answers, and the interface of the services that answer."""
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import msgspec
 from pymavlink.dialects.v20 import all as mavlink
@@ -116,7 +116,7 @@ Answer = Reply | Action
 class Service:
     """One group of requests; by default it changes nothing and sends nothing by itself."""
 
-    types: ClassVar[tuple[str, ...]] = ()
+    types: tuple[str, ...] = ()
     """Names of the messages that it handles."""
 
     def changes_state(self, _request: Request) -> bool:

@@ -183,8 +183,7 @@ class Vehicle:
         self.health.on_state(state, sample)
         found = self.telemetry.on_state(state, sample)
         found += self._announcements.on_state(state, sample, now_us)
-        if self._intervals.has_fast:
-            found += self._intervals.on_state(state.time_us)
+        found += self._intervals.on_state(state.time_us)
         if self._calibrator.busy:
             found += self._calibrator.on_sample(sample)
         return self._finish(found) if found else []

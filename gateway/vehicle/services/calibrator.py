@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 
 from gateway.geometry.geomagnetism import MagneticField, magnetic_field, year_of
-from gateway.records import ImuSample, NavFlags, NavState, Vec3
+from gateway.records import ImuSample, NavFlags, NavState
 from gateway.sensing.calibrating import (
     IN_BODY_AXES,
     CalibrationError,
@@ -92,16 +92,11 @@ class _Run:
     command: Command
     began_us: int
     samples: list[ImuSample] = field(default_factory=list)
-    mag: list[Vec3] = field(default_factory=list)
-    mag_times_us: list[int] = field(default_factory=list)
+    mag: list[ImuSample] = field(default_factory=list)
+    """Those of the samples that have a field."""
     poses: list[NodeSamples] = field(default_factory=list)
     """Samples of each side that it rested on."""
     progress: int = 0
-
-    @property
-    def is_turned(self) -> bool:
-        """Whether the operator turns it about all axes."""
-        return self.kind == "mag" and self.at_rest is None
 
     @property
     def has_sides(self) -> bool:
@@ -116,8 +111,7 @@ class _Run:
         """Collect a sample; return the time that all samples span."""
         self.samples.append(sample)
         if sample.mag_b_ut is not None and len(self.mag) < MAG_SAMPLES:
-            self.mag.append(sample.mag_b_ut)
-            self.mag_times_us.append(sample.time_us)
+            self.mag.append(sample)
         return sample.time_us - self.samples[0].time_us
 
     def collected(self) -> NodeSamples:
@@ -126,11 +120,11 @@ class _Run:
             time_s=np.array([sample.time_us for sample in self.samples]) / US_PER_S,
             accel=np.array([sample.accel_b_mps2 for sample in self.samples]),
             gyro=np.array([sample.gyro_b_radps for sample in self.samples]),
-            mag_time_s=np.array(self.mag_times_us) / US_PER_S,
-            mag=np.array(self.mag, float).reshape(-1, 3),
+            mag_time_s=np.array([sample.time_us for sample in self.mag]) / US_PER_S,
+            mag=np.array([sample.mag_b_ut for sample in self.mag], float).reshape(-1, 3),
             moving=np.zeros(len(self.samples), np.bool_),
         )
-        self.samples, self.mag, self.mag_times_us = [], [], []
+        self.samples, self.mag = [], []
         return found
 
 
@@ -188,10 +182,10 @@ class Calibrator(Service):
         if self._in_flight():
             return self._fail("in flight")
         passed_us = run.add(sample)
-        if run.is_turned:
-            return self._on_mag(run, passed_us) if sample.mag_b_ut is not None else []
         if run.has_sides:
             return self._on_side(run) if passed_us > SIDE_US else []
+        if run.at_rest is None:
+            return self._on_mag(run, passed_us) if sample.mag_b_ut is not None else []
         if passed_us <= REST_US:
             return self._announce(run, min(99, 100 * passed_us // REST_US))
         return self._solve(run, run.collected())
@@ -239,7 +233,7 @@ class Calibrator(Service):
         if passed_us < MAG_MIN_US or len(run.mag) % FIT_EVERY:
             return self._announce(run, min(90, 100 * passed_us // TIMEOUT_US))
         try:
-            fit = solve_magnetometer(np.array(run.mag))
+            fit = solve_magnetometer(np.array([sample.mag_b_ut for sample in run.mag]))
             return self._done(run, with_magnetometer(IN_BODY_AXES, fit))
         except MoreNeeded:
             is_full = len(run.mag) >= MAG_SAMPLES

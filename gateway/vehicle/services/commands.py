@@ -202,11 +202,10 @@ class IntervalService(Service):
             if not 0 < requested_us <= KEEPS_CLIENTS_US:
                 return DENIED, []
             requested_us = DEFAULT
-        if requested_us < 0:
-            requested_us = NONE
-        elif requested_us != DEFAULT:
+        if requested_us > 0:
             carried = message_id in CARRIED_MESSAGES
             requested_us = max(MIN_INTERVAL_US if carried else MIN_TIMED_INTERVAL_US, requested_us)
+        requested_us = max(requested_us, NONE)
         if _is_faster(requested_us, stream.interval_us) and not command.request.may_change:
             return DENIED, []
         return ACCEPTED, self._apply(command.request.client_id, message_id, requested_us)
@@ -229,17 +228,10 @@ class IntervalService(Service):
 
     def on_state(self, time_us: int) -> list[Answer]:
         """Send the messages of an IMU sample to the clients that requested more."""
-        return self._due(CARRIED_MESSAGES, time_us, Stream.offer)
-
-    @property
-    def has_fast(self) -> bool:
-        """Whether a client requested more than the settings' rate."""
-        return bool(self._fast)
+        return self._due(CARRIED_MESSAGES, time_us, Stream.offer) if self._fast else []
 
     def poll(self, now_us: int) -> list[Answer]:
         """Send the timed messages to the clients that requested more."""
-        if not self._fast:
-            return []
         timed = [m for _, m in self._fast if m not in CARRIED_MESSAGES]
         return self._due(timed, now_us, Stream.tick)
 
@@ -290,10 +282,12 @@ class CommandService(Service):
     ) -> None:
         """Let other services carry out commands: those that change something, and the others."""
         self._telemetry = telemetry
-        self._explain = explain
         self._handlers: dict[int, Handler] = {
             **dict.fromkeys((REQUEST_MESSAGE, *SHORTHANDS), self._request_message),
-            **dict.fromkeys(REFUSALS, self._decline),
+            **dict.fromkeys(
+                REFUSALS,
+                lambda command, now_us: (DENIED, explain(REFUSALS[command.number], now_us)),
+            ),
             **changing,
             **reading,
         }
@@ -315,9 +309,6 @@ class CommandService(Service):
             return [command.ack(UNSUPPORTED)]
         result, answers = handler(command, now_us)
         return [command.ack(result), *answers]
-
-    def _decline(self, command: Command, now_us: int) -> Outcome:
-        return DENIED, self._explain(REFUSALS[command.number], now_us)
 
     def _request_message(self, command: Command, now_us: int) -> Outcome:
         wanted, request = requested_message(command), command.request

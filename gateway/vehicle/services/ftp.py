@@ -121,14 +121,6 @@ class FtpService(TransferService):
         self._files = dict(files)
         self._sessions: dict[int, _Session] = {}
         self._last: dict[int, tuple[Packet, Reply]] = {}
-        self._handlers: dict[int, Callable[[Request, Packet], bytes]] = {
-            Opcode.NONE: lambda *_: b"",
-            Opcode.TERMINATE_SESSION: self._terminate,
-            Opcode.RESET_SESSIONS: self._reset,
-            Opcode.LIST_DIRECTORY: self._list,
-            Opcode.READ_FILE: self._read,
-            Opcode.CALC_FILE_CRC32: self._crc32,
-        }
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Answer one request; a repeated request gets the same answer again."""
@@ -144,7 +136,9 @@ class FtpService(TransferService):
         except _RefusedError as refused:
             answer = packet.answer(NAK, packet.session, bytes([refused.error]))
         reply = _reply(request, answer)
-        self._keep_answer(request.client_id, packet, reply)
+        if request.client_id not in self._last and len(self._last) >= MAX_ANSWERS:
+            self._last.pop(next(iter(self._last)))
+        self._last[request.client_id] = (packet, reply)
         return [reply]
 
     def remove_client(self, client_id: int) -> None:
@@ -164,14 +158,30 @@ class FtpService(TransferService):
 
     def _carry_out(self, request: Request, packet: Packet) -> tuple[int, bytes]:
         """Carry out a request; return the session and the data of the answer."""
-        if packet.opcode == Opcode.OPEN_FILE_RO:
-            return self._open(request, packet)
-        if packet.opcode in WRITING:
-            raise _RefusedError(FtpError.FILE_PROTECTED)
-        handler = self._handlers.get(packet.opcode)
-        if handler is None:
-            raise _RefusedError(FtpError.UNKNOWN_COMMAND)
-        return packet.session, handler(request, packet)
+        session, data = packet.session, b""
+        match packet.opcode:
+            case Opcode.OPEN_FILE_RO:
+                return self._open(request, packet)
+            case Opcode.NONE:
+                pass
+            case Opcode.TERMINATE_SESSION:
+                self._content(request, packet)
+                self._drop(session)
+            case Opcode.RESET_SESSIONS:
+                # A client's reset must not close the files of others.
+                self.remove_client(request.client_id)
+            case Opcode.LIST_DIRECTORY:
+                data = self._list(request, packet)
+            case Opcode.READ_FILE:
+                size = min(packet.size or MAX_DATA, MAX_DATA)
+                data = self._content_from(request, packet)[:size]
+            case Opcode.CALC_FILE_CRC32:
+                data = struct.pack("<I", crc32(self._generate(*_path(packet), request)))
+            case opcode:
+                is_protected = opcode in WRITING
+                error = FtpError.FILE_PROTECTED if is_protected else FtpError.UNKNOWN_COMMAND
+                raise _RefusedError(error)
+        return session, data
 
     def _open(self, request: Request, packet: Packet) -> tuple[int, bytes]:
         """Open a session, under the number of the request if that is free.
@@ -200,16 +210,6 @@ class FtpService(TransferService):
             raise _RefusedError(FtpError.NO_SESSIONS)
         self._drop(oldest)
 
-    def _terminate(self, request: Request, packet: Packet) -> bytes:
-        self._content(request, packet)
-        self._drop(packet.session)
-        return b""
-
-    def _reset(self, request: Request, _packet: Packet) -> bytes:
-        # A client's reset must not close the files of others.
-        self.remove_client(request.client_id)
-        return b""
-
     def _list(self, request: Request, packet: Packet) -> bytes:
         folder = _path(packet)[0].removesuffix("/") + "/"
         found = [path for path in sorted(self._files) if path.rpartition("/")[0] + "/" == folder]
@@ -225,12 +225,6 @@ class FtpService(TransferService):
         if not data:
             raise _RefusedError(FtpError.EOF)
         return data
-
-    def _read(self, request: Request, packet: Packet) -> bytes:
-        return self._content_from(request, packet)[: min(packet.size or MAX_DATA, MAX_DATA)]
-
-    def _crc32(self, request: Request, packet: Packet) -> bytes:
-        return struct.pack("<I", crc32(self._generate(*_path(packet), request)))
 
     def _content(self, request: Request, packet: Packet) -> bytes:
         """Return the file of the client's session."""
@@ -250,11 +244,6 @@ class FtpService(TransferService):
         if file is None:
             raise _RefusedError(FtpError.FILE_NOT_FOUND)
         return file if isinstance(file, bytes) else file(request, query)
-
-    def _keep_answer(self, client_id: int, packet: Packet, reply: Reply) -> None:
-        if client_id not in self._last and len(self._last) >= MAX_ANSWERS:
-            self._last.pop(next(iter(self._last)))
-        self._last[client_id] = (packet, reply)
 
 
 def _burst(request: Request, packet: Packet, content: bytes) -> Iterator[Reply]:

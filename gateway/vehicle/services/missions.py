@@ -67,18 +67,16 @@ MAX_CLIENTS: Final = 512
 CHECKS: Final = 3
 """Number of further requests for the last item when the ACK may have been lost."""
 ALL: Final = mavlink.MAV_MISSION_TYPE_ALL
-CHANGING: Final = frozenset(
-    {
-        "MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_CLEAR_ALL",
-        "MISSION_SET_CURRENT", "MISSION_WRITE_PARTIAL_LIST",
-    }
-)  # fmt: skip
+CHANGING: Final = (
+    *("MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_CLEAR_ALL"),
+    *("MISSION_SET_CURRENT", "MISSION_WRITE_PARTIAL_LIST"),
+)
+UNSUPPORTED: Final = ("MISSION_REQUEST_PARTIAL_LIST", "MISSION_WRITE_PARTIAL_LIST")
 
 Sender = tuple[int, int, int]
 """Client, system and component: several programs may share one client of the hub."""
 
 Items = tuple[Item, ...]
-
 Changed = Callable[[int], list[Answer]]
 """Called with the mission type that was stored, cleared or advanced."""
 
@@ -112,11 +110,6 @@ class _Upload:
 class MissionService(Service):
     """The stored items of one vehicle."""
 
-    types = (
-        "MISSION_REQUEST_LIST", "MISSION_REQUEST_INT", "MISSION_REQUEST", "MISSION_ACK",
-        "MISSION_REQUEST_PARTIAL_LIST", *sorted(CHANGING),
-    )  # fmt: skip
-
     def __init__(
         self,
         changed: Changed,
@@ -143,6 +136,7 @@ class MissionService(Service):
             "MISSION_SET_CURRENT": self._set_current,
             "MISSION_ACK": self._end,
         }
+        self.types = (*self._handlers, *UNSUPPORTED)
 
     def changes_state(self, request: Request) -> bool:
         """Return whether the request would store, clear or change the current item."""
@@ -224,14 +218,14 @@ class MissionService(Service):
         found: list[Any] = []
         for kind, items in self.items.items():
             found.append(mavlink.MAVLink_mission_count_message(0, 0, len(items), kind))
-            found += [
-                write_item(item, number, kind, (0, 0), self._is_current(kind, number))
-                for number, item in enumerate(items)
-            ]
+            found += [self._item(items, number, kind, (0, 0)) for number in range(len(items))]
         return found
 
-    def _is_current(self, kind: int, sequence: int) -> bool:
-        return kind == MISSION and sequence == self.current
+    def _item(
+        self, items: Items, sequence: int, kind: int, target: tuple[int, int], floats: bool = False
+    ) -> Any:
+        is_current = kind == MISSION and sequence == self.current
+        return write_item(items[sequence], sequence, kind, target, is_current, floats)
 
     def _sent(self, kind: int) -> Items:
         """Return the items that a client gets."""
@@ -253,10 +247,8 @@ class MissionService(Service):
         items = self._sent(kind)
         if sequence >= len(items):
             return [mission_ack(request, mavlink.MAV_MISSION_INVALID_SEQUENCE)]
-        target = (request.system_id, request.component_id)
-        item, is_current = items[sequence], self._is_current(kind, sequence)
-        as_floats = not self._forms[_sender(request)]
-        return [request.reply(write_item(item, sequence, kind, target, is_current, as_floats))]
+        target, floats = _sender(request)[1:], not self._forms[_sender(request)]
+        return [request.reply(self._item(items, sequence, kind, target, floats))]
 
     def _begin(self, request: Request, now_us: int) -> list[Answer]:
         kind, count = request.message.mission_type, request.message.count
@@ -337,10 +329,8 @@ class MissionService(Service):
         return answers
 
     def _set_current(self, request: Request, now_us: int) -> list[Answer]:
-        answers = self.set_current(request.message.seq)
-        if answers is None:
-            return self._explain(f"No mission item {request.message.seq}", now_us)
-        return answers
+        answers, sequence = self.set_current(request.message.seq), request.message.seq
+        return self._explain(f"No mission item {sequence}", now_us) if answers is None else answers
 
     def _end(self, request: Request, now_us: int) -> list[Answer]:
         """Handle a client's MISSION_ACK: the end of its download, or of its own upload.

@@ -34,8 +34,8 @@ References
 .. [1] MAV_CMD_REQUEST_OPERATOR_CONTROL and CONTROL_STATUS in MAVLink's development.xml
 """
 
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -55,8 +55,7 @@ INTERVAL_US: Final = US_PER_S
 TIMEOUT_US: Final = 30 * US_PER_S
 
 
-@dataclass(frozen=True, slots=True)
-class _Wanted:
+class _Wanted(NamedTuple):
     """A request for control, or its release, of either order of parameters."""
 
     action: int
@@ -66,18 +65,11 @@ class _Wanted:
     """System ids that may send it; empty for any."""
     is_former: bool
 
-    def parameters(self, system_id: int) -> tuple[float, ...]:
-        """Return the command's parameters that forward a system's request."""
-        if self.is_former:
-            return (system_id, self.action, self.takeover, self.timeout_s)
-        return (self.action, self.takeover, self.timeout_s, system_id)
-
 
 def read_wanted(params: tuple[float, ...], sender: int) -> _Wanted:
     """Read the command; if both orders are possible, the present one is assumed."""
     first, second, third, fourth, fifth = map(whole, params[:5])
-    is_former = is_former_control(params, sender)
-    if is_former:
+    if is_former_control(params, sender):
         systems = range(first, first + 1) if first else range(0)
         return _Wanted(second, third, params[3], systems, is_former=True)
     systems = range(fourth, max(fourth, fifth) + 1) if fourth else range(0)
@@ -90,9 +82,7 @@ class _Operator:
     """Its newest request for control."""
     received_us: int
     """When its newest message was received."""
-    allows_takeover: bool
-    uses_former: bool
-    """Whether it requested control with the former order of parameters."""
+    wanted: _Wanted
 
 
 class OperatorControl(Service):
@@ -124,49 +114,37 @@ class OperatorControl(Service):
 
     def command(self, command: Command, now_us: int) -> Outcome:
         """Carry out MAV_CMD_REQUEST_OPERATOR_CONTROL."""
-        request = command.request
-        wanted = read_wanted(command.params, request.system_id)
-        is_release, reason = wanted.action == RELEASE_CONTROL, request.reason
-        if wanted.systems and request.system_id not in wanted.systems and not is_release:
+        request, sender = command.request, command.request.system_id
+        wanted, reason = read_wanted(command.params, sender), request.reason
+        is_release = wanted.action == RELEASE_CONTROL
+        if wanted.systems and sender not in wanted.systems and not is_release:
             reason = reason or "requested for another system"
         if reason:
-            text = f"Refused control to system {request.system_id}: {reason}"
+            text = f"Refused control to system {sender}: {reason}"
             return DENIED, self._explain(text, now_us)
+        if not self.exclusive:
+            return ACCEPTED, []
         if is_release:
-            return self._release(request, now_us)
-        result, answers = self._request(
-            request, now_us, allows_takeover=wanted.takeover == 1, uses_former=wanted.is_former
-        )
-        if result == FAILED:
-            answers = [*answers, *self._notice(request, wanted)]
-        return result, answers
-
-    def _notice(self, request: Request, wanted: _Wanted) -> list[Answer]:
-        """Notify the station in control of another's request, in the order that it uses."""
-        if self._operator is None:
-            return []
-        operator = self._operator.request
-        notice = mavlink.MAVLink_command_long_message(
-            operator.system_id,
-            operator.component_id,
-            REQUEST_OPERATOR_CONTROL,
-            0,
-            *replace(wanted, is_former=self._operator.uses_former).parameters(request.system_id),
-            *(0.0, 0.0, 0.0),
-        )
-        return [operator.reply(notice)]
+            if not self._is_operator(request):
+                return DENIED, []
+            return ACCEPTED, self._change(None, f"System {sender} released control", now_us)
+        operator = self._operator
+        is_own = operator is not None and operator.request.system_id == sender
+        if operator is None or is_own or operator.wanted.takeover == 1:
+            text = "" if is_own else f"System {sender} is in control"
+            return ACCEPTED, self._change(_Operator(request, now_us, wanted), text, now_us)
+        text = f"System {sender} requests control; {self.denial(request)}"
+        return FAILED, [*self._explain(text, now_us), _notice(operator, wanted, sender)]
 
     def poll(self, now_us: int) -> list[Answer]:
         """Send CONTROL_STATUS, and release the control of a station that timed out."""
         if not self.exclusive or now_us < self._due_us:
             return []
-        operator = self._operator
+        operator, text = self._operator, ""
         if operator is not None and now_us - operator.received_us > TIMEOUT_US:
-            return self._change(
-                None, f"System {operator.request.system_id} lost control: timeout", now_us
-            )
-        self._due_us = now_us + INTERVAL_US
-        return [Reply(self.status())]
+            text = f"System {operator.request.system_id} lost control: timeout"
+            operator = None
+        return self._change(operator, text, now_us)
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to send."""
@@ -178,48 +156,35 @@ class OperatorControl(Service):
             self._operator = None
             self._due_us = 0
 
-    def status(self) -> Any:
-        """Encode CONTROL_STATUS."""
-        operator = self._operator
-        is_free = operator is None or operator.allows_takeover
-        flags = SYSTEM_MANAGER | (TAKEOVER_ALLOWED if is_free else 0)
-        return CONTROL_STATUS(flags, operator.request.system_id if operator else 0, *[0] * 10)
-
     def _is_operator(self, request: Request) -> bool:
         if self._operator is None:
             return False
         operator = self._operator.request
         return (operator.client_id, operator.system_id) == (request.client_id, request.system_id)
 
-    def _request(
-        self,
-        request: Request,
-        now_us: int,
-        *,
-        allows_takeover: bool = False,
-        uses_former: bool = False,
-    ) -> Outcome:
-        if not self.exclusive:
-            return ACCEPTED, []
-        operator = self._operator
-        is_own = operator is not None and operator.request.system_id == request.system_id
-        if operator is not None and not is_own and not operator.allows_takeover:
-            return FAILED, self._explain(
-                f"System {request.system_id} requests control; {self.denial(request)}", now_us
-            )
-        text = "" if is_own else f"System {request.system_id} is in control"
-        granted = _Operator(request, now_us, allows_takeover, uses_former)
-        return ACCEPTED, self._change(granted, text, now_us)
-
-    def _release(self, request: Request, now_us: int) -> Outcome:
-        if not self.exclusive:
-            return ACCEPTED, []
-        if not self._is_operator(request):
-            return DENIED, []
-        return ACCEPTED, self._change(None, f"System {request.system_id} released control", now_us)
-
     def _change(self, operator: _Operator | None, text: str, now_us: int) -> list[Answer]:
+        """Set the station in control, and send CONTROL_STATUS."""
         self._operator = operator
         self._due_us = now_us + INTERVAL_US
+        is_free = operator is None or operator.wanted.takeover == 1
+        flags = SYSTEM_MANAGER | (TAKEOVER_ALLOWED if is_free else 0)
+        in_control = 0 if operator is None else operator.request.system_id
         explained = self._explain(text, now_us) if text else []
-        return [Reply(self.status()), *explained]
+        return [Reply(CONTROL_STATUS(flags, in_control, *[0] * 10)), *explained]
+
+
+def _notice(operator: _Operator, wanted: _Wanted, sender: int) -> Reply:
+    """Notify the station in control of another's request, in the order that it uses."""
+    asked = (wanted.action, wanted.takeover, wanted.timeout_s)
+    params = (sender, *asked) if operator.wanted.is_former else (*asked, sender)
+    request, nothing = operator.request, (0.0, 0.0, 0.0)
+    return request.reply(
+        mavlink.MAVLink_command_long_message(
+            request.system_id,
+            request.component_id,
+            REQUEST_OPERATOR_CONTROL,
+            0,
+            *params,
+            *nothing,
+        )
+    )

@@ -56,39 +56,14 @@ UNITS: Final = frozenset(
 )  # fmt: skip
 
 ABBREVIATIONS: Final = {
-    "accel": "ACC",
-    "accuracy": "ACCUR",
-    "altitude": "ALT",
-    "attitude": "ATT",
-    "calibration": "CAL",
-    "chebyshev": "CHEB",
-    "controller": "CTRL",
-    "declination": "DECL",
-    "estimation": "EST",
-    "extended": "EXT",
-    "heading": "HDG",
-    "height": "HGT",
-    "highpass": "HP",
-    "highres": "HR",
-    "lowpass": "LP",
-    "mission": "MIS",
-    "mounting": "MNT",
-    "nominal": "NOM",
-    "position": "POS",
-    "pressure": "PRES",
-    "quaternion": "QUAT",
-    "rates": "RATE",
-    "reference": "REF",
-    "satellites": "SATS",
-    "scaled": "SCAL",
-    "status": "STAT",
-    "system": "SYS",
-    "takeoff": "TKOFF",
-    "tolerance": "TOL",
-    "vehicle": "VEH",
-    "velocity": "VEL",
-}
-
+    "accel": "ACC", "accuracy": "ACCUR", "altitude": "ALT", "attitude": "ATT",
+    "calibration": "CAL", "chebyshev": "CHEB", "controller": "CTRL", "declination": "DECL",
+    "estimation": "EST", "extended": "EXT", "heading": "HDG", "height": "HGT", "highpass": "HP",
+    "highres": "HR", "lowpass": "LP", "mission": "MIS", "mounting": "MNT", "nominal": "NOM",
+    "position": "POS", "pressure": "PRES", "quaternion": "QUAT", "rates": "RATE",
+    "reference": "REF", "satellites": "SATS", "scaled": "SCAL", "status": "STAT", "system": "SYS",
+    "takeoff": "TKOFF", "tolerance": "TOL", "vehicle": "VEH", "velocity": "VEL",
+}  # fmt: skip
 VOWELS: Final = frozenset("AEIOU")
 AXES: Final = ("X", "Y", "Z")
 ANGLES: Final = (("ROLL", "Roll", 180.0), ("PIT", "Pitch", 90.0), ("YAW", "Yaw", 180.0))
@@ -115,8 +90,6 @@ GENERAL_PATH: Final = "/general.json"
 PARAMETER_PATH: Final = "/parameter.json.xz"
 """Path for programs with fixed paths. Each vehicle announces its own paths, since programs store
 a download under its name: two vehicles would overwrite each other's file."""
-TYPE_PARAMETER: Final = 1
-"""COMP_METADATA_TYPE_PARAMETER."""
 MAX_SHORT: Final = 100
 """Length of a short description in the specification's schema."""
 POSITION_PLACES: Final = 7
@@ -142,15 +115,11 @@ def parameter_name(section: str, key: str, axis: str = "") -> str:
     while len("_".join(short)) > room:
         # The first word is not shortened: ground stations group parameters by it.
         longest = max(range(1, len(short)), key=lambda index: len(short[index]))
-        short[longest] = _shorten(short[longest])
+        word = short[longest]
+        # Its last vowel, or else its last letter, is removed.
+        last = max((n for n in range(1, len(word)) if word[n] in VOWELS), default=len(word) - 1)
+        short[longest] = word[:last] + word[last + 1 :]
     return "_".join([*short, axis] if axis else short)
-
-
-def _shorten(word: str) -> str:
-    for index in range(len(word) - 1, 0, -1):
-        if word[index] in VOWELS:
-            return word[:index] + word[index + 1 :]
-    return word[:-1]
 
 
 def decode_value(value: float, kind: int) -> float:
@@ -351,7 +320,17 @@ class Metadata:
         self._table = table
         self._general = _named(GENERAL_PATH, system_id)
         parameters, described = _named(PARAMETER_PATH, system_id), _described(table.kinds)
-        general = _general(parameters, crc32(described))
+        kind = {"type": 1, "uri": f"mftp://{parameters}", "fileCrc": crc32(described)}
+        general = _json(
+            {
+                "version": 1,
+                "vendorName": "mavgate",
+                "modelName": "mavgate tracker",
+                "firmwareVersion": ".".join((*__version__.split("."), "0", "0", "0")[:3]),
+                # COMP_METADATA_TYPE_PARAMETER is the only one.
+                "metadataTypes": [kind],
+            }
+        )
         self.files: Mapping[str, bytes] = {
             **dict.fromkeys((self._general, GENERAL_PATH), general),
             **dict.fromkeys((parameters, PARAMETER_PATH), described),
@@ -393,20 +372,6 @@ def _described(kinds: tuple[tuple[str, type[Settings]], ...]) -> bytes:
     return lzma.compress(_json({"version": 1, "parameters": described}), check=lzma.CHECK_CRC32)
 
 
-def _general(parameter_path: str, parameter_crc: int) -> bytes:
-    """Write the general metadata file, which lists the other files."""
-    general = {
-        "version": 1,
-        "vendorName": "mavgate",
-        "modelName": "mavgate tracker",
-        "firmwareVersion": ".".join((*__version__.split("."), "0", "0", "0")[:3]),
-        "metadataTypes": [
-            {"type": TYPE_PARAMETER, "uri": f"mftp://{parameter_path}", "fileCrc": parameter_crc}
-        ],
-    }
-    return _json(general)
-
-
 def _describe(parameter: Parameter) -> dict[str, Any]:
     field = parameter.field
     group = parameter.path[-2] if len(parameter.path) > 1 else parameter.section
@@ -429,8 +394,7 @@ def _describe(parameter: Parameter) -> dict[str, Any]:
             {"value": number, "description": name} for number, name in enumerate(names)
         ]
         return described
-    described |= {"min": low} if low is not None else {}
-    described |= {"max": high} if high is not None else {}
+    described |= {key: end for key, end in (("min", low), ("max", high)) if end is not None}
     if not is_whole:
         is_position = parameter.path[-1] in ("lat_deg", "lon_deg")
         described["decimalPlaces"] = POSITION_PLACES if is_position else PLACES

@@ -43,6 +43,11 @@ from gateway.vehicle.telemetry.telemetry import Telemetry
 NUMBERS: Final = {"lat_deg": "lat_deg", "lon_deg": "lon_deg", "alt_m": "alt_amsl_m"}
 """Parameters of home, and the fields of `Location` that they set."""
 Say = Callable[[StatusText, int], list[Answer]]
+ROI_MODES: Final = {
+    mavlink.MAV_CMD_DO_SET_ROI_LOCATION: mavlink.MAV_ROI_LOCATION,
+    mavlink.MAV_CMD_DO_SET_ROI_NONE: mavlink.MAV_ROI_NONE,
+}
+"""Modes of the commands that have no parameter for it."""
 USE_CURRENT: Final = 1
 """Value of the first parameter of MAV_CMD_DO_SET_HOME: use the current position."""
 
@@ -129,9 +134,7 @@ class PlanService:
         )
         self.commands: dict[int, Handler] = {
             mavlink.MAV_CMD_DO_SET_HOME: self._set_home,
-            mavlink.MAV_CMD_DO_SET_ROI: self._set_roi,
-            mavlink.MAV_CMD_DO_SET_ROI_LOCATION: self._set_roi_location,
-            mavlink.MAV_CMD_DO_SET_ROI_NONE: self._clear_roi,
+            **dict.fromkeys((mavlink.MAV_CMD_DO_SET_ROI, *ROI_MODES), self._set_roi),
             mavlink.MAV_CMD_DO_SET_MISSION_CURRENT: self._set_mission_current,
         }
 
@@ -183,7 +186,7 @@ class PlanService:
             return self._change_source(value, now_us)
         part, home = NUMBERS[key], self._telemetry.home
         if home is not None:
-            if _same(value, getattr(home.location, part)):
+            if np.float32(value) == np.float32(getattr(home.location, part)):
                 # A parameter is less precise than home; a list that is written back must not round
                 # it.
                 return []
@@ -233,8 +236,7 @@ class PlanService:
 
     @property
     def _home_alt_m(self) -> float:
-        home = self._telemetry.home
-        return home.location.alt_amsl_m if home else NAN
+        return self._telemetry.home.location.alt_amsl_m if self._telemetry.home else NAN
 
     def _explain(self, text: str, now_us: int) -> list[Answer]:
         return self._say(StatusText(INFO, text), now_us)
@@ -270,24 +272,13 @@ class PlanService:
         return ACCEPTED, [*announced, *texts, self._save()]
 
     def _set_roi(self, command: Command, now_us: int) -> Outcome:
-        mode = whole(command.params[0])
-        if mode == mavlink.MAV_ROI_NONE:
-            return self._clear_roi(command, now_us)
-        if mode != mavlink.MAV_ROI_LOCATION:
+        """Mark a location, or clear the mark, by MAV_CMD_DO_SET_ROI and its later forms."""
+        mode = ROI_MODES.get(command.number, whole(command.params[0]))
+        location = self._location(command) if mode == mavlink.MAV_ROI_LOCATION else None
+        if location is None and mode != mavlink.MAV_ROI_NONE:
             return DENIED, []
-        return self._set_roi_location(command, now_us)
-
-    def _set_roi_location(self, command: Command, now_us: int) -> Outcome:
-        location = self._location(command)
-        return (DENIED, []) if location is None else (ACCEPTED, self.put_mark(location, now_us))
-
-    def _clear_roi(self, _command: Command, now_us: int) -> Outcome:
-        return ACCEPTED, self.put_mark(None, now_us)
+        return ACCEPTED, self.put_mark(location, now_us)
 
     def _set_mission_current(self, command: Command, _now_us: int) -> Outcome:
         answers = self.missions.set_current(whole(command.params[0]))
         return (DENIED, []) if answers is None else (ACCEPTED, answers)
-
-
-def _same(a: float, b: float) -> bool:
-    return bool(np.float32(a) == np.float32(b))

@@ -127,8 +127,6 @@ class Announcer:
 
     def poll(self, now_us: int) -> list[Answer]:
         """Return the states that changed while their topics were held."""
-        if not self._pending:
-            return []
         return [a for name in tuple(self._pending) for a in self._announce(name, now_us)]
 
     def next_due_us(self) -> int | None:
@@ -140,16 +138,14 @@ class Announcer:
         topic = self._pending[name]
         if now_us < topic.held_until_us:
             return []
-        if topic.is_bad and any(self._is_bad(cause) for cause in topic.causes):
+        causes = (self._topics[name] for name in topic.causes if name in self._topics)
+        if topic.is_bad and any(cause.is_bad for cause in causes):
             topic.held_until_us = now_us + GRACE_US
             return []
         del self._pending[name]
         topic.announced = topic.state
         topic.held_until_us = now_us + HOLD_US
         return chunks(topic.text, self._number())
-
-    def _is_bad(self, name: str) -> bool:
-        return name in self._topics and self._topics[name].is_bad
 
     def _number(self) -> int:
         self._next_id = self._next_id % 0xFFFF + 1
@@ -169,14 +165,9 @@ def chunks(text: StatusText, number: int = 1) -> list[Answer]:
         return [Reply(mavlink.MAVLink_statustext_message(text.severity, data))]
     # A receiver treats a chunk that is not full as the last one.
     starts = range(0, len(data) + (len(data) % TEXT_BYTES == 0), TEXT_BYTES)
-    return [
-        Reply(
-            mavlink.MAVLink_statustext_message(
-                text.severity, data[start : start + TEXT_BYTES], number, chunk
-            )
-        )
-        for chunk, start in enumerate(starts)
-    ]
+    parts = (data[start : start + TEXT_BYTES] for start in starts)
+    message = mavlink.MAVLink_statustext_message
+    return [Reply(message(text.severity, part, number, n)) for n, part in enumerate(parts)]
 
 
 class Announcements(Announcer):

@@ -18,6 +18,7 @@ are announced when they get worse:
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -28,6 +29,7 @@ from gateway.records import (
     NODE_IMU,
     SOURCE_NODE,
     BaroSample,
+    BatteryReport,
     GpsFix,
     ImuFlags,
     ImuSample,
@@ -36,7 +38,6 @@ from gateway.records import (
     NavState,
     NodeLink,
     NodeStatus,
-    ReceiverStatus,
     VehicleReport,
     node_role,
 )
@@ -58,7 +59,6 @@ WORD: Final = 0xFFFF
 """Mask of the nodes' counters, which have 16 bits and wrap."""
 BATTERY_TIMEOUT_US: Final = 10 * US_PER_S
 """Timeout of a battery report: autopilots send one every second or so, and links lose many."""
-CELLS: Final = 10
 MV: Final = 1e3
 GYRO: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
 ACCEL: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
@@ -102,32 +102,27 @@ class _Trouble:
 
 
 @dataclass(slots=True)
-class _Radio:
-    """Failed sends of the last seconds; a few are usual."""
-
-    failed: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=MAX_REPORTS))
-    """Time of each report and the number of failed sends that it added."""
-    is_bad: bool = False
-
-    def update(self, time_us: int, failed: int, rate_hz: int) -> int:
-        """Add a report, and return the number of failed sends in `RADIO_SPAN_US`."""
-        self.failed.append((time_us, failed))
-        while self.failed[0][0] <= time_us - RADIO_SPAN_US:
-            self.failed.popleft()
-        total = sum(number for _, number in self.failed)
-        most = FAILED_SHARE * rate_hz * RADIO_SPAN_US / US_PER_S
-        self.is_bad = 0 < (most / 2 if self.is_bad else most) <= total
-        return total
-
-
-@dataclass(slots=True)
 class _Board:
     status: NodeStatus
     low: bool = False
     bus: _Trouble = field(default_factory=_Trouble)
-    radio: _Radio = field(default_factory=_Radio)
+    failed: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=MAX_REPORTS))
+    """Time of each report and the number of failed sends that it added; a few are usual."""
+    loses: bool = False
+    """Whether too many sends fail."""
     pipe: _Trouble = field(default_factory=_Trouble)
     overruns: int | None = None
+
+    def add_failed(self, failed: int) -> int:
+        """Add the failed sends of a report; return their number in `RADIO_SPAN_US`."""
+        time_us = self.status.time_us
+        self.failed.append((time_us, failed))
+        while self.failed[0][0] <= time_us - RADIO_SPAN_US:
+            self.failed.popleft()
+        total = sum(number for _, number in self.failed)
+        most = FAILED_SHARE * self.status.sample_rate_hz * RADIO_SPAN_US / US_PER_S
+        self.loses = 0 < (most / 2 if self.loses else most) <= total
+        return total
 
 
 def _finding(topic: str, name: str, is_bad: bool, bad: str, good: str) -> Finding:
@@ -231,14 +226,14 @@ class Health:
             # The node has restarted, and with it its counters.
             before = status
         errors = status.bus_errors - before.bus_errors & WORD
-        failed = status.radio_failed - before.radio_failed & WORD
-        failed = known.radio.update(status.time_us, failed, status.sample_rate_hz)
+        failed = known.add_failed(status.radio_failed - before.radio_failed & WORD)
         if status.sensors_present & NODE_IMU:
             # The duration of the node's longest loop as a share of the sample interval.
             self._load_permille = status.loop_max_us * status.sample_rate_hz // 1000
         name, bus_errors = self.node_name(number), known.bus.update(errors > 0)
         supply_v = status.supply_mv / MV
-        known.low = self._is_low(supply_v, was_low=known.low)
+        limit_v = self.supply_low_v + (HYSTERESIS_V if known.low else 0.0)
+        known.low = bool(self.supply_low_v and supply_v) and supply_v < limit_v
         low, good = f"supply low, {supply_v:.2f} V", f"supply OK again, {supply_v:.2f} V"
         radio = f"radio sends failed, {failed} in {RADIO_SPAN_US // US_PER_S} s"
         bus = f"bus errors, {status.bus_errors} so far"
@@ -247,12 +242,8 @@ class Health:
             Finding(f"chips {number}", status.chips or False, chips),
             _finding(f"supply {number}", name, known.low, low, good),
             _finding(f"bus {number}", name, bus_errors, bus, "bus OK again"),
-            _finding(f"radio {number}", name, known.radio.is_bad, radio, "radio OK again"),
+            _finding(f"radio {number}", name, known.loses, radio, "radio OK again"),
         ]
-
-    def _is_low(self, supply_v: float, *, was_low: bool) -> bool:
-        limit_v = self.supply_low_v + (HYSTERESIS_V if was_low else 0.0)
-        return bool(self.supply_low_v and supply_v) and supply_v < limit_v
 
     def on_link(self, report: LinkReport) -> list[Finding]:
         """Note the state of the radio links to this aircraft's nodes; return its findings."""
@@ -264,10 +255,8 @@ class Health:
         fresh = max(0, received - self._received) + max(0, lost - self._lost)
         self._drop_rate = max(0, lost - self._lost) / fresh if fresh else 0.0
         self._received, self._lost = received, lost
-        return self._receiver_findings(report.receiver) if report.receiver else []
-
-    def _receiver_findings(self, receiver: ReceiverStatus) -> list[Finding]:
-        """Check the receiver's radio module, and the payloads for which it had no room."""
+        if (receiver := report.receiver) is None:
+            return []
         problem, works = receiver.radio.problem, "radio module works again"
         found = [_finding("receiver radio", "Receiver", bool(problem), problem, works)]
         for link in self._links:
@@ -305,8 +294,8 @@ class Health:
         absent = MAG if self._imu_flags & ImuFlags.MAG_ABSENT else 0
         absent |= PRESSURE if self._imu_flags & ImuFlags.BARO_ABSENT else 0
         faulty = GYRO | ACCEL if self._imu_flags & ImuFlags.SELF_TEST_FAILED else 0
-        for status in self.statuses:
-            failed = status.sensors_failed & status.sensors_present
+        for board in self._boards.values():
+            failed = board.status.sensors_failed & board.status.sensors_present
             faulty |= sum(sensors for bit, sensors in NODE_SENSORS if failed & bit)
         for sensor in SENSORS:
             if sensor not in self._seen_us or absent & sensor:
@@ -342,7 +331,7 @@ class Health:
         counts are the nodes' bus errors, failed and repeated radio sends, and the receiver's
         overruns.
         """
-        bus, failed, retries, overruns = self._error_counts()
+        boards = self._boards.values()
         lowest = self._lowest_supply()
         millivolts = lowest.supply_mv if lowest else encoding.UINT16_MAX
         current = remaining = -1
@@ -358,10 +347,10 @@ class Health:
             battery_remaining=remaining,
             drop_rate_comm=round(self._drop_rate * 10_000.0),
             errors_comm=encoding.uint16(self._lost),
-            errors_count1=bus,
-            errors_count2=failed,
-            errors_count3=retries,
-            errors_count4=overruns,
+            errors_count1=_sum(board.status.bus_errors for board in boards),
+            errors_count2=_sum(board.status.radio_failed for board in boards),
+            errors_count3=_sum(board.status.radio_retries for board in boards),
+            errors_count4=_sum(board.overruns or 0 for board in boards),
         )
 
     def radio_status(self) -> Any:
@@ -386,17 +375,6 @@ class Health:
             fixed=0,
         )
 
-    def _error_counts(self) -> list[int]:
-        """Sum up bus errors, failed and repeated sends, and overruns, for the four error counts."""
-        boards = self._boards.values()
-        counts = (
-            sum(board.status.bus_errors for board in boards),
-            sum(board.status.radio_failed for board in boards),
-            sum(board.status.radio_retries for board in boards),
-            sum(board.overruns or 0 for board in boards),
-        )
-        return [encoding.uint16(count, unknown=0) for count in counts]
-
     def _lowest_supply(self) -> NodeStatus | None:
         """Return the report with the lowest supply; None if no node measures it."""
         measured = (status for status in self.statuses if status.supply_mv)
@@ -414,21 +392,10 @@ class Health:
         """Encode a node's supply as BATTERY_STATUS; None if it does not measure it."""
         if not status.supply_mv:
             return None
-        low = self._boards[status.node.node_id].low
-        state = mavlink.MAV_BATTERY_CHARGE_STATE_LOW if low else mavlink.MAV_BATTERY_CHARGE_STATE_OK
-        return mavlink.MAVLink_battery_status_message(
-            id=status.node.node_id,
-            battery_function=mavlink.MAV_BATTERY_FUNCTION_AVIONICS,
-            type=mavlink.MAV_BATTERY_TYPE_UNKNOWN,
-            temperature=encoding.INT16_MAX,
-            voltages=[status.supply_mv] + [encoding.UINT16_MAX] * (CELLS - 1),
-            current_battery=-1,
-            current_consumed=-1,
-            energy_consumed=-1,
-            battery_remaining=-1,
-            time_remaining=0,
-            charge_state=state,
-        )
+        number = status.node.node_id
+        supply = BatteryReport(number=number, voltage_v=status.supply_mv / MV)
+        avionics = mavlink.MAV_BATTERY_FUNCTION_AVIONICS
+        return battery_status(supply, avionics, self._boards[number].low)
 
     def silent_nodes(self, now_us: int) -> frozenset[int]:
         """Return the nodes that have sent payloads before and have timed out."""
@@ -455,6 +422,10 @@ class Health:
     def known_nodes(self) -> frozenset[int]:
         """Return the nodes that have sent a payload."""
         return frozenset(link.node.node_id for link in self._links if link.received)
+
+
+def _sum(counts: Iterable[int]) -> int:
+    return encoding.uint16(sum(counts), unknown=0)
 
 
 def _signed_byte(dbm: int) -> int:

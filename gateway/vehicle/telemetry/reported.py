@@ -66,7 +66,7 @@ class Reported:
         """Time of the newest mode, arming and type."""
         self.batteries: dict[int, tuple[int, BatteryReport]] = {}
         """Time and content of the batteries, by number."""
-        self._modes: list[str] = []
+        self._modes: dict[str, int] = {}
         self._newest: dict[str, tuple[int, Any]] = {}
         """Time and value of the other fields."""
 
@@ -109,9 +109,9 @@ class Reported:
         """Return the number of a mode: ArduPilot's, or the next free one for another mode."""
         if report.custom_mode is not None:
             return report.custom_mode
-        if report.mode not in self._modes and len(self._modes) < MAX_MODES:
-            self._modes.append(report.mode)
-        return OWN_MODE + self._modes.index(report.mode) if report.mode in self._modes else OWN_MODE
+        if len(self._modes) < MAX_MODES:
+            self._modes.setdefault(report.mode, OWN_MODE + len(self._modes))
+        return self._modes.get(report.mode, OWN_MODE)
 
     def value(self, name: str, now_us: int, timeout_us: int) -> Any:
         """Return a field, or None if it is unknown or older than the timeout."""
@@ -173,18 +173,25 @@ class Reported:
         return battery if battery is not None and now_us - time_us <= timeout_us else None
 
 
-def battery_status(battery: BatteryReport) -> Any:
-    """Encode BATTERY_STATUS of the vehicle's battery, with its cells or else the total voltage."""
+def battery_status(
+    battery: BatteryReport,
+    function: int = mavlink.MAV_BATTERY_FUNCTION_ALL,
+    low: bool | None = None,
+) -> Any:
+    """Encode BATTERY_STATUS of a battery or supply, with its cells or else the total voltage.
+
+    Whether it is `low` follows from the remaining charge if it is not given.
+    """
     cells = battery.cells_v[:MAX_CELLS] or (battery.voltage_v,)
     mv = [encoding.uint16(cell * MV_PER_V) for cell in cells]
     first = [*mv[:10], *[encoding.UINT16_MAX] * (10 - len(mv[:10]))]
-    low = battery.remaining_percent < LOW_PERCENT
-    state = mavlink.MAV_BATTERY_CHARGE_STATE_LOW if low else mavlink.MAV_BATTERY_CHARGE_STATE_OK
-    if math.isnan(battery.remaining_percent):
+    is_low = battery.remaining_percent < LOW_PERCENT if low is None else low
+    state = mavlink.MAV_BATTERY_CHARGE_STATE_LOW if is_low else mavlink.MAV_BATTERY_CHARGE_STATE_OK
+    if low is None and math.isnan(battery.remaining_percent):
         state = mavlink.MAV_BATTERY_CHARGE_STATE_UNDEFINED
     return mavlink.MAVLink_battery_status_message(
         id=battery.number,
-        battery_function=mavlink.MAV_BATTERY_FUNCTION_ALL,
+        battery_function=function,
         type=mavlink.MAV_BATTERY_TYPE_UNKNOWN,
         temperature=encoding.INT16_MAX,
         voltages=first,
