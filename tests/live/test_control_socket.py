@@ -6,6 +6,7 @@ import os
 import socket
 import stat
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,15 @@ async def server(tmp_path: Path) -> AsyncIterator[ControlServer]:
     made.close()
 
 
+@asynccontextmanager
+async def connected(
+    server: ControlServer,
+) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    reader, writer = await asyncio.open_unix_connection(str(server.path))
+    yield reader, writer
+    writer.close()
+
+
 async def ask(server: ControlServer, verb: str, params: dict[str, Any] | None = None) -> Any:
     return await asyncio.to_thread(request, server.path, verb, params)
 
@@ -77,42 +87,34 @@ async def test_refused_requests_get_a_reason(
         await ask(server, verb, params)
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
+async def test_invalid_requests_are_answered_with_an_error(server: ControlServer) -> None:
+    for line in (
         *(b"\n", b"nonsense\n", b"[]\n", b'{"verb": 3}\n', b"\xff\xfe\n", b'{"verb": "\xff"}\n'),
         b'{"verb": "verbs", "params": {"a": ' + b"[" * 60_000 + b"\n",
-    ],
-    ids=range(7),
-)
-async def test_invalid_requests_are_answered_with_an_error(
-    server: ControlServer, line: bytes
-) -> None:
-    answer = msgspec.json.decode(await server.answer(line))
-    assert answer["ok"] is False
-    assert answer["error"]
-
-
-async def test_socket_is_accessible_to_its_user_only(server: ControlServer) -> None:
-    assert stat.S_IMODE(server.path.stat().st_mode) == 0o600
-    assert stat.S_IMODE(server.path.parent.stat().st_mode) == 0o700
+    ):
+        answer = msgspec.json.decode(await server.answer(line))
+        assert answer["ok"] is False, line[:60]
+        assert answer["error"], line[:60]
 
 
 async def test_several_requests_are_answered_on_one_connection(server: ControlServer) -> None:
-    reader, writer = await asyncio.open_unix_connection(str(server.path))
-    writer.write(b'{"verb":"seek","params":{"offset_s":1}}\n{"verb":"refuse"}\n')
-    first, second = await reader.readline(), await reader.readline()
+    assert stat.S_IMODE(server.path.parent.stat().st_mode) == 0o700
+    async with connected(server) as (reader, writer):
+        writer.write(b'{"verb":"seek","params":{"offset_s":1}}\n{"verb":"refuse"}\n')
+        first, second = await reader.readline(), await reader.readline()
     assert msgspec.json.decode(first)["ok"] is True
     assert msgspec.json.decode(second) == {"ok": False, "result": None, "error": "not now"}
-    writer.close()
-    await writer.wait_closed()
 
 
-async def test_endless_line_closes_its_own_connection_only(server: ControlServer) -> None:
-    reader, writer = await asyncio.open_unix_connection(str(server.path))
-    writer.write(b"x" * (2 * MAX_LINE))
-    assert await reader.read() == b""
-    writer.close()
+async def test_endless_line_or_idle_connection_is_closed_alone(
+    server: ControlServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with connected(server) as (reader, writer):
+        writer.write(b"x" * (2 * MAX_LINE))
+        assert await reader.read() == b""
+    monkeypatch.setattr(control_socket, "IDLE_S", 0.05)
+    async with connected(server) as (reader, _):
+        assert await reader.read() == b""
     assert await ask(server, "verbs")
 
 
@@ -129,16 +131,7 @@ async def test_idle_connections_keep_nobody_out(server: ControlServer) -> None:
         writer.close()
 
 
-async def test_idle_connection_is_closed_after_a_while(
-    server: ControlServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(control_socket, "IDLE_S", 0.05)
-    reader, writer = await asyncio.open_unix_connection(str(server.path))
-    assert await reader.read() == b""
-    writer.close()
-
-
-@pytest.mark.parametrize("turns", range(5))
+@pytest.mark.parametrize("turns", range(5), ids=lambda turns: f"{turns} turns")
 async def test_connection_just_before_the_end_is_closed(server: ControlServer, turns: int) -> None:
     """At whichever turn of the loop it is accepted and served."""
     with socket.socket(socket.AF_UNIX) as link:
@@ -175,14 +168,10 @@ async def test_gateways_of_one_user_have_a_socket_each(server: ControlServer) ->
 
 @pytest.mark.parametrize(
     ("user", "groups", "in_service", "is_answered"),
-    [
-        (0, (), False, True),
-        (1, (), False, True),
-        (2, (7,), False, False),
-        (2, (7,), True, True),
-        (2, (8,), True, False),
-    ],
-)
+    [(0, (), False, True), (1, (), False, True), (2, (7,), False, False), (2, (7,), True, True),
+     (2, (8,), True, False)],
+    ids=["root", "owner", "another user", "member of the service", "another user of the service"],
+)  # fmt: skip
 async def test_only_owner_root_and_group_of_a_service_are_answered(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -200,13 +189,11 @@ async def test_only_owner_root_and_group_of_a_service_are_answered(
     monkeypatch.setattr(control_socket, "peer_of", lambda _: (user, groups))
     monkeypatch.setattr(os, "getuid", lambda: 1)
     monkeypatch.setattr(os, "getgid", lambda: 7)
-    reader, writer = await asyncio.open_unix_connection(str(server.path))
-    writer.write(b'{"verb":"verbs"}\n')
-    try:
-        answered = bool(await reader.read(1))
-    except ConnectionResetError:
-        answered = False
-    writer.close()
+    answered = False
+    async with connected(server) as (reader, writer):
+        writer.write(b'{"verb":"verbs"}\n')
+        with contextlib.suppress(ConnectionResetError):
+            answered = bool(await reader.read(1))
     server.close()
     assert answered == is_answered
 
@@ -241,9 +228,15 @@ def test_missing_gateway_is_reported(folders: Path) -> None:
         find_socket("play")
 
 
-async def test_command_finds_the_gateway_of_its_user_before_the_service(folders: Path) -> None:
+async def test_command_finds_the_gateway_of_its_user_before_the_service(
+    folders: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     service = ControlServer(folders / "run.sock")
     await service.start()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "access", lambda *_: False)
+        with pytest.raises(ControlError, match="usermod -aG mavgate"):
+            find_socket("run")
     assert find_socket("run") == service.path, "the service's, where the user has none"
     first, second = ControlServer(socket_path("run")), ControlServer(socket_path("run"))
     await first.start()
@@ -255,17 +248,6 @@ async def test_command_finds_the_gateway_of_its_user_before_the_service(folders:
     assert find_socket("run") == second.path
     for server in (second, service):
         server.close()
-
-
-async def test_error_without_access_to_a_service_names_its_group(
-    folders: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "access", lambda *_: False)
-    service = ControlServer(folders / "run.sock")
-    await service.start()
-    with pytest.raises(ControlError, match="usermod -aG mavgate"):
-        find_socket("run")
-    service.close()
 
 
 def test_socket_is_in_the_runtime_folder(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,7 @@ import math
 import os
 import sys
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -66,11 +66,6 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(
     assert (await ask(server, "record.list"))["result"] == []
     assert not (await ask(server, "record.delete", name="first"))["ok"]
     assert bench.announced[1] == (False, "Note: here")
-
-
-async def test_note_that_no_vehicle_could_get_is_refused(
-    bench: RecorderBench, tmp_path: Path
-) -> None:
     server = ControlServer(tmp_path / "s", recorder_verbs(bench.recorder, lambda: False))
     refused = await ask(server, "record.note", text="here")
     assert "no vehicle is received" in refused["error"]
@@ -164,58 +159,48 @@ async def test_player_follows_its_verbs(clock: ManualClock, tmp_path: Path) -> N
     played.close()
 
 
-async def test_only_listed_serial_ports_are_added_as_clients(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+Add = Callable[[str], Awaitable[None]]
+
+
+@pytest.fixture
+def add(tmp_path: Path) -> Add:
+    """Add a client, whose files must be in the folder `own`."""
     extend()
+    hub: Any = SimpleNamespace(add=lambda _: None, remove=None, clients=None, endpoints=tuple)
+    return client_verbs(hub, tmp_path / "own")["clients.add"]
+
+
+async def test_only_listed_serial_ports_are_added_as_clients(
+    add: Add, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     port = SimpleNamespace(device="/dev/ttyUSB9")
     monkeypatch.setattr(control_verbs, "list_serial_ports", lambda: [port])
-    added: list[str] = []
-    hub: Any = SimpleNamespace(
-        add=added.append, remove=None, clients=None, endpoints=lambda: tuple(added)
-    )
-    add: Any = client_verbs(hub)["clients.add"]
-    link = tmp_path / "by-id"
-    link.symlink_to("/dev/ttyUSB9")
-    for device in ("/dev/pts/0", "/dev/watchdog", "/dev/zero", str(tmp_path)):
-        with pytest.raises(ControlError, match="is not a serial port here"):
-            await add(f"serial:{device}:57600")
-    with pytest.raises(ControlError, match="is not a serial port here"):
-        await add("rotator:serial:/dev/watchdog:9600")
-    wanted = [f"serial:{device}:57600" for device in ("/dev/ttyUSB9", link)]
-    for url in [*wanted, "udp:127.0.0.1:14550"]:
+    (link := tmp_path / "by-id").symlink_to("/dev/ttyUSB9")
+    for device in ("/dev/pts/0", "/dev/watchdog", "/dev/zero", tmp_path):
+        for url in (f"serial:{device}:57600", f"rotator:serial:{device}:9600"):
+            with pytest.raises(ControlError, match="is not a serial port here"):
+                await add(url)
+    for url in ("serial:/dev/ttyUSB9:57600", f"serial:{link}:57600", "udp:127.0.0.1:14550"):
         await add(url)
-    assert added == [*wanted, "udp:127.0.0.1:14550"]
 
 
-@pytest.mark.parametrize(
-    ("name", "why"),
-    [
-        ("own/login", ""),
-        ("other", "not in"),
-        ("own/link", "not in"),
-        ("own/pipe", "not a regular file"),
-        ("own/large", "not a regular file"),
-        ("own/absent", "No such file"),
-    ],
-)
 async def test_added_endpoint_names_only_files_of_the_settings_folder(
-    name: str, why: str, tmp_path: Path
+    add: Add, tmp_path: Path
 ) -> None:
-    extend()
     (own := tmp_path / "own").mkdir()
     (own / "login").write_text("user:password")
     (tmp_path / "other").write_text("secret:key")
     (own / "link").symlink_to(tmp_path / "other")
     os.mkfifo(own / "pipe")
     (own / "large").write_bytes(bytes(url_files.MAX_BYTES + 1))
-    added: list[str] = []
-    hub: Any = SimpleNamespace(add=added.append, remove=None, clients=None, endpoints=tuple)
-    add: Any = client_verbs(hub, own)["clients.add"]
     for option in ("mqtt:tcp:127.0.0.1:1883?login", "cot:tls:127.0.0.1:8089?authority"):
-        if not why:
-            await add(f"{option}={tmp_path / name}")
-            continue
-        with pytest.raises(ControlError, match=why):
-            await add(f"{option}={tmp_path / name}")
-    assert len(added) == (0 if why else 2)
+        await add(f"{option}={own / 'login'}")
+        for name, why in {
+            "other": "not in",
+            "own/link": "not in",
+            "own/pipe": "not a regular file",
+            "own/large": "not a regular file",
+            "own/absent": "No such file",
+        }.items():
+            with pytest.raises(ControlError, match=why):
+                await add(f"{option}={tmp_path / name}")

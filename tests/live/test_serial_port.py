@@ -1,6 +1,7 @@
 """The serial port: choice, unplugging, coming back."""
 
 import asyncio
+import contextlib
 import os
 import select
 import tty
@@ -21,9 +22,10 @@ from gateway.live.serial_port import (
     SerialSettings,
     find_port,
     find_receiver,
-    why_not_open,
+    open_port,
 )
 from gateway.wire.framing import encode_frame
+from tests.kit.process import until
 from tests.live.test_control_verbs import ask
 
 CH340 = Port("/dev/ttyUSB0", "1a86:7523", "", "WCH CH340", known=True)
@@ -34,7 +36,7 @@ BUILT_IN = Port("/dev/ttyS0", "", "", "n/a", known=False)
 
 
 @pytest.mark.parametrize(
-    ("wanted", "ports", "device"),
+    ("wanted", "ports", "found"),
     [
         ("/dev/ttyAMA0", [], "/dev/ttyAMA0"),
         ("auto", [MODEM, CH340, BUILT_IN], "/dev/ttyUSB0"),
@@ -44,83 +46,74 @@ BUILT_IN = Port("/dev/ttyS0", "", "", "n/a", known=False)
     ],
 )
 def test_port_is_found_by_device_adapter_or_usb_id(
-    wanted: str, ports: list[Port], device: str
+    wanted: str, ports: list[Port], found: str
 ) -> None:
-    assert find_port(wanted, ports) == device
+    assert find_port(wanted, ports) == found
 
 
-@pytest.mark.parametrize(
-    ("wanted", "ports", "message"),
-    [
+def test_error_of_find_port_lists_the_ports() -> None:
+    for wanted, ports, text in (
         ("auto", [], "no port at all"),
         ("auto", [MODEM, BUILT_IN], r"/dev/ttyACM0 \(2cb7:0a05\), /dev/ttyS0 \(no USB\)"),
         ("auto", [CH340, FTDI], "several USB adapters fit"),
         ("usb:dead:beef", [CH340], "no port fits 'usb:dead:beef'"),
-    ],
-)
-def test_error_of_find_port_lists_the_ports(wanted: str, ports: list[Port], message: str) -> None:
-    with pytest.raises(PortNotFoundError, match=message):
-        find_port(wanted, ports)
+        ("none", [], r"serial.port = none"),
+    ):
+        with pytest.raises(PortNotFoundError, match=text):
+            find_port(wanted, ports)
 
 
-@pytest.mark.parametrize(
-    ("device", "ports", "reason"),
-    [
-        ("/dev/ttyUSB99", [], "No such file or directory"),
-        ("/dev/ttyUSB99", [MODEM], "No such file or directory"),
-        (
-            "/dev/ttyUSB99",
-            [CH340, MODEM],
-            "No such file or directory; /dev/ttyUSB0 is there, always found as usb:1a86:7523",
-        ),
-        ("/dev/null", [CH340], "not a serial port"),
-    ],
-)
-def test_reason_of_a_failed_opening_names_the_known_adapters(
-    device: str, ports: list[Port], reason: str
-) -> None:
-    with pytest.raises(serial.SerialException) as raised:
-        serial.Serial(device, timeout=0)
-    assert why_not_open(raised.value, ports) == reason
+@pytest.mark.io
+def test_reason_of_a_failed_opening_names_the_known_adapters(adapters: "Adapters") -> None:
+    held, missing = adapters.plug(), "No such file or directory"
+    found = f"{missing}; /dev/ttyUSB0 is there, always found as usb:1a86:7523"
+    with serial.Serial(held, timeout=0, exclusive=True):
+        for device, ports, reason in (
+            ("/dev/ttyUSB99", [MODEM], missing),
+            ("/dev/ttyUSB99", [CH340, MODEM], found),
+            ("/dev/null", [CH340], "not a serial port"),
+            (held, [CH340], "another program has it open"),
+        ):
+            with pytest.raises(PortNotFoundError) as raised:
+                open_port(device, 9600, ports)
+            assert str(raised.value) == f"serial port {device}: {reason}"
 
 
-def test_port_in_use_by_another_program_is_reported() -> None:
-    master, slave = os.openpty()
-    try:
-        with serial.Serial(os.ttyname(slave), timeout=0, exclusive=True) as held:
-            with pytest.raises(serial.SerialException) as raised:
-                serial.Serial(held.port, timeout=0, exclusive=True)
-            assert why_not_open(raised.value, [CH340]) == "another program has it open"
-    finally:
-        os.close(master)
-        os.close(slave)
+class Adapters:
+    """Pseudo-terminals in the place of several known USB adapters."""
 
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.masters: dict[str, int] = {}
+        monkeypatch.setattr("gateway.live.serial_port.list_serial_ports", self.ports)
 
-class Bench:
-    """A pseudo-terminal behind a symbolic link, so that it can be pulled and plugged again."""
+    def ports(self) -> list[Port]:
+        return [Port(device, "1a86:7523", "", "WCH CH340", known=True) for device in self.masters]
 
-    def __init__(self, folder: Path) -> None:
-        self.link = folder / "ttyRECEIVER"
-        self.master = -1
-
-    def plug(self) -> None:
-        self.master, slave = os.openpty()
+    def plug(self, link: Path | None = None) -> str:
+        """Open a terminal, which a link may name, and return its name."""
+        master, slave = os.openpty()
         tty.setraw(slave)
-        self.link.symlink_to(os.ttyname(slave))
+        os.set_blocking(master, False)
+        device = os.ttyname(slave)
         os.close(slave)
+        if link is not None:
+            link.symlink_to(device)
+            device = str(link)
+        self.masters[device] = master
+        return device
 
-    def pull(self) -> None:
-        self.link.unlink()
-        os.close(self.master)
-        self.master = -1
+    def pull(self, device: str) -> None:
+        if Path(device).is_symlink():
+            Path(device).unlink()
+        os.close(self.masters.pop(device))
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(tmp_path)
-    yield bench
-    if bench.master >= 0:
-        bench.pull()
+def adapters(monkeypatch: pytest.MonkeyPatch) -> Iterator[Adapters]:
+    adapters = Adapters(monkeypatch)
+    yield adapters
+    for device in [*adapters.masters]:
+        adapters.pull(device)
 
 
 class Listener:
@@ -170,53 +163,32 @@ def fast_retry(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.io
 @pytest.mark.usefixtures("fast_retry")
+@pytest.mark.parametrize("needed", [True, False], ids=["needed", "not needed"])
 async def test_port_is_opened_again_after_it_was_unplugged(
-    bench: Bench, listener: Listener, caplog: pytest.LogCaptureFixture
+    adapters: Adapters,
+    listener: Listener,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    needed: bool,
 ) -> None:
-    link = listener.port(str(bench.link))
-    link.start()
-    assert not link.connected
-    bench.plug()
-    await listener.until(opened=1)
-    os.write(bench.master, b"first")
-    await listener.until(data=b"first")
-    bench.pull()
-    async with asyncio.timeout(60):
-        while link.connected:
-            await asyncio.sleep(0)
-    assert listener.lost == [str(bench.link)]
-    bench.plug()
-    await listener.until(opened=2)
-    os.write(bench.master, b"second")
-    await listener.until(data=b"second")
-    link.close()
-    assert not link.connected
+    """One that is not needed is missed only after it was there."""
+    link = tmp_path / "ttyRECEIVER"
+    port = listener.port(str(link), needed=needed)
+    port.start()
+    assert not port.connected
+    missing = f"serial port {link}: No such file or directory; trying again until it works"
+    assert [record.getMessage() for record in caplog.records] == [missing] * needed
+    for count, word in enumerate((b"first", b"second"), 1):
+        device = adapters.plug(link)
+        await listener.until(opened=count)
+        os.write(adapters.masters[device], word)
+        await listener.until(data=word)
+        adapters.pull(device)
+        await until(lambda: not port.connected)
+        assert listener.lost == [device] * count
+    port.close()
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert len(warnings) == len(set(warnings)), "each problem is logged once"
-    assert any("is gone" in text for text in warnings)
-    missing = f"serial port {bench.link}: No such file or directory; trying again until it works"
-    assert missing in warnings
-
-
-@pytest.mark.io
-@pytest.mark.usefixtures("fast_retry")
-async def test_port_that_is_not_needed_is_missed_only_after_it_was_there(
-    bench: Bench, listener: Listener, caplog: pytest.LogCaptureFixture
-) -> None:
-    def warnings() -> list[str]:
-        return [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
-
-    link = listener.port(str(bench.link), needed=False)
-    link.start()
-    assert warnings() == []
-    bench.plug()
-    await listener.until(opened=1)
-    bench.pull()
-    async with asyncio.timeout(60):
-        while link.connected:
-            await asyncio.sleep(0)
-    link.close()
-    assert any("is gone" in text for text in warnings())
+    assert sum("is gone" in text for text in warnings) == 2
 
 
 @pytest.mark.io
@@ -226,8 +198,6 @@ async def test_gateway_without_receiver_opens_no_port(
     link = listener.port("none")
     link.start()
     assert (link.status([]).state, link.connected, caplog.records) == ("closed", False, [])
-    with pytest.raises(PortNotFoundError, match=r"serial.port = none"):
-        find_port("none", [])
 
 
 @pytest.mark.io
@@ -253,9 +223,9 @@ async def test_retries_back_off(listener: Listener, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.io
-@pytest.mark.parametrize("can", [True, False])
+@pytest.mark.parametrize("can", [True, False], ids=["supported", "unsupported"])
 async def test_low_latency_of_the_adapter_is_requested(
-    bench: Bench,
+    adapters: Adapters,
     listener: Listener,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
@@ -269,8 +239,7 @@ async def test_low_latency_of_the_adapter_is_requested(
             raise ValueError("Failed to update ASYNC_LOW_LATENCY flag")
 
     monkeypatch.setattr("serial.Serial.set_low_latency_mode", ask)
-    bench.plug()
-    link = listener.port(str(bench.link))
+    link = listener.port(adapters.plug())
     link.start()
     assert (asked, link.connected) == ([True], True)
     assert not caplog.records, "an adapter that cannot is used as it is, without a word"
@@ -292,36 +261,6 @@ def test_backlog_is_read_at_the_rate_of_the_line(listener: Listener) -> None:
     assert listener.sizes == [48, 48, 2000, 48, 856]
 
 
-class Adapters:
-    """Pseudo-terminals in the place of several known USB adapters."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.masters: dict[str, int] = {}
-        monkeypatch.setattr("gateway.live.serial_port.list_serial_ports", self.ports)
-
-    def ports(self) -> list[Port]:
-        return [Port(device, "1a86:7523", "", "WCH CH340", known=True) for device in self.masters]
-
-    def plug(self) -> str:
-        master, slave = os.openpty()
-        tty.setraw(slave)
-        device = os.ttyname(slave)
-        os.close(slave)
-        self.masters[device] = master
-        return device
-
-    def pull(self, device: str) -> None:
-        os.close(self.masters.pop(device))
-
-
-@pytest.fixture
-def adapters(monkeypatch: pytest.MonkeyPatch) -> Iterator[Adapters]:
-    adapters = Adapters(monkeypatch)
-    yield adapters
-    for device in [*adapters.masters]:
-        adapters.pull(device)
-
-
 FRAME = encode_frame(bytes(range(1, 40)))
 NOISE = bytes([0x55, 0x00, 0xFF]) * 40
 """Bytes of another device, delimiters included."""
@@ -331,9 +270,14 @@ async def found_receiver(adapters: Adapters, listener: Listener, receiver: str) 
     """Open a port that searches, and send frames to one adapter until it is found."""
     port = listener.port()
     port.start()
-    while not listener.opened:
-        os.write(adapters.masters[receiver], FRAME)
-        await asyncio.sleep(0.001)
+
+    def sent() -> int:
+        # Opening discards what was received before.
+        with contextlib.suppress(BlockingIOError):
+            os.write(adapters.masters[receiver], FRAME)
+        return listener.opened
+
+    await until(sent)
     return port
 
 
@@ -360,9 +304,7 @@ async def test_silent_adapter_is_not_taken_when_the_receiver_is_pulled(
     silent, receiver = adapters.plug(), adapters.plug()
     port = await found_receiver(adapters, listener, receiver)
     adapters.pull(receiver)
-    async with asyncio.timeout(60):
-        while f"no receiver among {silent}" not in caplog.text:
-            await asyncio.sleep(0.001)
+    await until(lambda: f"no receiver among {silent}" in caplog.text)
     assert listener.devices == [receiver]
     again = adapters.plug()
     await listener.until(opened=2)
