@@ -27,11 +27,6 @@ async def make_bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[MakeBe
 
 
 @pytest.fixture
-def bench(make_bench: MakeBench) -> RecorderBench:
-    return make_bench()
-
-
-@pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[SlowDisk]:
     made = SlowDisk()
     monkeypatch.setattr(os, "fsync", made.sync)

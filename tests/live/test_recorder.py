@@ -43,8 +43,15 @@ POSITION = mavlink.MAVLink_global_position_int_message(
 )
 
 
+@pytest.fixture
+async def bench(make_bench: MakeBench) -> RecorderBench:
+    """Return a recorder that records."""
+    made = make_bench()
+    await made.turn()
+    return made
+
+
 async def test_every_frame_is_in_the_tlog_at_its_time(bench: RecorderBench) -> None:
-    await bench.turn()
     begin_us = bench.clock()
     await bench.record(FRAMES)
     records = read_tlog(bench.recorder.folder / f"{NAME}_01.tlog")
@@ -125,7 +132,6 @@ async def test_armed_bit_of_own_aircraft_and_its_memory_are_bounded(
 async def test_table_contains_the_flight_and_its_header(
     bench: RecorderBench, rng: np.random.Generator
 ) -> None:
-    await bench.turn()
     flight = [*make_flight(rng, 50), make_baro(rng, 600_000)]
     bench.fly(flight[:25])
     bench.recorder.note("over the wood")
@@ -152,7 +158,6 @@ async def test_table_contains_the_flight_and_its_header(
 async def test_changed_settings_write_a_new_header_after_the_samples_before(
     bench: RecorderBench, rng: np.random.Generator
 ) -> None:
-    await bench.turn()
     bench.recorder.settings_changed(3)
     bench.fly([make_fused(rng, 1000), make_baro(rng, 1500)])
     bench.recorder.settings_changed(3)
@@ -163,9 +168,9 @@ async def test_changed_settings_write_a_new_header_after_the_samples_before(
 
 
 async def test_header_of_a_recording_begun_in_flight_reports_no_cold_start(
-    bench: RecorderBench, rng: np.random.Generator
+    make_bench: MakeBench, rng: np.random.Generator
 ) -> None:
-    first, second, *_ = make_flight(rng, 10)
+    bench, (first, second, *_) = make_bench(), make_flight(rng, 10)
     bench.fly([first])
     await bench.turn()
     bench.fly([second])
@@ -206,7 +211,6 @@ async def test_rotation_loses_nothing(make_bench: MakeBench) -> None:
 
 
 async def test_stop_and_start_make_two_recordings(bench: RecorderBench) -> None:
-    await bench.turn()
     bench.send(FRAMES[:5])
     bench.recorder.stop()
     await bench.turn()
@@ -218,38 +222,30 @@ async def test_stop_and_start_make_two_recordings(bench: RecorderBench) -> None:
     assert sorted(frames_of(bench.recorder.folder)) == sorted(FRAMES[:5] + FRAMES[10:])
 
 
-@pytest.mark.parametrize(
-    ("number", "text"), [(errno.ENOSPC, "disk is full"), (errno.EROFS, "disk is read-only")]
-)
+FAULTS = {"disk is full": errno.ENOSPC, "disk is read-only": errno.EROFS, "folder has vanished": 0}
+
+
+@pytest.mark.parametrize("text", FAULTS)
 async def test_failing_disk_stops_recording_until_it_recovers(
-    bench: RecorderBench, monkeypatch: pytest.MonkeyPatch, number: int, text: str
+    bench: RecorderBench, monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
-    await bench.turn()
+    kept = FRAMES[:5] if FAULTS[text] else []
     await bench.record(FRAMES[:5])
     with monkeypatch.context() as patch:
-        patch.setattr(os, "write", refusing(number))
+        if FAULTS[text]:
+            patch.setattr(os, "write", refusing(FAULTS[text]))
+        else:
+            shutil.rmtree(bench.recorder.folder)
         await bench.record(FRAMES[5:6])
         assert bench.troubles == [f"Recording stopped: {text}"]
         await bench.record(FRAMES[6:7])
     await bench.turn(RETRY_S)
     await bench.record(FRAMES[7:])
-    assert frames_of(bench.recorder.folder) == FRAMES[:5] + FRAMES[7:]
+    assert frames_of(bench.recorder.folder) == kept + FRAMES[7:]
     assert bench.announced[-1] == (False, f"Recording {NAME}")
 
 
-async def test_deleted_folder_is_created_again(bench: RecorderBench) -> None:
-    await bench.turn()
-    await bench.record(FRAMES[:5])
-    shutil.rmtree(bench.recorder.folder)
-    await bench.record(FRAMES[5:6])
-    assert bench.troubles == ["Recording stopped: folder has vanished"]
-    await bench.turn(RETRY_S)
-    await bench.record(FRAMES[6:])
-    assert frames_of(bench.recorder.folder) == FRAMES[6:]
-
-
 async def test_hanging_disk_stops_recording_and_bounds_the_buffer(bench: RecorderBench) -> None:
-    await bench.turn()
     await bench.record(2 * (PENDING_LIMIT // len(PIECE)) * [PIECE])
     assert bench.troubles == ["Recording stopped: disk is too slow"]
     (file,) = bench.recorder.folder.glob("*.tlog")
@@ -326,7 +322,8 @@ async def test_save_renames_a_running_recording(make_bench: MakeBench) -> None:
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-async def test_save_needs_a_recording_and_a_good_name(bench: RecorderBench) -> None:
+async def test_save_needs_a_recording_and_a_good_name(make_bench: MakeBench) -> None:
+    bench = make_bench()
     with pytest.raises(RecordingError, match="nothing was recorded"):
         await bench.recorder.save("x")
     await bench.turn()
@@ -335,7 +332,8 @@ async def test_save_needs_a_recording_and_a_good_name(bench: RecorderBench) -> N
         await bench.recorder.save("../x")
 
 
-async def test_recording_wanted_at_start_misses_no_frame(bench: RecorderBench) -> None:
+async def test_recording_wanted_at_start_misses_no_frame(make_bench: MakeBench) -> None:
+    bench = make_bench()
     bench.recorder.start()
     assert bench.recorder.status().state == "recording"
     bench.send(FRAMES)
@@ -363,20 +361,8 @@ async def test_runs_of_the_hub_are_recorded_in_order_with_frames(
     assert all(b.time_us > a.time_us for a, b in itertools.pairwise(records))
 
 
-async def test_frames_are_taken_only_while_a_recording_runs(make_bench: MakeBench) -> None:
-    bench = make_bench(mode="manual")
-    bench.recorder.start()
-    await bench.turn()
-    assert not bench.recorder.takes_frames
-    bench.recorder.record()
-    await bench.turn()
-    bench.recorder.stop()
-    await bench.turn()
-    assert bench.takes_frames[0]
-    assert not bench.takes_frames[-1]
-
-
-async def test_failed_start_is_reported_and_retried(bench: RecorderBench) -> None:
+async def test_failed_start_is_reported_and_retried(make_bench: MakeBench) -> None:
+    bench = make_bench()
     bench.recorder.folder.write_text("a file where the folder should be")
     bench.recorder.start()
     assert bench.troubles == ["Recording not started: recordings: File exists"]
@@ -385,38 +371,36 @@ async def test_failed_start_is_reported_and_retried(bench: RecorderBench) -> Non
     assert bench.recorder.status().state == "recording"
 
 
-async def test_recording_begins_on_request(make_bench: MakeBench) -> None:
+async def test_recording_begins_and_frames_are_taken_on_request(make_bench: MakeBench) -> None:
     bench = make_bench(mode="manual")
     bench.recorder.start()
     await bench.recorder.settle()
-    assert not bench.recorder.recording
+    assert (bench.recorder.recording, bench.recorder.takes_frames) == (False, False)
     bench.recorder.record()
     await bench.recorder.settle()
     assert bench.recorder.status().state == "recording"
     bench.send(FRAMES)
-    bench.recorder.close()
+    bench.recorder.stop()
+    await bench.recorder.settle()
+    assert (bench.takes_frames[0], bench.takes_frames[-1]) == (True, False)
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-def test_file_without_content_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    files = PartFiles(tmp_path, "a", 1)
+def test_file_without_content_is_removed_and_another_one_is_not_overwritten(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = (PartFiles(tmp_path, "a", 2) for _ in range(2))
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", refusing(errno.ENOSPC))
         with pytest.raises(OSError, match="No space left"):
-            files.write({".tlog": b"x"})
-    files.close({})
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_existing_file_is_not_overwritten(tmp_path: Path) -> None:
-    first, second = (PartFiles(tmp_path, "a", 2) for _ in range(2))
-    first.write({".tlog": b"x"})
+            first.write({".tlog": b"x"})
     with pytest.raises(FileExistsError):
         second.write({".tlog": b"y"})
     first.close({})
+    assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("is_later", [False, True])
+@pytest.mark.parametrize("is_later", [False, True], ids=["together", "one after the other"])
 async def test_two_gateways_that_record_in_one_folder_lose_nothing(
     make_bench: MakeBench, is_later: bool
 ) -> None:
@@ -445,7 +429,6 @@ async def test_recording_is_reported_once_the_disk_has_written_something(
     def outcome() -> tuple[bool, str]:
         return bench.recorder.recording, bench.recorder.trouble
 
-    await bench.turn()
     assert outcome() == (False, "")
     bench.recorder.folder.rmdir()
     await bench.record(FRAMES[:5])

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from gateway.live.session import RETRY_US
-from gateway.recordings.index import list_recordings
 from tests.kit.recorder import FRAMES, NAME, MakeBench, RecorderBench, frames_of
 
 pytestmark = pytest.mark.io
@@ -63,24 +62,3 @@ async def test_full_disk_stops_recording_until_there_is_space(
     assert frames_of(bench.recorder.folder) == FRAMES[:5] + FRAMES[8:]
     assert bench.announced[-1] == (False, f"Recording {NAME}")
     assert len(bench.troubles) == 1
-
-
-async def test_read_only_disk_stops_recording_until_it_is_writable(
-    bench: RecorderBench, disk: Path
-) -> None:
-    # With a file open for writing the kernel would refuse.
-    bench.recorder.stop()
-    await bench.turn()
-    mount("-o", "remount,ro", str(disk))
-    bench.recorder.record()
-    await bench.turn()
-    await bench.record(FRAMES[5:8])
-    assert bench.troubles == ["Recording stopped: disk is read-only"]
-    await bench.turn(RETRY_S)
-    assert len(bench.troubles) == 1
-    mount("-o", "remount,rw", str(disk))
-    await bench.turn(RETRY_S)
-    await bench.record(FRAMES[8:])
-    assert bench.recorder.recording
-    assert [len(r.files) for r in list_recordings(bench.recorder.folder)] == [1, 1]
-    assert frames_of(bench.recorder.folder)[5:] == FRAMES[8:]
