@@ -9,8 +9,7 @@ import pytest
 
 from gateway import extras
 from gateway.extras import EXTRAS, MissingExtraError, how_to_add, require
-
-ROOT = Path(__file__).resolve().parents[1]
+from tests.conftest import ROOT
 
 
 @pytest.fixture
@@ -37,21 +36,19 @@ PACKAGES = "'jinja2>=3.1' 'matplotlib>=3.9'"
 
 
 @pytest.mark.parametrize(
-    ("absent", "files", "command"),
+    ("absent", "file", "command"),
     [
-        ((), (), f"/env/bin/python -m pip install {PACKAGES}"),
-        (("pip",), (), f"uv pip install --python /env/bin/python {PACKAGES}"),
-        ((), ("pipx_metadata.json",), f"pipx inject mavgate {PACKAGES}"),
-        (("pip",), ("pipx_metadata.json",), f"pipx inject mavgate {PACKAGES}"),
+        ((), "x", f"/env/bin/python -m pip install {PACKAGES}"),
+        (("pip",), "x", f"uv pip install --python /env/bin/python {PACKAGES}"),
+        ((), "pipx_metadata.json", f"pipx inject mavgate {PACKAGES}"),
+        (("pip",), "pipx_metadata.json", f"pipx inject mavgate {PACKAGES}"),
     ],
     ids=["venv", "uv", "pipx", "pipx with shared pip"],
 )
 def test_command_fits_the_environment(
-    environment: Callable[..., Path], absent: tuple[str, ...], files: tuple[str, ...], command: str
+    environment: Callable[..., Path], absent: tuple[str, ...], file: str, command: str
 ) -> None:
-    folder = environment(*absent)
-    for name in files:
-        (folder / name).touch()
+    (environment(*absent) / file).touch()
     assert how_to_add("a report", "plot") == (
         f"a report needs the extra plot; to install it: {command}"
     )

@@ -29,21 +29,18 @@ def test_new_file_has_permissions_of_umask(tmp_path: Path) -> None:
     assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
 
 
-def test_existing_file_is_replaced_only_with_overwrite(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(b"old")
-    with pytest.raises(FileExistsError):
-        write_new(tmp_path / "a", [b"new"])
-    assert content(tmp_path) == {"a": b"old"}
-    write_new(tmp_path / "a", [b"new"], overwrite=True)
-    assert content(tmp_path) == {"a": b"new"}
-
-
-@pytest.mark.parametrize("rights", [None, PRIVATE])
-def test_private_file_stays_private_when_replaced(tmp_path: Path, rights: int | None) -> None:
-    file = tmp_path / "1.toml"
+@pytest.mark.parametrize("rights", [None, PRIVATE], ids=["its rights", "given rights"])
+def test_existing_file_is_replaced_only_with_overwrite_and_stays_private(
+    tmp_path: Path, rights: int | None
+) -> None:
+    file = tmp_path / "a"
     file.write_bytes(b"old")
     file.chmod(0o600 if rights is None else 0o644)
+    with pytest.raises(FileExistsError):
+        write_new(file, [b"new"])
+    assert content(tmp_path) == {"a": b"old"}
     write_new(file, [b"new"], overwrite=True, rights=rights)
+    assert content(tmp_path) == {"a": b"new"}
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
 
 
@@ -79,7 +76,7 @@ def test_output_that_is_an_input_is_rejected(tmp_path: Path, way: str) -> None:
     assert flight.read_bytes() == b"precious"
 
 
-@pytest.mark.parametrize("old", [None, b"old"])
+@pytest.mark.parametrize("old", [None, b"old"], ids=["new", "replaced"])
 def test_interrupted_write_leaves_previous_content(tmp_path: Path, old: bytes | None) -> None:
     def broken() -> Iterator[bytes]:
         yield b"half"
@@ -96,7 +93,7 @@ def no_links(*_: object) -> None:
     raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
 
 
-@pytest.mark.parametrize("on_fat", [False, True])
+@pytest.mark.parametrize("on_fat", [False, True], ids=["with hard links", "on FAT"])
 def test_file_created_during_write_is_not_overwritten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_fat: bool
 ) -> None:
@@ -112,22 +109,17 @@ def test_file_created_during_write_is_not_overwritten(
     assert content(tmp_path) == {"a": b"other"}
 
 
-@pytest.mark.parametrize("overwrite", [False, True])
-def test_file_appears_only_when_complete(tmp_path: Path, overwrite: bool) -> None:
+@pytest.mark.parametrize("overwrite", [False, True], ids=["new", "replaced"])
+@pytest.mark.parametrize("name", ["a", "飛" * 83 + ".csv"], ids=["short name", "long name"])
+def test_file_appears_only_when_complete(tmp_path: Path, name: str, overwrite: bool) -> None:
     """A gateway that is killed while it writes a mission must not find it empty afterwards."""
 
     def looking() -> Iterator[bytes]:
-        assert not (tmp_path / "a").exists()
+        assert not (tmp_path / name).exists()
         yield b"1"
 
-    write_new(tmp_path / "a", looking(), overwrite=overwrite)
-    assert content(tmp_path) == {"a": b"1"}
-
-
-def test_existing_file_with_the_temporary_name_is_unchanged(tmp_path: Path) -> None:
-    (tmp_path / "a.partial").write_bytes(b"mine")
-    write_new(tmp_path / "a", [b"1"])
-    assert (tmp_path / "a.partial").read_bytes() == b"mine"
+    write_new(tmp_path / name, looking(), overwrite=overwrite)
+    assert content(tmp_path) == {name: b"1"}
 
 
 def test_folder_that_is_not_empty_needs_overwrite(tmp_path: Path) -> None:
@@ -142,11 +134,6 @@ def test_folder_that_is_not_empty_needs_overwrite(tmp_path: Path) -> None:
             check_folder(below, overwrite=True)
 
 
-def test_output_check_creates_no_file(tmp_path: Path) -> None:
-    check_output(tmp_path / "a")
-    assert content(tmp_path) == {}
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
 def test_error_of_a_full_disk_names_the_requested_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -158,7 +145,7 @@ def test_error_of_a_full_disk_names_the_requested_file(
     assert caught.value.filename == str(tmp_path / "a.csv")
 
 
-@pytest.mark.parametrize("is_there", [False, True])
+@pytest.mark.parametrize("is_there", [False, True], ids=["new folder", "old folder"])
 def test_files_of_a_folder_are_replaced_together_or_not_at_all(
     tmp_path: Path, is_there: bool
 ) -> None:
@@ -207,15 +194,11 @@ def test_read_error_names_the_input(tmp_path: Path) -> None:
     assert not [*tmp_path.iterdir()]
 
 
-def test_long_non_ascii_name_is_written(tmp_path: Path) -> None:
-    name = "飛" * 83 + ".csv"
-    write_new(tmp_path / name, [b"1"])
-    assert content(tmp_path) == {name: b"1"}
-
-
 def test_missing_or_read_only_folder_is_reported_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    check_output(tmp_path / "a")
+    assert content(tmp_path) == {}
     with pytest.raises(FileNotFoundError, match="folder that does not exist"):
         check_output(tmp_path / "none" / "a.csv")
     check_folder(tmp_path / "none" / "report")

@@ -21,7 +21,7 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.opening import lay_out, open_flights
 from gateway.records import Incoming, Outgoing
 from gateway.vehicle.recorded_vehicle import RecordedAction
-from gateway.wire.frame_editing import edit_frame
+from gateway.wire.frame_editing import renumbered
 from gateway.wire.mavlink_splitter import frame_of
 from gateway.wire.recorded_frames import RecordedFrame
 from tests.conftest import ManualClock
@@ -114,7 +114,7 @@ def settings_of(*endpoints: str) -> GatewaySettings:
     )
 
 
-@pytest.mark.parametrize("with_commands", [False, True])
+@pytest.mark.parametrize("with_commands", [False, True], ids=["without", "with commands"])
 async def test_commands_of_stations_are_played_only_on_request(
     make: Make, station: PlayedTo, with_commands: bool
 ) -> None:
@@ -122,9 +122,7 @@ async def test_commands_of_stations_are_played_only_on_request(
     wanted = [r.frame for r in recording()]
     if not with_commands:
         # The parameters are an answer; without it the second heartbeat follows the first.
-        edited = edit_frame(frame_of(wanted[-1]), sequence=1)
-        assert edited is not None
-        wanted = [wanted[0], edited.data]
+        wanted = [wanted[0], renumbered(frame_of(wanted[-1]), 1).data]
     await station.until(len(wanted))
     assert station.frames == wanted
 
@@ -137,19 +135,14 @@ async def test_recorded_high_latency_messages_are_played(make: Make, station: Pl
     assert station.frames == frames
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
-        "udp:tablet.example:14550",
-        "udp-listen:0.0.0.0:14550",
-        "udp-broadcast:127.255.255.255:14550",
-        "serial:/dev/ttyUSB0:57600",
-        "tcp:drone.example:5760",
-    ],
-)
-def test_commands_to_other_machines_need_confirmation(make: Make, url: str) -> None:
-    urls = ("udp:127.0.0.1:14550", "tcp:[::1]:5760", url)
-    assert endpoints_beyond(settings_of(*urls).hub) == [url]
+def test_commands_to_other_machines_need_confirmation(make: Make) -> None:
+    urls = ("udp:127.0.0.1:14550", "tcp:[::1]:5760")
+    others = [
+        *("udp:tablet.example:14550", "udp-listen:0.0.0.0:14550", "serial:/dev/ttyUSB0:57600"),
+        *("udp-broadcast:127.255.255.255:14550", "tcp:drone.example:5760"),
+    ]
+    assert endpoints_beyond(settings_of(*urls, *others).hub) == others
+    urls = (*urls, others[0])
     with pytest.raises(ValueError, match="unless the user confirms"):
         make(*urls, with_commands=True)
     make(*urls, with_commands=True, commands_anywhere=True)
@@ -231,7 +224,7 @@ READY = {
 """Number of modes and parameters, of items of plans, and the cameras."""
 
 
-@pytest.mark.parametrize("one_by_one", [True, False])
+@pytest.mark.parametrize("one_by_one", [True, False], ids=["one by one", "all at once"])
 @pytest.mark.parametrize("name", READY)
 def test_qgroundcontrol_becomes_ready(
     make: Make, tmp_path: Path, clock: ManualClock, name: str, one_by_one: bool
@@ -384,18 +377,16 @@ async def test_idle_player_repeats_the_state_without_gaps_in_the_numbers(
     assert [frame.sequence for frame in read] == [(first + i) % 256 for i in range(len(read))]
 
 
-@pytest.mark.parametrize(
-    ("endpoints", "text"),
-    [
-        (("udp:127.0.0.1:14550", "tcp-listen:127.0.0.1:5760"),
-         "playing a.tlog as vehicle 3 to udp:127.0.0.1:14550, tcp-listen:127.0.0.1:5760"),
-        ((), "playing a.tlog as vehicle 3 to no client: no endpoint is set"),
-    ],
-)  # fmt: skip
 def test_vehicles_and_endpoints_are_printed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], endpoints: tuple[str, ...], text: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with ExitStack() as opened:
-        flights = open_flights([write_tlog(tmp_path / "a.tlog", recording())], OPTIONS, opened)
-        print_plan(["a.tlog"], lay_out(flights, with_commands=False), endpoints)
-    assert " ".join(capsys.readouterr().out.split()) == text
+    path = write_tlog(tmp_path / "a.tlog", recording())
+    for endpoints, text in (
+        (("udp:127.0.0.1:1", "tcp-listen:127.0.0.1:2"), "udp:127.0.0.1:1, tcp-listen:127.0.0.1:2"),
+        ((), "no client: no endpoint is set"),
+    ):
+        with ExitStack() as opened:
+            flights = lay_out(open_flights([path], OPTIONS, opened), with_commands=False)
+            print_plan(["a.tlog"], flights, endpoints)
+        printed = " ".join(capsys.readouterr().out.split())
+        assert printed == f"playing a.tlog as vehicle 3 to {text}"

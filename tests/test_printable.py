@@ -78,30 +78,20 @@ def test_console_escapes_text_of_any_renderable(make: object) -> None:
     assert not {RIGHT_TO_LEFT, "\x9b"} & set(console.file.getvalue())
 
 
-def test_log_line_is_escaped_and_its_length_bounded() -> None:
+def test_log_line_is_escaped_bounded_and_cannot_be_imitated_by_a_line_feed() -> None:
     assert log_line(f"\x1b{RIGHT_TO_LEFT}") == r"from \x1b\u202e"
     assert len(log_line("/" * 60_000)) == LONGEST + 1
-
-
-def test_line_feed_in_a_logged_text_cannot_imitate_a_log_line() -> None:
     assert log_line("x\n2026-01-01 INFO all is well") == "from x\n    2026-01-01 INFO all is well"
 
 
-@pytest.mark.parametrize(
-    ("connected", "received", "frames", "text"),
-    [
-        (False, 0, 0, "receiver: not connected (serial.port = auto)"),
-        (True, 0, 0, "connected, silent"),
-        (True, 5000, 90, "connected"),
-        (True, 5000, 0, "serial.baud"),
-    ],
-)
-def test_port_without_frames_is_described(
-    connected: bool, received: int, frames: int, text: str
-) -> None:
-    state = receiver_state("auto", connected, received, frames)
-    assert text in state
-    assert (state == "receiver: auto connected") == (frames > 0)
+def test_port_without_frames_is_described() -> None:
+    assert receiver_state("auto", True, 5000, 90) == "receiver: auto connected"
+    for connected, received, text in (
+        (False, 0, "receiver: not connected (serial.port = auto)"),
+        (True, 0, "receiver: auto connected, silent"),
+        (True, 5000, "receiver: auto connected, sends no frames"),
+    ):
+        assert receiver_state("auto", connected, received, 0).startswith(text)
 
 
 @pytest.mark.parametrize(
@@ -118,12 +108,7 @@ def test_text_for_other_machines_has_no_folder_of_this_one(text: str, shown: str
     assert without_folders(text) == (shown or text)
 
 
-@pytest.mark.parametrize(
-    ("value", "shown"),
-    [(None, "—"), (math.nan, "—"), (math.inf, "—"), (-math.inf, "—"), (2.25, "2.2 m")],
-)
-def test_known_number_is_followed_by_its_unit_and_an_unknown_one_is_a_dash(
-    value: float | None, shown: str
-) -> None:
-    assert figure(value, ".1f", "m") == shown
+def test_known_number_is_followed_by_its_unit_and_an_unknown_one_is_a_dash() -> None:
+    assert {figure(value, ".1f", "m") for value in (None, math.nan, math.inf, -math.inf)} == {"—"}
+    assert figure(2.25, ".1f", "m") == "2.2 m"
     assert figure(0.1, ".0%") == "10%"

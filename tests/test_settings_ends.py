@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from gateway.aircraft import Aircraft, AircraftSettings, Outputs
 from gateway.config import GatewaySettings
+from gateway.estimation.select import EstimationSettings
 from gateway.records import BaroRaw, ImuFlags, RawRecord
 from gateway.sensing.calibrating import IN_BODY_AXES
 from gateway.sensing.calibration import NodeCalibration
@@ -33,18 +34,14 @@ def numbers(kind: type[Settings], path: tuple[str, ...] = ()) -> Iterator[tuple[
         inner = (*path, field.name)
         if field.section is not None:
             yield from numbers(field.section, inner)
-        elif not field.choices and is_number(first_of(field.default)):
+        elif not field.choices and is_number(field.default):
             yield ".".join(inner), field
 
 
 def is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def first_of(value: Any) -> Any:
     while isinstance(value, tuple) and value:
         value = value[0]
-    return value
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def ends(field: Field) -> list[float]:
@@ -61,6 +58,7 @@ def is_matrix(field: Field) -> bool:
     return isinstance(field.default, tuple) and isinstance(field.default[0], tuple)
 
 
+EVERY_NUMBER = [*numbers(GatewaySettings), *numbers(AircraftSettings)]
 FUSION = [
     (path, field)
     for path, field in numbers(AircraftSettings)
@@ -126,13 +124,12 @@ def all_known(found: list[Any]) -> bool:
 
 
 def test_every_number_has_lower_and_upper_bound() -> None:
-    everything = [*numbers(GatewaySettings), *numbers(AircraftSettings)]
-    assert [path for path, field in everything if None in field.bounds] == []
+    assert [path for path, field in EVERY_NUMBER if None in field.bounds] == []
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_settings_reject_nan_and_infinity(value: float) -> None:
-    for path, field in [*numbers(GatewaySettings), *numbers(AircraftSettings)]:
+    for path, field in EVERY_NUMBER:
         plain = msgspec.to_builtins(field.default)
         wrong: Any = value
         if isinstance(plain, list | tuple):
@@ -179,25 +176,19 @@ def test_estimator_can_be_changed_in_flight(before: str, after: str) -> None:
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_changed_gps_latency_keeps_attitude(name: str) -> None:
+def test_changed_gps_latency_keeps_attitude_and_a_failed_change_keeps_settings(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     aircraft = Aircraft(1, with_estimator(name))
     before = fly(aircraft)[-1]
     wanted = replaced(with_estimator(name), "estimation.reference.gps_latency_s", 0.3).estimation
     aircraft.perform([SettingsChange("estimation", wanted)], 0, Outputs())
     after = fly(aircraft, 3_700_000, 2)[0]
     assert (after.roll, after.pitch) == pytest.approx((before.roll, before.pitch), abs=0.2)
-
-
-def test_failed_settings_change_leaves_settings_unchanged(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    aircraft = Aircraft(1, AircraftSettings())
     monkeypatch.setattr("gateway.aircraft.make_estimator", Mock(side_effect=ArithmeticError))
-    before = aircraft.settings
-    wanted = SettingsChange("estimation", with_estimator("paper").estimation)
     with pytest.raises(ArithmeticError):
-        aircraft.perform([wanted], 0, Outputs())
-    assert aircraft.settings == before
+        aircraft.perform([SettingsChange("estimation", EstimationSettings())], 0, Outputs())
+    assert aircraft.settings.estimation == wanted
 
 
 @pytest.mark.parametrize(
