@@ -168,11 +168,11 @@ def main() -> None:
         baseline, watch = begin_copy(send_even_turns, 60.0 * options.minutes), TurnWatch()
         stations = (PYTHON, "-m", "tools.bench_pauses", "--stations", *map(str, ports))
         with (
-            running(*stations) as visitors,
+            running(*stations) as clients,
             asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner,
         ):
             rows = runner.run(fly(config, watch, 60.0 * options.minutes))
-            if visitors.poll() is not None:
+            if clients.poll() is not None:
                 sys.exit("the stations have ended")
         rows += baseline.recv()
     show(f"turns of {options.minutes:g} min, {options.vehicles} aircraft", HEADS, rows)

@@ -122,9 +122,9 @@ def twins(port: int) -> Batch:
             yield partial(sock.send, frame)
 
 
-def visit(port: int, visitors: int) -> Batch:
+def visit(port: int, clients: int) -> Batch:
     """Send one heartbeat each from new ports, as some stations in turn."""
-    for system in itertools.cycle(range(1, 1 + visitors)):
+    for system in itertools.cycle(range(1, 1 + clients)):
         with caller(TRUSTED, port) as client:
             yield partial(client.send, heartbeat(system))
 
