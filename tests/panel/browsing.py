@@ -1,13 +1,10 @@
-"""A gateway with its panel as processes, and a real Chromium to look at it."""
+"""A real Chromium that looks at a panel."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, FloatRect, Locator, Page, Playwright
-
-from tests.kit import process
+from playwright.sync_api import Browser, FloatRect, Locator, Page, sync_playwright
 
 CHROMIUM = Path("/usr/bin/chromium")
 ARGUMENTS = [
@@ -35,61 +32,19 @@ window.cancelAnimationFrame = (id) => waiting.delete(id);
 """
 """Lets a page draw about ten frames a second, since the processor draws them."""
 
-CONFIG = """
-aircraft_folder = "{folder}/aircraft"
-[hub]
-endpoints = ["udp-listen:127.0.0.1:0?name=clients"]
-[recording]
-folder = "{folder}/recordings"
-mode = "manual"
-[simulator]
-vehicles = 2
-gps_first_fix_s = 0.5
-imu_rate_hz = 25
-baro_rate_hz = 5
-[vehicle.rates]
-attitude_quaternion_hz = 5
-attitude_hz = 5
-global_position_int_hz = 5
-vfr_hud_hz = 5
-highres_imu_hz = 5
-[panel]
-port = 0
-tiles_folder = "{folder}/tiles"
-map_styles = [
-  {{name = "Field", url = "{folder}/field.mbtiles", max_zoom = 18}},
-  {{name = "Other", url = "{folder}/other.mbtiles", max_zoom = 18}},
-]
-"""
-CONFIG_WITHOUT_MAP = """
-aircraft_folder = "{folder}/aircraft"
-[hub]
-endpoints = []
-[recording]
-folder = "{folder}/recordings"
-[panel]
-port = 0
-tiles_folder = "{folder}/tiles"
-map_styles = []
-"""
-
 needs_chromium = pytest.mark.skipif(
     not CHROMIUM.exists(),
     reason=f"no {CHROMIUM}: sudo apt-get install --no-install-recommends chromium",
 )
 
 
-def launch(playwright: Playwright) -> Browser:
-    return playwright.chromium.launch(
-        executable_path=str(CHROMIUM), args=ARGUMENTS, timeout=START_LIMIT_MS
-    )
-
-
-class Process(process.Process):
-    """A `mavgate` command with a panel."""
-
-    def __init__(self, folder: Path, *arguments: str, config: str = CONFIG) -> None:
-        super().__init__(folder, *arguments, config=config.format(folder=folder))
+def launched() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(
+            executable_path=str(CHROMIUM), args=ARGUMENTS, timeout=START_LIMIT_MS
+        )
+        yield opened
+        opened.close()
 
 
 def open_page(browser: Browser, link: str, view: str = "flight", script: str = "") -> Page:
@@ -104,17 +59,6 @@ def open_page(browser: Browser, link: str, view: str = "flight", script: str = "
     )
     show(page, view)
     return page
-
-
-@contextmanager
-def opened(browser: Browser, link: str) -> Iterator[Page]:
-    """Open the page; none of its scripts may fail until it is closed."""
-    page = open_page(browser, link)
-    troubles: list[str] = []
-    page.on("pageerror", lambda error: troubles.append(str(error)))
-    yield page
-    page.close()
-    assert troubles == []
 
 
 def show(page: Page, view: str) -> Locator:
@@ -138,13 +82,3 @@ def box_of(element: Locator) -> FloatRect:
     box = element.bounding_box()
     assert box is not None
     return box
-
-
-def download(page: Page, button: Locator, folder: Path) -> Path:
-    """Click a button; return the file that is downloaded, under the name that the page gives it."""
-    # The command of an export has a lower priority than all other tests.
-    with page.expect_download(timeout=5 * START_LIMIT_MS) as waiting:
-        button.click()
-    path = folder / waiting.value.suggested_filename
-    waiting.value.save_as(path)
-    return path

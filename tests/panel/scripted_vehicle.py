@@ -4,7 +4,7 @@ import contextlib
 import math
 import socket
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -24,23 +24,21 @@ class ScriptedVehicle(threading.Thread):
     def __init__(self) -> None:
         super().__init__(daemon=True)
         self.port = free_port()
-        self.hostile_names = HOSTILE_NAMES
-        self.kind = mavlink.MAV_TYPE_FIXED_WING
         self.roll_deg = self.pitch_deg = self.heading_deg = 0.0
         self.alt_home_m, self.home_alt_m = 60.0, 431.0
         self.groundspeed_mps, self.airspeed_mps, self.climb_mps = 18.0, 17.5, 1.5
         self._ended = threading.Event()
 
     def run(self) -> None:
-        own = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-        hostile = mavlink.MAVLink(None, srcSystem=2, srcComponent=1)
+        own = mavlink.MAVLink(None, srcSystem=2, srcComponent=1)
+        hostile = mavlink.MAVLink(None, srcSystem=3, srcComponent=1)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.connect(("127.0.0.1", self.port))
             turn = 0
             while not self._ended.wait(1 / RATE_HZ):
                 frames = [message.pack(own) for message in self._messages()]
                 if turn % HOSTILE_EVERY == 0:
-                    frames += [m.pack(hostile) for m in hostile_messages(self.hostile_names)]
+                    frames += [m.pack(hostile) for m in hostile_messages()]
                 turn += 1
                 for frame in frames:
                     with contextlib.suppress(ConnectionRefusedError):
@@ -55,7 +53,7 @@ class ScriptedVehicle(threading.Thread):
         alt_m = self.home_alt_m + self.alt_home_m
         heading = round(self.heading_deg)
         return [
-            mavlink.MAVLink_heartbeat_message(self.kind, 0, 128, 0, 4, 3),
+            mavlink.MAVLink_heartbeat_message(1, 0, 128, 0, 4, 3),
             mavlink.MAVLink_attitude_message(0, *angles, 0.0, 0.0, 0.0),
             mavlink.MAVLink_global_position_int_message(
                 0, 470_000_000, 80_000_000, round(alt_m * 1e3), round(self.alt_home_m * 1e3),
@@ -71,16 +69,16 @@ class ScriptedVehicle(threading.Thread):
         ]  # fmt: skip
 
 
-def hostile_messages(names: Sequence[str]) -> Iterator[mavlink.MAVLink_message]:
+def hostile_messages() -> Iterator[mavlink.MAVLink_message]:
     """Make parameters, texts and named values whose names are scripts."""
     yield mavlink.MAVLink_heartbeat_message(1, 0, 128, 0, 4, 3)
     yield mavlink.MAVLink_attitude_message(0, 0.1, 0.1, 0.1, 0.0, 0.0, 0.0)
     yield mavlink.MAVLink_global_position_int_message(
         0, 470_000_000, 80_001_000, 500_000, 60_000, 0, 0, 0, 0
     )
-    for number, name in enumerate(names):
+    for number, name in enumerate(HOSTILE_NAMES):
         raw = name.encode()[:16]
-        yield mavlink.MAVLink_param_value_message(raw, number / 3, 9, len(names), number)
+        yield mavlink.MAVLink_param_value_message(raw, number / 3, 9, len(HOSTILE_NAMES), number)
         yield mavlink.MAVLink_named_value_float_message(0, raw[:10], 1.0)
         yield mavlink.MAVLink_debug_vect_message(raw[:10], 0, 1.0, 2.0, 3.0)
     for part in range(0, len(HOSTILE_MARKUP), 50):

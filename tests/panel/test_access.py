@@ -27,7 +27,7 @@ from gateway.panel.panel_server import PageErrors, PanelError, tls_files, withou
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.response_headers import HEADERS, ScriptNonces
 from tests.conftest import ManualClock
-from tests.panel.web_client import OPERATOR, VIEWER
+from tests.panel.web_client import OPERATOR, VIEWER, write_certificate
 
 HERE = "http://127.0.0.1:14590"
 
@@ -377,13 +377,9 @@ def test_bad_certificate_is_named(tmp_path: Path, certificate: str, key: str, me
 
 @pytest.mark.io
 def test_key_in_the_certificate_file_is_accepted_unless_encrypted(tmp_path: Path) -> None:
-    key, certificate, locked = (tmp_path / name for name in ("key", "certificate", "locked"))
-    for words in (
-        ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes",
-         "-days", "30", "-subj", "/CN=mavgate", "-keyout", key, "-out", certificate],
-        ["ec", "-in", key, "-aes256", "-passout", "pass:secret", "-out", locked],
-    ):  # fmt: skip
-        subprocess.run(["openssl", *words], check=True, capture_output=True)
+    (certificate, key), locked = write_certificate(tmp_path), tmp_path / "locked"
+    words = ["ec", "-in", key, "-aes256", "-passout", "pass:secret", "-out", locked]
+    subprocess.run(["openssl", *words], check=True, capture_output=True)
     settings = PanelSettings(certificate=str(certificate), certificate_key=str(locked))
     with pytest.raises(PanelError, match=r"without a password$"):
         tls_files(settings)

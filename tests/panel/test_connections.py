@@ -3,9 +3,13 @@
 import asyncio
 import contextlib
 import socket
+import ssl
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
 
+import httpx
 import pytest
 import uvicorn
 from starlette.responses import PlainTextResponse
@@ -22,6 +26,7 @@ from gateway.panel.connections import (
     LimitedProtocol,
     LimitedServer,
 )
+from tests.panel.web_client import write_certificate
 
 pytestmark = pytest.mark.io
 REQUEST = b"GET /%s HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n"
@@ -115,8 +120,10 @@ async def answers_all(scope: Scope, receive: Receive, send: Send) -> None:
 
 
 @asynccontextmanager
-async def served() -> AsyncIterator[int]:
-    config = uvicorn.Config(answers_all, http=LimitedProtocol, log_config=None, lifespan="off")
+async def served(**options: Any) -> AsyncIterator[int]:
+    config = uvicorn.Config(
+        answers_all, http=LimitedProtocol, log_config=None, lifespan="off", **options
+    )
     config.load()
     server = LimitedServer(config, ConnectionLimits())
     sock = socket.socket()
@@ -136,6 +143,14 @@ async def connected() -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.Strea
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         yield reader, writer
         writer.close()
+
+
+async def test_page_is_served_over_tls(tmp_path: Path) -> None:
+    certificate, key = write_certificate(tmp_path)
+    async with served(ssl_certfile=certificate, ssl_keyfile=key) as port:
+        trusted = ssl.create_default_context(cafile=str(certificate))
+        async with httpx.AsyncClient(verify=trusted) as client:
+            assert (await client.get(f"https://127.0.0.1:{port}/")).text == "hello"
 
 
 async def test_idle_connections_do_not_block_a_user() -> None:

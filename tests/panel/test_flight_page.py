@@ -4,7 +4,7 @@ import base64
 import gzip
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.cli import invoke
 from tests.kit.mavlink import packed
 from tests.kit.recordings import write_tlog
-from tests.panel.browsing import FEW_FRAMES, needs_chromium
+from tests.panel.browsing import FEW_FRAMES, launched, needs_chromium
 from tests.panel.messages import BEGIN_US, HOSTILE_TEXT, flight_records
 
 pytestmark = pytest.mark.io
@@ -137,6 +137,11 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "flight.html"
     path.write_text(render_page(flight_of(path.parent, flight_records(120))))
     return path
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    yield from launched()
 
 
 @pytest.mark.slow

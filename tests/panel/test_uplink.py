@@ -196,3 +196,30 @@ async def test_late_status_does_not_replace_a_later_one() -> None:
     assert watch.status is not None
     assert watch.before is not None
     assert (watch.before["number"], watch.status["number"]) == (1, 2)
+
+
+async def test_restarted_gateway_is_found_again_by_its_control_socket(
+    fleet: FleetState, sockets: tuple[socket.socket, socket.socket]
+) -> None:
+    listeners: list[dict[str, Any]] = []
+    asked: list[str] = []
+    now_us = [0]
+
+    class Control:
+        async def ask(self, verb: str, **params: str) -> dict[str, Any]:
+            asked.append(verb)
+            if verb == "clients.add":
+                listeners[:] = [{"endpoint": params["url"], "port": ports[0]}]
+            return {"listeners": listeners}
+
+    ports = [sock.getsockname()[1] for sock in sockets]
+    control: Any = Control()
+    clock: Any = lambda: now_us[0]  # noqa: E731
+    uplink = Uplink(None, fleet, control, clock)
+    uplink.start()
+    for sock in sockets:
+        await until(lambda sock=sock: bool(heard(sock)), lambda: None)
+        listeners.clear()
+        ports.reverse()
+    assert asked[:3] == ["status", "clients.add", "status"]
+    uplink.close()

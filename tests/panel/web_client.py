@@ -1,6 +1,8 @@
 """HTTP clients of an application, without a socket, and hashes of passwords."""
 
+import subprocess
 from collections.abc import Callable
+from pathlib import Path
 
 import httpx
 import pytest
@@ -29,3 +31,13 @@ def client_of(serve: Callable[[FastAPI], object], role: Role = Role.OPERATOR) ->
 
     transport = httpx.ASGITransport(app=with_role)
     return httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1")
+
+
+def write_certificate(folder: Path) -> tuple[Path, Path]:
+    """Write a certificate of 127.0.0.1, and its key."""
+    certificate, key = folder / "panel.pem", folder / "panel.key"
+    command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"]
+    command += ["-nodes", "-days", "1", "-subj", "/CN=127.0.0.1"]
+    command += ["-addext", "subjectAltName=IP:127.0.0.1", "-out", certificate, "-keyout", key]
+    subprocess.run(command, check=True, capture_output=True)
+    return certificate, key

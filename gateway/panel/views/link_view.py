@@ -120,10 +120,10 @@ class LinkView:
         with ui.element("div").classes("card padded").props("data-role=push") as self._push:
             heading("Posts of a phone")
             request = ui.context.client.request
-            self._base = str(request.base_url) if request is not None else "/"
+            self._base = str(request.base_url)
             if self._context.parts.settings.address in LOOPBACK:
                 ui.label(f"{LOOPBACK_ONLY}.").classes("soft")
-            elif request is not None and request.url.hostname in LOOPBACK:
+            elif request.url.hostname in LOOPBACK:
                 ui.label(f"{OPEN_BY_ADDRESS}.").classes("soft")
             self._push_urls = ui.element("div")
         self._push.set_visibility(False)
