@@ -43,7 +43,7 @@ RATE_HZ = 200
 LONGEST_S = 3.0
 SHORTEST_S = 0.3
 MAX_LOST_S = 1.0
-CUT_BYTES = 6000
+CUT_BYTES = 2000
 NUMBERS = struct.Struct("QQ")
 """Data shared with a child: its samples, and the recorder's size of its larger file."""
 PATIENCE_S = 240.0

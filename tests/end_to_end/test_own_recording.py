@@ -274,7 +274,7 @@ def test_page_and_report_are_made(folder: Path, tlog: Path, tmp_path: Path) -> N
     invoke("report", tlog, "-o", tmp_path / "f.html", "--quick", code=0)
     assert "<html" in (tmp_path / "f.html").read_text()[:500]
     (table,) = folder.glob("*_01_v1.csv")
-    invoke("report", table, "-o", tmp_path / "report", code=0)
+    invoke("report", table, "-o", tmp_path / "report", "--quick", code=0)
     assert list((tmp_path / "report").glob("*.html"))
 
 

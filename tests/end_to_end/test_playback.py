@@ -1,5 +1,6 @@
 """Recordings read and played to mavlogdump, MAVProxy, MAVSDK and a bare client."""
 
+import asyncio
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -106,21 +107,6 @@ def test_attached_player_ends_when_its_parent_ends(
     assert playing.process.wait(START_LIMIT_S) == 0
 
 
-def test_control_socket_pauses_and_seeks_player(
-    tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
-) -> None:
-    port = free_port()
-    client = connect(port)
-    playing = play(str(tlog), "--loop", "--from", "0:10", port=port)
-    client.until(lambda seen: "HOME_POSITION" in seen)
-    assert request(playing.socket, "play.pause")["state"] == "paused"
-    status = request(playing.socket, "seek", {"to": "0:30"})
-    assert status["position_s"] == pytest.approx(30.0)
-    wanted = round(LAT_DEG * 1e7) + 10 * 10 * 40 - 10
-    seen = client.until(lambda seen: getattr(seen.get("GLOBAL_POSITION_INT"), "lat", 0) == wanted)
-    assert seen["HEARTBEAT"].get_srcSystem() == 3
-
-
 def test_two_recordings_are_played_as_two_vehicles(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
@@ -132,12 +118,30 @@ def test_two_recordings_are_played_as_two_vehicles(
         systems |= {message.get_srcSystem() for message in client.receive()}
 
 
-def test_recorded_vehicle_answers_a_ground_station(
-    tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
+async def position_by_mavsdk(port: int) -> tuple[float, float]:
+    """Return latitude and longitude as MAVSDK reports them."""
+    async with mavsdk_system(port) as system:
+        telemetry = TelemetryAsync(system)
+        position = await anext(telemetry.subscribe_position())
+    return position.latitude_deg, position.longitude_deg
+
+
+def latitude_by_mavproxy(proxy: MavProxy, system: int) -> float:
+    """Return the latitude as MAVProxy reports it."""
+    proxy.until(rf"Detected vehicle {system}:1")
+    found = proxy.until(r"GLOBAL_POSITION_INT \{.*?lat : (-?\d+)", "status GLOBAL_POSITION_INT")
+    return int(found[1]) / 1e7
+
+
+def test_recorded_vehicle_is_seen_answers_and_is_paused_and_moved(
+    tlog: Path,
+    play: Callable[..., Playing],
+    connect: Callable[..., Client],
+    start_mavproxy: Callable[[int], MavProxy],
 ) -> None:
     port = free_port()
     client = connect(port)
-    play(str(tlog), port=port)
+    playing = play(str(tlog), "--loop", "--from", "0:10", port=port)
     _, address = client.sock.recvfrom(2048)
     client.send(mavlink.MAVLink_param_request_list_message(3, 1), address[1])
     seen = client.until(lambda seen: "PARAM_ERROR" in seen)
@@ -147,29 +151,23 @@ def test_recorded_vehicle_answers_a_ground_station(
     client.send(home, address[1])
     seen = client.until(lambda seen: {"COMMAND_ACK", "HOME_POSITION"} <= seen.keys())
     assert seen["COMMAND_ACK"].result == mavlink.MAV_RESULT_ACCEPTED
+    client.sock.close()
+    assert asyncio.run(position_by_mavsdk(port)) == pytest.approx((LAT_DEG, LON_DEG), abs=0.01)
+    proxy = start_mavproxy(port)
+    assert latitude_by_mavproxy(proxy, 3) == pytest.approx(LAT_DEG, abs=0.01)
+    proxy.process.kill()
+    proxy.process.wait()
+    client = connect(port)
+    client.until(lambda seen: "HOME_POSITION" in seen)
+    assert request(playing.socket, "play.pause")["state"] == "paused"
+    status = request(playing.socket, "seek", {"to": "0:30"})
+    assert status["position_s"] == pytest.approx(30.0)
+    wanted = round(LAT_DEG * 1e7) + 10 * 10 * 40 - 10
+    seen = client.until(lambda seen: getattr(seen.get("GLOBAL_POSITION_INT"), "lat", 0) == wanted)
+    assert seen["HEARTBEAT"].get_srcSystem() == 3
 
 
-def test_mavproxy_sees_the_recorded_vehicle(
-    tlog: Path, play: Callable[..., Playing], start_mavproxy: Callable[[int], MavProxy]
-) -> None:
-    playing = play(str(tlog), "--loop")
-    proxy = start_mavproxy(playing.port)
-    proxy.until(r"Detected vehicle 3:1")
-    found = proxy.until(r"GLOBAL_POSITION_INT \{.*?lat : (\d+)", "status GLOBAL_POSITION_INT")
-    assert int(found[1]) / 1e7 == pytest.approx(LAT_DEG, abs=0.01)
-
-
-async def test_mavsdk_sees_the_recorded_vehicle(tlog: Path, play: Callable[..., Playing]) -> None:
-    playing = play(str(tlog), "--loop")
-    async with mavsdk_system(playing.port) as system:
-        telemetry = TelemetryAsync(system)
-        position = await anext(telemetry.subscribe_position())
-        home = await anext(telemetry.subscribe_home())
-    assert position.latitude_deg == pytest.approx(LAT_DEG, abs=0.01)
-    assert home.longitude_deg == pytest.approx(LON_DEG, abs=0.01)
-
-
-async def test_mavproxy_recording_is_seen_by_mavproxy_and_mavsdk(
+def test_mavproxy_recording_is_seen_by_mavproxy_and_mavsdk(
     start_gateway: Callable[..., Gateway],
     start_mavproxy: Callable[[int], MavProxy],
     play: Callable[..., Playing],
@@ -185,21 +183,10 @@ async def test_mavproxy_recording_is_seen_by_mavproxy_and_mavsdk(
     recorder.process.terminate()
     recorder.process.communicate(timeout=START_LIMIT_S)
     gateway.end()
-    playing = play(str(tmp_path / "mav.tlog"), "--loop")
-    async with mavsdk_system(playing.port) as system:
-        telemetry = TelemetryAsync(system)
-        position = await anext(telemetry.subscribe_position())
+    recorded = (tmp_path / "mav.tlog").rename(tmp_path / "recorded.tlog")
+    playing = play(str(recorded), "--loop")
     home = SimulatorSettings()
-    assert position.latitude_deg == pytest.approx(home.home_lat_deg, abs=NEAR_DEG)
-    playing.end()
-    viewing = play(str(tmp_path / "mav.tlog"), "--loop")
-    folder = tmp_path / "viewer"
-    folder.mkdir()
-    viewer = MavProxy(viewing.port, folder)
-    try:
-        viewer.until(r"Detected vehicle 1:1")
-        found = viewer.until(r"GLOBAL_POSITION_INT \{.*?lat : (-\d+)", "status GLOBAL_POSITION_INT")
-    finally:
-        viewer.process.kill()
-        viewer.process.communicate()
-    assert int(found[1]) / 1e7 == pytest.approx(home.home_lat_deg, abs=NEAR_DEG)
+    latitude, _ = asyncio.run(position_by_mavsdk(playing.port))
+    assert latitude == pytest.approx(home.home_lat_deg, abs=NEAR_DEG)
+    proxy = start_mavproxy(playing.port)
+    assert latitude_by_mavproxy(proxy, 1) == pytest.approx(home.home_lat_deg, abs=NEAR_DEG)
