@@ -4,7 +4,6 @@ Every section contains the settings of one stage or edge, which its code declare
 is rejected with all its errors at once, each with file, key, value and the allowed values.
 """
 
-import difflib
 import errno
 import logging
 import re
@@ -26,7 +25,7 @@ from gateway.live.serial_port import SerialSettings
 from gateway.live.session import RecordingSettings
 from gateway.output import PRIVATE, write_new
 from gateway.panel.panel_settings import PanelSettings
-from gateway.printable import UserError
+from gateway.printable import UserError, near_match
 from gateway.settings import Field, Settings, fields_of, setting
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.sources.settings import MAX_SOURCES, SourceSettings, parse_source
@@ -346,16 +345,16 @@ def _check_path(path: str, value: Any, field: Field) -> Iterator[str]:
 
 
 def _unknown_key(path: str, key: str, fields: Mapping[str, Field]) -> str:
-    near = difflib.get_close_matches(key, fields, n=1)
-    known = f"; known here: {', '.join(fields)}; a newer mavgate may have it"
-    hint = f"; did you mean {near[0]!r}?" if near else known
-    return f"{path}: no such setting{hint}"
+    known = f"known here: {', '.join(fields)}; a newer mavgate may have it"
+    return f"{path}: no such setting; {near_match(key, fields) or known}"
 
 
 def _wrong_value(path: str, value: Any, field: Field, error: msgspec.ValidationError) -> str:
     reason = f"must be {_wanted(field, str(error))}"
     text = f"{path} = {tomlkit.item(value).as_string()}: {reason}"
-    hint = "; ".join(filter(None, (_choice_hint(value, field), _uncapital(field.meaning))))
+    allowed = f"allowed: {', '.join(field.choices)}" if field.choices else ""
+    choices = " ".join(filter(None, (near_match(str(value), field.choices), allowed)))
+    hint = "; ".join(filter(None, (choices, _uncapital(field.meaning))))
     return f"{text} ({hint})" if hint else text
 
 
@@ -372,15 +371,6 @@ def _wanted(field: Field, error: str) -> str:
     wanted = KINDS.get(kind[1], kind[1]) if kind else "as described"
     inside = "a list, each entry " if " - at `$[" in error else ""
     return f"{inside}{wanted}{f' of {length[1]} entries' if length else ''}"
-
-
-def _choice_hint(value: Any, field: Field) -> str:
-    """Return the allowed choices, with the most similar one first."""
-    if not field.choices:
-        return ""
-    near = difflib.get_close_matches(str(value), field.choices, n=1)
-    meant = f"did you mean {near[0]!r}? " if near else ""
-    return f"{meant}allowed: {', '.join(field.choices)}"
 
 
 def _uncapital(text: str) -> str:

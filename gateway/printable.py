@@ -110,15 +110,20 @@ def reason_of(error: Exception) -> str:
     )
 
 
-def unknown_choice(what: str, word: str, choices: Iterable[str]) -> str:
-    """Return the text for a word that is not allowed."""
+def near_match(word: str, choices: Iterable[str]) -> str:
+    """Return the question `did you mean 'x'?` for a misspelt word, or an empty text."""
     # Imported here, as only an error needs it.
     import difflib
 
+    near = difflib.get_close_matches(word, [*choices], n=1)
+    return f"did you mean {near[0]!r}?" if near else ""
+
+
+def unknown_choice(what: str, word: str, choices: Iterable[str]) -> str:
+    """Return the text for a word that is not allowed."""
     listed = [*choices]
-    near = difflib.get_close_matches(word, listed, n=1)
-    meant = f"did you mean {near[0]!r}? " if near else ""
-    return f"unknown {what} {word!r}; {meant}choose {', '.join(listed)}"
+    words = (near_match(word, listed), f"choose {', '.join(listed)}")
+    return f"unknown {what} {word!r}; {' '.join(filter(None, words))}"
 
 
 def receiver_state(port: str, connected: bool, bytes_received: int, frames: int) -> str:

@@ -35,7 +35,6 @@ from gateway.live.control_verbs import (
 from gateway.live.kept_files import PlanFiles, TimestampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.other_gateways import conflicts, identity_verb, log_other_gateways
-from gateway.live.part import Run
 from gateway.live.pty_port import PtyPort
 from gateway.live.recorder import Recorder
 from gateway.live.recording_budget import RecordingBudget
@@ -122,7 +121,8 @@ class Daemon:
             self._on_frame,
             self.now_us,
             on_foreign=self._record_foreign,
-            on_run=self._record_run,
+            # No secret is in a run: messages with a target are not forwarded in runs.
+            on_run=lambda run: self._recorder.run(run),
             on_gone=self._on_gone,
             on_alert=self._alert,
             signer=self._pipeline.signer,
@@ -401,10 +401,6 @@ class Daemon:
         """Return the states of all vehicles, brought up to date."""
         self._vehicles.update(self._hub.newest_frames(), self._hub.streams())
         return self._vehicles
-
-    def _record_run(self, run: Run) -> None:
-        # No secret is among them: messages with a target are not forwarded in runs.
-        self._recorder.run(run)
 
     def _record(self, frame: bytes) -> None:
         """Record a frame of another sender, unless it contains a key or a password."""

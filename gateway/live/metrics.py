@@ -170,7 +170,7 @@ def counter(name: str, text: str, labels: Labels, samples: Samples) -> Metric:
 
 def _filled(family: Any, samples: Samples) -> Metric:
     for labels, value in samples:
-        if value is not None and not math.isnan(value):
+        if value is not None and math.isfinite(value):
             family.add_metric(labels, value)
     filled: Metric = family
     return filled

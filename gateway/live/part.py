@@ -1,10 +1,11 @@
 """One part of a recording: the data buffered for its files until it is written."""
 
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import Final
 
 import msgspec
 
+from gateway.hub.forwarding import Forwarding
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
 from gateway.recordings.recorded_clock import STEP_US, Stamper
 from gateway.recordings.table import TableHeader, TableNote, encode_head, encode_line
@@ -14,20 +15,6 @@ from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatu
 PENDING_LIMIT: Final = 16 << 20
 """Maximum bytes that wait for a slow disk: minutes of telemetry. More is dropped."""
 TLOG: Final = ".tlog"
-
-
-class Run(Protocol):
-    """Frames that the hub has forwarded together."""
-
-    @property
-    def run_length(self) -> int:
-        """The number of frames."""
-
-    def run(self) -> list[bytes]:
-        """Return the frames."""
-
-    def records(self, first_us: int, step_us: int) -> bytes:
-        """Return the frames as in a tlog, with the time of the first and the step between two."""
 
 
 @dataclass(slots=True)
@@ -53,8 +40,10 @@ class Part:
         self.pending: dict[str, bytearray] = {}
         self.size = 0
         """Bytes added, including those dropped beyond the limit."""
-        self._tables: dict[int, _Table] = {}
-        self._introduced: set[int] = set()
+        self.tables: dict[int, _Table] = {}
+        """The prepared tables, by vehicle id."""
+        self.introduced: set[int] = set()
+        """Aircraft whose introduction is in the tlog."""
 
     def add(self, ending: str, data: bytes) -> None:
         """Buffer bytes for one file, unless too many wait already."""
@@ -65,7 +54,7 @@ class Part:
     def take(self) -> dict[str, bytes]:
         """Return the buffered bytes and clear the buffer."""
         heads = {}
-        for vehicle_id, table in self._tables.items():
+        for vehicle_id, table in self.tables.items():
             if table.begun and not table.has_head:
                 table.has_head = True
                 heads[table_ending(vehicle_id)] = self._head_of(table)
@@ -77,52 +66,42 @@ class Part:
         """Buffer a MAVLink frame for the tlog."""
         self.add(TLOG, encode_record(self.stamper.stamp(now_us), frame))
 
-    def add_run(self, run: Run, now_us: int) -> None:
-        """Buffer frames that arrived together for the tlog."""
+    def add_run(self, run: Forwarding, now_us: int) -> None:
+        """Buffer frames that the hub has forwarded together for the tlog."""
         first_us = self.stamper.stamp_several(now_us, run.run_length)
         self.add(TLOG, run.records(first_us, STEP_US))
 
-    def introduces(self, vehicle_id: int) -> bool:
-        """Return whether an aircraft is new in this part, and note that it no longer is."""
-        is_new = vehicle_id not in self._introduced
-        self._introduced.add(vehicle_id)
-        return is_new
-
-    def has_table(self, vehicle_id: int) -> bool:
-        """Return whether the table of an aircraft was prepared."""
-        return vehicle_id in self._tables
-
     def prepare_table(self, header: TableHeader, state: FusionState | None = None) -> None:
         """Set the head of an aircraft's table."""
-        self._tables[header.vehicle_id] = _Table(header, state)
+        self.tables[header.vehicle_id] = _Table(header, state)
 
     def add_flight(
         self, vehicle_id: int, record: BaroRaw | GpsFix | FusedSample | NodeStatus
     ) -> None:
         """Buffer a record of an aircraft, for a table that was prepared."""
-        if isinstance(record, NodeStatus):
+        table = self.tables[vehicle_id]
+        if not isinstance(record, NodeStatus):
+            self._write(table, table.rows.add(record))
+        elif table.begun:
             # A status does not begin a table: that begins with a row.
-            if self._tables[vehicle_id].begun:
-                self.add(table_ending(vehicle_id), encode_line(record).encode())
-            return
-        self._write(self._tables[vehicle_id], self._tables[vehicle_id].rows.add(record))
+            self.add(table_ending(vehicle_id), encode_line(record).encode())
 
     def change_settings(self, header: TableHeader) -> None:
         """Note in a prepared table that the following rows are fused with other settings."""
-        table = self._tables[header.vehicle_id]
+        table = self.tables[header.vehicle_id]
         table.begun = True
         self._write(table, table.rows.flush())
         self.add(table_ending(header.vehicle_id), encode_line(header).encode())
 
     def add_note(self, note: TableNote) -> None:
         """Add a note to every table that has begun."""
-        for vehicle_id, table in self._tables.items():
+        for vehicle_id, table in self.tables.items():
             if table.begun:
                 self.add(table_ending(vehicle_id), encode_line(note).encode())
 
     def flush_rows(self) -> None:
         """Buffer the records that still wait for the row of an IMU sample."""
-        for table in self._tables.values():
+        for table in self.tables.values():
             self._write(table, table.rows.flush())
 
     def _head_of(self, table: _Table) -> bytes:

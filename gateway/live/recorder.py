@@ -24,8 +24,9 @@ from typing import Final
 
 import msgspec
 
+from gateway.hub.forwarding import Forwarding
 from gateway.live.kept_files import begin_worker, done_by
-from gateway.live.part import PENDING_LIMIT, Part, Run
+from gateway.live.part import PENDING_LIMIT, Part
 from gateway.live.part_files import DiskState, PartFiles, close_behind, free_bytes_near, reason_of
 from gateway.live.restamper import Restamper, clear_copies
 from gateway.live.session import (
@@ -229,9 +230,8 @@ class Recorder:
 
     def frame(self, frame: bytes) -> None:
         """Record a MAVLink frame that was sent or received."""
-        now_us = self._clock()
         for part in self._parts() if self._settings.tlog else ():
-            part.add_frame(frame, now_us)
+            part.add_frame(frame, self._clock())
 
     @property
     def takes_frames(self) -> bool:
@@ -248,11 +248,10 @@ class Recorder:
         self._present = part
         self._on_change()
 
-    def run(self, run: Run) -> None:
+    def run(self, run: Forwarding) -> None:
         """Record frames that the hub has forwarded together."""
-        now_us = self._clock()
         for part in self._parts() if self._settings.tlog else ():
-            part.add_run(run, now_us)
+            part.add_run(run, self._clock())
 
     def flight(self, record: BaroRaw | GpsFix | FusedSample | NodeStatus) -> None:
         """Record a sample of the estimator, or the resulting state."""
@@ -263,11 +262,12 @@ class Recorder:
             if self._gps_time and isinstance(record, GpsFix) and record.utc_us is not None:
                 self._civil.update_gps(vehicle_id, record.utc_us, record.time_us)
         for part in self._parts():
-            if self._settings.tlog and part.introduces(vehicle_id):
+            if self._settings.tlog and vehicle_id not in part.introduced:
+                part.introduced.add(vehicle_id)
                 for frame in self._introduction_of(vehicle_id):
                     part.add_frame(frame, self._clock())
             if self._settings.table:
-                if not part.has_table(vehicle_id):
+                if vehicle_id not in part.tables:
                     part.prepare_table(self._header(vehicle_id, part))
                 part.add_flight(vehicle_id, record)
         self._seen.add(vehicle_id)
@@ -275,7 +275,7 @@ class Recorder:
     def settings_changed(self, vehicle_id: int) -> None:
         """Note that the following samples are fused with other settings, in a new header line."""
         for part in self._parts():
-            if part.has_table(vehicle_id):
+            if vehicle_id in part.tables:
                 part.change_settings(self._header(vehicle_id, part))
 
     def _parts(self) -> list[Part]:

@@ -104,53 +104,18 @@ LINKS: Final[dict[str, Callable[[HubContext, int, Endpoint], Client]]] = {
 }
 
 
-class _SourceLink(ByteLink):
-    """The transport of a source, which reports what happens to its port."""
-
-    read_bytes = PART
-
-    def __init__(self, hub: HubContext, endpoint: Endpoint, transport: str, port: "SourcePort"):
-        super().__init__(hub)
-        self._port = port
-        context = cast("HubContext", self)
-        if transport == "tcp-listen":
-            self.link = _NewestClient(context, endpoint)
-            return
-        self.link = link = LINKS[transport](context, hub.new_client_id(), endpoint)
-        if isinstance(link, UdpReceiver):
-            link.split = port.parts_of
-        self.appear(link)
-
-    def take(self, data: bytes, now_us: int) -> None:  # noqa: ARG002
-        """Process received bytes."""
-        self._port.feed(data)
-
-    def greet(self, client_id: int) -> None:  # noqa: ARG002
-        """Log that it is open, so that its next fault is logged again."""
-        self._port.opened()
-
-    def vanish(self, client: Client) -> None:
-        """Note that the client of a listening port has gone."""
-        super().vanish(client)
-        is_replaced = isinstance(self.link, _NewestClient) and self.link.is_replacing
-        self._port.lost(REPLACED if is_replaced else GONE)
-
-    def tick(self, now_us: int) -> None:
-        """Open the transport if it is closed, and note why it is not open."""
-        super().tick(now_us)
-        if isinstance(self.link, TcpListener):
-            if self.reason or not self.peers:
-                self._port.lost(self.reason or NO_CLIENT)
-        elif self.state != "open":
-            self._port.lost(self.reason or NOT_OPEN.get(self.state, ""))
-
-
-class SourcePort:
+class SourcePort(ByteLink):
     """Keep one source open, and pass on its bytes.
 
     `on_bytes` is called with the source and every chunk that arrives. The hub's limits apply to
     sources too.
     """
+
+    read_bytes = PART
+    _timer: asyncio.TimerHandle | None = None
+    _task: asyncio.Task[None] | None = None
+    _complaint = ""
+    _is_closed = False
 
     def __init__(
         self,
@@ -158,14 +123,9 @@ class SourcePort:
         on_bytes: Callable[[SourceInput, bytes], None],
         hub: HubContext,
     ) -> None:
+        super().__init__(hub)
         self._source = source
         self._on_bytes = on_bytes
-        self._hub = hub
-        self._link: _SourceLink | None = None
-        self._timer: asyncio.TimerHandle | None = None
-        self._task: asyncio.Task[None] | None = None
-        self._complaint = ""
-        self._is_closed = False
         self.token = ""
         """Token for pushing content; empty if this source accepts none."""
         if source.url.transport == "push":
@@ -173,36 +133,61 @@ class SourcePort:
 
     def start(self) -> None:
         """Begin to open it; needs a running event loop."""
-        url = self._source.url
-        if url.endpoint is None or url.transport == "poll":
+        endpoint, transport = self._source.url.endpoint, self._source.url.transport
+        if transport == "push":
+            self._source.lost("nothing was posted yet")
+        elif endpoint is None or transport == "poll":
             self._task = asyncio.get_running_loop().create_task(self._run())
-            return
-        self._link = _SourceLink(self._hub, url.endpoint, url.transport, self)
-        self._tick()
+        else:
+            context = cast("HubContext", self)
+            if transport == "tcp-listen":
+                self.link = _NewestClient(context, endpoint)
+            else:
+                self.link = link = LINKS[transport](context, self._hub.new_client_id(), endpoint)
+                if isinstance(link, UdpReceiver):
+                    link.split = self.parts_of
+                self.appear(link)
+            self._tick()
 
     def _tick(self) -> None:
-        assert self._link is not None
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
-        self._link.tick(self._hub.now_us())
+        self.tick(self._hub.now_us())
+
+    def tick(self, now_us: int) -> None:
+        """Open the transport if it is closed, and note why it is not open."""
+        super().tick(now_us)
+        if isinstance(self.link, TcpListener):
+            if self.reason or not self.peers:
+                self.lost(self.reason or NO_CLIENT)
+        elif self.state != "open":
+            self.lost(self.reason or NOT_OPEN.get(self.state, ""))
+
+    def take(self, data: bytes, now_us: int) -> None:  # noqa: ARG002
+        """Process received bytes."""
+        self.feed(data)
+
+    def greet(self, client_id: int) -> None:  # noqa: ARG002
+        """Log that it is open, so that its next fault is logged again."""
+        self.opened()
+
+    def vanish(self, client: Client) -> None:
+        """Note that the client of a listening port has gone."""
+        super().vanish(client)
+        is_replaced = isinstance(self.link, _NewestClient) and self.link.is_replacing
+        self.lost(REPLACED if is_replaced else GONE)
 
     def close(self) -> None:
         """Close it without another attempt to open it."""
         self._is_closed = True
         if self._timer is not None:
             self._timer.cancel()
-        if self._link is not None:
-            self._link.close()
+            super().close()
         if self._task is not None:
             self._task.cancel()
 
     async def _run(self) -> None:
         url = self._source.url
-        read = {
-            "poll": self._poll,
-            "push": self._push,
-            "stdin": self._stdin,
-            "file": self._file,
-        }[url.transport]
+        read = {"poll": self._poll, "stdin": self._stdin, "file": self._file}[url.transport]
         while True:
             try:
                 await read()
@@ -271,10 +256,6 @@ class SourcePort:
                 self.opened()
             self.feed(answer.replace(b"\n", b" ") + b"\n")
             await asyncio.sleep(POLL_S)
-
-    async def _push(self) -> None:
-        self._source.lost("nothing was posted yet")
-        await asyncio.get_running_loop().create_future()
 
     @property
     def name(self) -> str:

@@ -1,12 +1,11 @@
 """Metrics of every vehicle of the hub, foreign ones included, from their newest MAVLink."""
 
-import math
 from collections.abc import Callable, Iterator
 from typing import Final
 
 from prometheus_client.core import Metric
 
-from gateway.live.metrics import Labels, counter, gauge
+from gateway.live.metrics import counter, gauge
 from gateway.live.vehicle_watch import VehicleWatch
 from gateway.records import NAN
 from gateway.units import US_PER_S
@@ -42,23 +41,12 @@ def system_families(watch: VehicleWatch, now_us: int) -> Iterator[Metric]:
     """Yield the metrics of the systems that were received recently."""
     present = watch.present(now_us)
     for name, (text, value_of) in GAUGES.items():
-        samples = [
-            (_label(system_id), _known(value_of(state, now_us)))
-            for system_id, state in present.items()
-        ]
+        samples = [((str(key),), value_of(state, now_us)) for key, state in present.items()]
         yield gauge(f"system_{name}", text, SYSTEM, samples)
-    streams = [(_label(key), watch.streams[key]) for key in present if key in watch.streams]
+    streams = [((str(key),), watch.streams[key]) for key in present if key in watch.streams]
     text = "Frames of the vehicle that were received; copies by a second link are not counted."
-    frames = [(label, float(stream.frames)) for label, stream in streams]
+    frames = [(label, float(stream.count)) for label, stream in streams]
     yield counter("system_frames", text, SYSTEM, frames)
     text = "Frames of the vehicle that were lost on the way here, by their sequence numbers."
     lost = [(label, float(stream.lost)) for label, stream in streams]
     yield counter("system_frames_lost", text, SYSTEM, lost)
-
-
-def _label(system_id: int) -> Labels:
-    return (str(system_id),)
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -29,7 +29,7 @@ MAX_TEXTS: Final = 256
 FLUSH_TIMEOUT_S: Final = 1.0
 """Longest wait at the end for pending output."""
 KEY_BYTES: Final = 64
-_SEQUENCE: Final = re.compile(r"\x1b(?:[\[O]([0-9;]*)([A-Za-z~]))?")
+_KEY: Final = re.compile(r"\x1b(?:[\[O][0-9;]*([A-Za-z~]))?|(.)", re.DOTALL)
 _NAMES: Final = {"A": "up", "B": "down", "C": "right", "D": "left", "H": "home", "F": "end"}
 
 
@@ -152,19 +152,13 @@ def _has_file(stream: TextIO) -> bool:
 
 def keys_of(text: str) -> Iterator[str]:
     """Yield the keys that a terminal sent: printable characters, `space`, `up`, `home` and such."""
-    at = 0
-    while at < len(text):
-        sequence = _SEQUENCE.match(text, at)
-        if sequence is not None:
-            at = sequence.end()
-            if name := _NAMES.get(sequence[2] or ""):
-                yield name
-            continue
-        if text[at] == " ":
+    for sequence, letter in _KEY.findall(text):
+        if letter == " ":
             yield "space"
-        elif text[at].isprintable():
-            yield text[at]
-        at += 1
+        elif letter.isprintable() and letter:
+            yield letter
+        elif sequence in _NAMES:
+            yield _NAMES[sequence]
 
 
 class Keyboard:

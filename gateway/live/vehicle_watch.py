@@ -8,7 +8,7 @@ numbers; with several links to one system, only frames that all of them lost cou
 import math
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -35,19 +35,12 @@ RECEIVER: Final = "receiver"
 """Link of a vehicle of the receiver's boards."""
 
 
-class FrameCounter(NamedTuple):
-    """Frame counters of the vehicle of a system."""
-
-    frames: int
-    lost: int
-
-
 class VehicleWatch:
     """The states of all vehicles, fed with the frames of the hub."""
 
     def __init__(self) -> None:
-        self.streams: dict[int, FrameCounter] = {}
-        """Counters of received frames by system id."""
+        self.streams: dict[int, FrameStream] = {}
+        """Received frames by system id."""
         self._vehicles = NewestVehicles()
         self._decoded_us: dict[tuple[int, int], int] = {}
         """When each message of each system was last decoded."""
@@ -59,7 +52,7 @@ class VehicleWatch:
         for data, time_us in newest:
             self.feed(frame_of(data), time_us)
         self.streams = {
-            origin[0]: FrameCounter(stream.count, stream.lost)
+            origin[0]: stream
             for origin, stream in streams.items()
             if self._vehicles.components.is_known(*origin)
         }
@@ -105,17 +98,13 @@ class VehicleWatch:
         links = {system_id: client.name for client in clients for system_id, _ in client.systems}
         links |= {system_id: sources.get(system_id, RECEIVER) for system_id in own}
         return tuple(
-            self._row(
-                (system_id, state),
-                now_us,
-                own.get(system_id) or state.mode(),
-                links.get(system_id, ""),
-            )
+            self._row(system_id, state, now_us, own.get(system_id), links.get(system_id, ""))
             for system_id, state in self.present(now_us).items()
         )
 
-    def _row(self, known: tuple[int, NewestState], now_us: int, mode: str, link: str) -> VehicleRow:
-        system_id, state = known
+    def _row(
+        self, system_id: int, state: NewestState, now_us: int, mode: str | None, link: str
+    ) -> VehicleRow:
         at, fix = state.valid_position(now_us), state.fix()
         volts, percent = state.battery()
         stream = self.streams.get(system_id)
@@ -123,7 +112,7 @@ class VehicleWatch:
         return VehicleRow(
             system_id=system_id,
             kind="" if kind is None else kind.name.removeprefix("MAV_TYPE_").lower(),
-            mode=mode,
+            mode=mode or state.mode(),
             armed=state.is_armed(),
             lat_deg=None if at is None else at.lat_deg,
             lon_deg=None if at is None else at.lon_deg,
@@ -133,7 +122,7 @@ class VehicleWatch:
             battery_percent=_known(percent),
             link=link,
             age_s=state.age_us(now_us, *state.heard_us) / US_PER_S,
-            loss=stream.lost / (stream.lost + stream.frames) if stream else None,
+            loss=stream.lost / (stream.lost + stream.count) if stream else None,
         )
 
 
