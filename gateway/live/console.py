@@ -8,7 +8,7 @@ aircraft. With too few rows the end is cut off; so the message rates come last.
 import logging
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 from msgspec.structs import asdict
@@ -22,18 +22,15 @@ from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, ListenerStats, name_with_remote
 from gateway.printable import UNKNOWN, PrintableFormatter, figure, receiver_state, source_state
 from gateway.records import (
-    GpsFix,
     LinkReport,
     NavFlags,
     NavState,
     NodeId,
-    NodeLink,
     NodeStatus,
-    RadioSignal,
     board_name,
     channel_name,
 )
-from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot
+from gateway.status import AircraftStatus, RecorderStatus, Snapshot
 from gateway.units import MV_PER_V, US_PER_S, counted
 from gateway.vehicle_row import VEHICLE_HEADS, vehicle_cells
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
@@ -53,6 +50,7 @@ FIX_NAMES: Final = ("none", "dead reckoning", "2D", "3D", "3D", "time only")
 MB: Final = 1e6
 GB: Final = 1e9
 
+Cell = str | Text
 FLAG_WORDS: Final = (
     (NavFlags.ATTITUDE_VALID, "attitude", "green"),
     (NavFlags.HEADING_VALID, "heading", "green"),
@@ -103,7 +101,8 @@ class LiveView:
         status = {one.vehicle_id: one for one in snapshot.aircraft}
         for vehicle_id, state in snapshot.states:
             flying += [Text(), _aircraft(vehicle_id, state, status.get(vehicle_id)), _flags(state)]
-        flying += [Text(), _vehicles(snapshot)] if snapshot.vehicles else []
+        if snapshot.vehicles:
+            flying += [Text(), _Grid(VEHICLE_HEADS, map(vehicle_cells, snapshot.vehicles))]
         if not snapshot.states and not snapshot.vehicles:
             flying.append(Text("No aircraft yet.", style="dim"))
         others: list[RenderableType] = [_clients(snapshot)]
@@ -139,13 +138,8 @@ class _Grid:
     The first column has the table's name as its heading, and is repeated in each of them.
     """
 
-    def __init__(self, *heads: str) -> None:
-        self._heads = heads
-        self._rows: list[tuple[str | Text, ...]] = []
-
-    def add_row(self, *cells: str | Text) -> None:
-        """Add a row, one cell per column."""
-        self._rows.append(cells)
+    def __init__(self, heads: Iterable[str], rows: Iterable[Iterable[Cell]]) -> None:
+        self._heads, self._rows = [*heads], [[*row] for row in rows]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         widths = [
@@ -212,41 +206,33 @@ def _nodes(report: LinkReport, boards: Mapping[NodeId, NodeStatus]) -> _Grid:
 
     A radio that measures its signal has two more columns.
     """
-    signals = any(node.signal is not None for node in report.nodes)
-    heads = ("Hz", "lost %", "age s", *(("dBm", "SNR") if signals else ()))
-    boards_heads = ("V", "bus", "TX failed", "retries", "overruns", "restarts", "fw")
-    grid = _Grid("board", *heads, *boards_heads)
+    rows: list[dict[str, Cell]] = []
+    pipes = () if report.receiver is None else report.receiver.pipes
+    has_signals = any(node.signal is not None for node in report.nodes)
     for node in report.nodes:
-        pipes = report.receiver.pipes if report.receiver is not None else ()
-        overruns = str(pipes[node.pipe].overruns) if node.pipe < len(pipes) else UNKNOWN
-        total, board = node.received + node.lost, boards.get(node.node)
-        grid.add_row(
-            board_name(node.node, board.sensors_present if board else 0),
-            f"{node.rate_hz:.0f}",
-            figure(100 * node.lost / total if total else None, ".2f"),
-            _age(report.time_us, node.last_time_us),
-            *(_signal_cells(node.signal) if signals else ()),
-            *_board_cells(board, overruns, node),
-        )
-    return grid
+        total, board, signal = node.received + node.lost, boards.get(node.node), node.signal
+        signals = {"dBm": _known(signal, "rssi_dbm"), "SNR": _known(signal, "snr_db")}
+        row: dict[str, Cell] = {
+            "board": board_name(node.node, board.sensors_present if board else 0),
+            "Hz": f"{node.rate_hz:.0f}",
+            "lost %": figure(100 * node.lost / total if total else None, ".2f"),
+            "age s": _age(report.time_us, node.last_time_us),
+            **(signals if has_signals else {}),
+            "V": figure(board.supply_mv / MV_PER_V if board and board.supply_mv else None, ".2f"),
+            "bus": _known(board, "bus_errors"),
+            "TX failed": _known(board, "radio_failed"),
+            "retries": _known(board, "radio_retries"),
+            "overruns": _known(pipes[node.pipe] if node.pipe < len(pipes) else None, "overruns"),
+            "restarts": str(node.restarts),
+            "fw": ".".join(map(str, board.firmware_version)) if board else UNKNOWN,
+        }
+        rows.append(row)
+    return _Grid(rows[0], (row.values() for row in rows))
 
 
-def _signal_cells(signal: RadioSignal | None) -> tuple[str, str]:
-    return (UNKNOWN, UNKNOWN) if signal is None else (f"{signal.rssi_dbm}", f"{signal.snr_db:.0f}")
-
-
-def _board_cells(board: NodeStatus | None, overruns: str, node: NodeLink) -> tuple[str, ...]:
-    if board is None:
-        return (*(UNKNOWN,) * 4, overruns, str(node.restarts), UNKNOWN)
-    return (
-        figure(board.supply_mv / MV_PER_V if board.supply_mv else None, ".2f"),
-        str(board.bus_errors),
-        str(board.radio_failed),
-        str(board.radio_retries),
-        overruns,
-        str(node.restarts),
-        ".".join(map(str, board.firmware_version)),
-    )
+def _known(of: object, name: str, form: str = ".0f") -> str:
+    """Return an attribute; a dash if it is unknown, or what has it."""
+    return figure(getattr(of, name, None), form)
 
 
 def _age(now_us: int, then_us: int) -> Text:
@@ -257,50 +243,28 @@ def _age(now_us: int, then_us: int) -> Text:
 def _aircraft(vehicle_id: int, state: NavState, known: AircraftStatus | None) -> _Grid:
     roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
     north, east, down = state.vel_n_mps
-    heads = ("roll°", "pitch°", "yaw°", "latitude°", "longitude°", "AMSL m", "m/s", "climb")
-    fixes = ("fix", "satellites", "±h m", "±v m")
-    grid = _Grid("aircraft", *heads, *fixes, "home m", "home at°", "mark m", "mark at°")
-    grid.add_row(
-        str(vehicle_id),
-        figure(roll, "+.1f"),
-        figure(pitch, "+.1f"),
-        figure(yaw % 360.0, ".1f"),
-        figure(state.lat_deg, ".6f"),
-        figure(state.lon_deg, ".6f"),
-        figure(state.alt_amsl_m, ".1f"),
-        figure(math.hypot(north, east), ".1f"),
-        figure(-down, "+.1f"),
-        *_fix_cells(known.fix if known else None),
-        *_distance_cells(known.home if known else None),
-        *_distance_cells(known.mark if known else None),
-    )
-    return grid
-
-
-def _vehicles(snapshot: Snapshot) -> _Grid:
-    """Show all vehicles of the hub, own and foreign."""
-    grid = _Grid(*VEHICLE_HEADS)
-    for row in snapshot.vehicles:
-        grid.add_row(*vehicle_cells(row))
-    return grid
-
-
-def _fix_cells(fix: GpsFix | None) -> tuple[str | Text, ...]:
-    if fix is None:
-        return (UNKNOWN,) * 4
-    name = FIX_NAMES[fix.fix_type] if fix.fix_ok else FIX_NAMES[0]
-    return (
-        Text(name, style="" if fix.fix_ok else "red"),
-        str(fix.satellites),
-        figure(fix.h_acc_m, ".1f"),
-        figure(fix.v_acc_m, ".1f"),
-    )
-
-
-def _distance_cells(location: RelativeLocation | None) -> tuple[str, str]:
-    if location is None or location.distance_m is None or location.bearing_deg is None:
-        return UNKNOWN, UNKNOWN
-    return figure(location.distance_m, ".0f"), figure(location.bearing_deg, ".0f")
+    fix, home, mark = (known.fix, known.home, known.mark) if known else (None,) * 3
+    name = FIX_NAMES[fix.fix_type if fix.fix_ok else 0] if fix else UNKNOWN
+    row: dict[str, Cell] = {
+        "aircraft": str(vehicle_id),
+        "roll°": figure(roll, "+.1f"),
+        "pitch°": figure(pitch, "+.1f"),
+        "yaw°": figure(yaw % 360.0, ".1f"),
+        "latitude°": figure(state.lat_deg, ".6f"),
+        "longitude°": figure(state.lon_deg, ".6f"),
+        "AMSL m": figure(state.alt_amsl_m, ".1f"),
+        "m/s": figure(math.hypot(north, east), ".1f"),
+        "climb": figure(-down, "+.1f"),
+        "fix": Text(name, style="red" if fix and not fix.fix_ok else ""),
+        "satellites": _known(fix, "satellites"),
+        "±h m": _known(fix, "h_acc_m", ".1f"),
+        "±v m": _known(fix, "v_acc_m", ".1f"),
+        "home m": _known(home, "distance_m"),
+        "home at°": _known(home, "bearing_deg"),
+        "mark m": _known(mark, "distance_m"),
+        "mark at°": _known(mark, "bearing_deg"),
+    }
+    return _Grid(row, [row.values()])
 
 
 def _flags(state: NavState) -> Text:
@@ -311,22 +275,17 @@ def _flags(state: NavState) -> Text:
 def _rates(snapshot: Snapshot, previous: Snapshot) -> Columns:
     span_s = (snapshot.time_us - previous.time_us) / US_PER_S
     before = dict(previous.sent)
-    rates = [
-        (_message_name(key), f"{(count - before.get(key, 0)) / span_s:.1f}" if span_s else UNKNOWN)
-        for key, count in snapshot.sent
-    ]
-    return Columns([f"{name:<{RATE_NAME}}{rate:>6}" for name, rate in rates], padding=(0, 3))
-
-
-def _message_name(message_id: int) -> str:
-    return MESSAGE_NAMES.get(message_id, str(message_id))
+    texts = []
+    for key, count in snapshot.sent:
+        name = MESSAGE_NAMES.get(key, str(key))
+        rate = figure((count - before.get(key, 0)) / span_s if span_s else None, ".1f")
+        texts.append(f"{name:<{RATE_NAME}}{rate:>6}")
+    return Columns(texts, padding=(0, 3))
 
 
 def _clients(snapshot: Snapshot) -> _Grid:
-    table = _Grid("client", "state", "sent", "dropped", "received", "received s ago")
-    for client in snapshot.clients:
-        table.add_row(*_client_cells(client), _since_received(snapshot.time_us, client))
-    return table
+    heads = ("client", "state", "sent", "dropped", "received", "received s ago")
+    return _Grid(heads, (_client_cells(snapshot.time_us, client) for client in snapshot.clients))
 
 
 def _ports(snapshot: Snapshot) -> list[Text]:
@@ -340,16 +299,11 @@ def _troubles(snapshot: Snapshot) -> list[Text]:
     return [Text(f"{one.name}: {one.reason}", style="red") for one in found if one.reason] + notes
 
 
-def _client_cells(client: ClientStats) -> tuple[str, ...]:
-    figures = (client.sent, client.dropped, client.received)
+def _client_cells(now_us: int, client: ClientStats) -> tuple[str, ...]:
+    age_s = None if client.heard_us is None else max(0, now_us - client.heard_us) / US_PER_S
     return (
         name_with_remote(client.name, client.remote),
         client.state,
-        *(str(figure) for figure in figures),
+        *map(str, (client.sent, client.dropped, client.received)),
+        "never" if age_s is None else f"{age_s:.1f}",
     )
-
-
-def _since_received(now_us: int, client: ClientStats) -> str:
-    if client.heard_us is None:
-        return "never"
-    return f"{max(0, now_us - client.heard_us) / US_PER_S:.1f}"
