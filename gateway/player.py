@@ -25,7 +25,7 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, time_us_of
 from gateway.recordings.opening import PlayedFlight
 from gateway.recordings.play import Player
-from gateway.recordings.workshop.trimming import NOTHING_WITHIN
+from gateway.recordings.workshop.selection import NOTHING_WITHIN
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle

@@ -6,7 +6,7 @@ here, and with the reference if there is one.
 """
 
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -27,7 +27,6 @@ from gateway.analysis.metrics import (
     rotation_error,
     total_error_rad,
 )
-from gateway.estimation.reference import is_usable
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
 from gateway.units import US_PER_S
@@ -77,21 +76,18 @@ def thin(flight: Flight, interval_s: float) -> BoolArray:
     last_us: int | None = None
     # A tolerance of a tenth of the interval, for jitter of the arrival.
     least_us = round(interval_s * US_PER_S * 0.9)
-    for k, fix in enumerate(flight.fixes):
-        if not is_usable(fix, flight.fusion.estimation.reference):
-            continue
-        if last_us is not None and 0 <= fix.time_us - last_us < least_us:
+    for k in np.flatnonzero(flight.usable).tolist():
+        time_us = flight.fixes[k].time_us
+        if last_us is not None and 0 <= time_us - last_us < least_us:
             keep[k] = False
         else:
-            last_us = fix.time_us
+            last_us = time_us
     return keep
 
 
 def withhold(flight: Flight, every: int) -> BoolArray:
     """Select all fixes except every n-th usable one."""
-    usable = np.array(
-        [is_usable(fix, flight.fusion.estimation.reference) for fix in flight.fixes], np.bool_
-    )
+    usable = flight.usable
     return np.asarray(~(usable & (np.cumsum(usable) % every == 0)))
 
 
@@ -100,18 +96,12 @@ def withhold_spans(flight: Flight, span_s: float, every_s: float) -> tuple[BoolA
 
     A span without a fix near its end, as in an outage or at the end of the flight, has no last one.
     """
-    keep = np.ones(len(flight.fixes), np.bool_)
-    ends = np.zeros(len(flight.fixes), np.bool_)
-    for k, fix in enumerate(flight.fixes):
-        if not is_usable(fix, flight.fusion.estimation.reference):
-            continue
-        phase_s = (fix.time_us - int(flight.time_us[0])) / US_PER_S % every_s
-        keep[k] = phase_s < every_s - span_s
-        ends[k] = phase_s >= every_s - ENDING * span_s
+    usable, times_us = flight.usable, np.array([fix.time_us for fix in flight.fixes], np.int64)
+    phase_s = flight.seconds(times_us) % every_s
+    keep = ~usable | (phase_s < every_s - span_s)
+    ends = usable & (phase_s >= every_s - ENDING * span_s)
     # Of several fixes at the end of a span, only the last one counts.
-    rows = np.flatnonzero(ends)
-    late = [row for row, following in pairwise(rows) if following == row + 1]
-    ends[late] = False
+    ends[:-1] &= ~ends[1:]
     return keep, ends
 
 
@@ -138,37 +128,36 @@ def paper_table() -> "pd.DataFrame":
     return pd.DataFrame(PAPER_ERRORS, columns=["alpha", "beta", "north_m", "east_m"])
 
 
-@dataclass(frozen=True, slots=True)
-class Judge:
-    """The fixes used to fuse and to score the tracks of one flight."""
+@dataclass(frozen=True)
+class SplitFlight:
+    """A flight with the fixes to fuse only, and with those to compare with only."""
 
     fused: Flight
-    """The flight with only the fixes to be fused."""
-    interpolated: FlightTrack
-    """Straight lines between the fused fixes."""
-    held_flight: Flight
-    """The flight with only the withheld fixes."""
-    held: Fixes
-    """The withheld fixes as arrays; may be empty."""
+    held: Flight
+
+    @classmethod
+    def by(cls, flight: Flight, keep: BoolArray) -> "SplitFlight":
+        """Split a flight by which fixes are fused."""
+        return cls(flight.with_fixes(keep), flight.with_fixes(~keep))
+
+    @cached_property
+    def interpolated(self) -> FlightTrack:
+        """Straight lines between the fused fixes."""
+        return interpolate(fixes_of(self.fused), self.fused.time_us)
+
+    @cached_property
+    def held_fixes(self) -> Fixes:
+        """The withheld fixes; may be empty."""
+        return fixes_of(self.held)
 
 
-def make_judge(flight: Flight, keep: BoolArray) -> Judge:
-    """Split the fixes of a flight into those to fuse and those to compare with."""
-    return judge_of(flight.with_fixes(keep), flight.with_fixes(~keep))
-
-
-def judge_of(fused: Flight, held: Flight) -> Judge:
-    """Build a judge from a flight with the fused fixes and one with the withheld fixes."""
-    return Judge(fused, interpolate(fixes_of(fused), fused.time_us), held, fixes_of(held))
-
-
-def score(track: FlightTrack, judge: Judge) -> dict[str, float]:
+def score(track: FlightTrack, split: SplitFlight) -> dict[str, float]:
     """Score one track; NaN if there is nothing to compare with."""
-    flight = judge.fused
-    to_gps = position_error_m(track, judge.interpolated)[flight.scored]
+    flight, held = split.fused, split.held_fixes
+    to_gps = position_error_m(track, split.interpolated)[flight.scored]
     # Only withheld fixes during scored samples.
-    nearest = np.searchsorted(flight.time_us, judge.held.valid_us).clip(0, len(flight.time_us) - 1)
-    to_held = error_at_fixes_m(track, judge.held)[flight.scored[nearest]]
+    nearest = np.searchsorted(flight.time_us, held.valid_us).clip(0, len(flight.time_us) - 1)
+    to_held = error_at_fixes_m(track, held)[flight.scored[nearest]]
     found = {
         "north_m": mean_abs(to_gps[:, 0]),
         "east_m": mean_abs(to_gps[:, 1]),

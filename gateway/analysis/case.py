@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from gateway.analysis.blending import Judge, judge_of, make_judge, score, withhold, withhold_spans
+from gateway.analysis.blending import SplitFlight, score, withhold, withhold_spans
 from gateway.analysis.flight import (
     Fixes,
     Flight,
@@ -122,8 +122,7 @@ def summarise(case: Case) -> dict[str, float]:
     filtering = case.fusion.estimation.paper
     smooth = apply(filtering.accel_filter, filtering, flight.rate_hz, flight.imu.accel_b_mps2)
     shaking = flight.imu.accel_b_mps2 - smooth
-    found = {
-        **recorded_summary(case.pilot),
+    found = recorded_summary(case.pilot) | {
         "IMU samples a second": flight.rate_hz,
         "usable GPS fixes": float(len(case.fixes)),
         "longest time without a fix, s": greatest(gap_s),
@@ -148,7 +147,8 @@ def _known(value: float | None) -> float:
 
 def withheld_error_m(case: Case, estimator: str) -> float:
     """Fuse without every n-th fix; return the horizontal RMS error at those fixes."""
-    return _held_m(case, estimator, make_judge(case.flight, withhold(case.flight, HOLD_OUT)))
+    split = SplitFlight.by(case.flight, withhold(case.flight, HOLD_OUT))
+    return _held_m(case, estimator, split)
 
 
 def outage_error_m(case: Case, estimator: str) -> float:
@@ -160,15 +160,16 @@ def outage_error_m(case: Case, estimator: str) -> float:
     keep, ends = withhold_spans(flight, OUTAGE_S, OUTAGE_EVERY_S)
     if not ends.any():
         return float("nan")
-    return _held_m(case, estimator, judge_of(flight.with_fixes(keep), flight.with_fixes(ends)))
+    split = SplitFlight(flight.with_fixes(keep), flight.with_fixes(ends))
+    return _held_m(case, estimator, split)
 
 
-def _held_m(case: Case, estimator: str, judge: Judge) -> float:
+def _held_m(case: Case, estimator: str, split: SplitFlight) -> float:
     if estimator == SMOOTHED:
-        track, _ = smooth_track(judge.fused, case.fusion)
+        track, _ = smooth_track(split.fused, case.fusion)
     else:
-        track = fuse_track(judge.fused, with_estimator(case.fusion, estimator))
-    return score(track, judge)["held_m"]
+        track = fuse_track(split.fused, with_estimator(case.fusion, estimator))
+    return score(track, split)["held_m"]
 
 
 def changed_settings(a: FusionSettings, b: FusionSettings) -> list[tuple[str, object, object]]:

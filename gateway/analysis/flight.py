@@ -4,9 +4,9 @@ Flights from all sources have the same form: the samples of a recording in the o
 were processed, on the gateway clock.
 """
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import Final
 
@@ -109,6 +109,12 @@ class Flight:
         return [record for _, record in self.samples.aiding if isinstance(record, GpsFix)]
 
     @property
+    def usable(self) -> BoolArray:
+        """Which of the fixes an estimator uses."""
+        reference = self.fusion.estimation.reference
+        return np.array([is_usable(fix, reference) for fix in self.fixes], np.bool_)
+
+    @property
     def baro(self) -> tuple[IntArray, FloatArray]:
         """Times in µs and standard-atmosphere heights in m of the barometer samples."""
         found = [record for _, record in self.samples.aiding if isinstance(record, BaroSample)]
@@ -165,20 +171,13 @@ class Fixes:
         return len(self.arrival_us)
 
 
-def max_speed_mps(flight: Flight) -> float:
-    """Return the greatest ground speed of the usable fixes; 0 without any."""
-    speeds = (math.hypot(*fix.vel_n_mps[:2]) for fix in flight.fixes if fix.fix_ok)
-    return max((speed for speed in speeds if math.isfinite(speed)), default=0.0)
-
-
 def fixes_of(flight: Flight) -> Fixes:
     """Return the fixes that an estimator uses."""
-    reference = flight.fusion.estimation.reference
-    used = [fix for fix in flight.fixes if is_usable(fix, reference)]
+    used = [*compress(flight.fixes, flight.usable)]
     arrival = np.array([fix.time_us for fix in used], np.int64)
     return Fixes(
         arrival_us=arrival,
-        valid_us=arrival - round(reference.gps_latency_s * US_PER_S),
+        valid_us=arrival - round(flight.latency_s * US_PER_S),
         lat_deg=np.array([fix.lat_dege7 for fix in used]) * DEG_PER_DEGE7,
         lon_deg=np.array([fix.lon_dege7 for fix in used]) * DEG_PER_DEGE7,
         alt_amsl_m=np.array([fix.alt_amsl_m for fix in used], np.float64),
@@ -250,23 +249,22 @@ def flight_of_blocks(
             node_time_us=raw[:, 0].astype(np.int64),
             mag_uncalibrated_b_ut=turned.apply_all(new_field_ut(raw[:, 1:], samples.imu.flags)),
         )
-    recorded = np.concatenate(states)
-    if not len(recorded):
-        return flight
-    return replace(flight, recorded=at_times(_track_of_cells(recorded), flight.time_us))
+    return replace(flight, recorded=_recorded_states(flight, states))
 
 
 def _settled(flight: Flight) -> BoolArray:
     """Return the samples from the time on when any estimator should have converged."""
-    reference = flight.fusion.estimation.reference
-    first_us = next((fix.time_us for fix in flight.fixes if is_usable(fix, reference)), None)
-    start_us = int(flight.time_us[0]) if first_us is None else first_us
+    used = compress(flight.fixes, flight.usable)
+    start_us = next((fix.time_us for fix in used), int(flight.time_us[0]))
     return np.asarray(flight.time_us >= start_us + SETTLING_US)
 
 
-def _track_of_cells(cells: FloatArray) -> FlightTrack:
-    """Make a track from the columns `NAV` of a table."""
-    return track_of(cells[:, 0].astype(np.int64), cells[:, 1:])
+def _recorded_states(flight: Flight, cells: Sequence[FloatArray]) -> FlightTrack | None:
+    """Return states from the columns `NAV` of a table at the samples' times; None without any."""
+    states = np.concatenate(cells)
+    if not len(states):
+        return None
+    return at_times(track_of(states[:, 0].astype(np.int64), states[:, 1:]), flight.time_us)
 
 
 def fuse_track(flight: Flight, settings: FusionSettings) -> FlightTrack:
@@ -361,9 +359,9 @@ def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight
     Raises ValueError if the recording contains no states.
     """
     states = [block.cells[has_group(block.cells, NAV)][:, NAV] for block in blocks]
-    if not sum(map(len, states)):
+    track = _recorded_states(flight, states) if states else None
+    if track is None:
         raise ValueError(f"{name}: contains no states to judge by")
-    track = at_times(_track_of_cells(np.concatenate(states)), flight.time_us)
     return replace(
         flight, reference=Reference(track, is_exact=False, description=f"the states in {name}")
     )
@@ -372,8 +370,7 @@ def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight
 def at_times(track: FlightTrack, time_us: IntArray) -> FlightTrack:
     """Return the rows of a track nearest to given times; NaN if none is within `NEAR_US`."""
     after = np.searchsorted(track.time_us, time_us).clip(1, max(len(track.time_us) - 1, 1))
-    before = after - 1
-    after = after.clip(0, len(track.time_us) - 1)
+    before, after = after - 1, after.clip(0, len(track.time_us) - 1)
     late = track.time_us[after] - time_us < time_us - track.time_us[before]
     nearest = np.where(late, after, before)
     near = np.abs(track.time_us[nearest] - time_us) <= NEAR_US

@@ -2,7 +2,6 @@
 
 import math
 import timeit
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, get_args
 
@@ -17,7 +16,6 @@ from gateway.estimation.vector_filter import (
     filter_step,
     prototype_of,
 )
-from gateway.records import Vec3
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,26 +47,13 @@ def design_lowpass(
     return discretise(*prototype_of(kind, ripple_db), cutoff_hz, rate_hz)
 
 
-class VectorFilter:
-    """One filter on three axes, designed for a sample rate in Hz."""
-
-    def __init__(self, design: Callable[[float], Coefficients], rate_hz: float = 100.0) -> None:
-        self._design = design
-        self.retune(rate_hz)
-
-    def retune(self, rate_hz: float) -> None:
-        """Redesign for another sample rate; the filter restarts at the next sample."""
-        self._coefficients = self._design(rate_hz)
-        self.state = [math.nan] * 6
-        """See `filter_step`. Can be read and restored."""
-
-    def step(self, x: Vec3) -> Vec3:
-        """Filter one finite vector."""
-        return filter_step(self._coefficients, self.state, x)
-
-    def run(self, x: FloatArray) -> FloatArray:
-        """Filter an array of shape (n, 3), with the result of n calls of `step`."""
-        return np.array([self.step((v[0], v[1], v[2])) for v in x.tolist()]).reshape(-1, 3)
+def filtered(
+    coefficients: Coefficients, x: FloatArray, state: list[float] | None = None
+) -> FloatArray:
+    """Filter an array of shape (n, 3) sample by sample, as the gateway does; see `filter_step`."""
+    state = [math.nan] * 6 if state is None else state
+    rows = [filter_step(coefficients, state, (v[0], v[1], v[2])) for v in x.tolist()]
+    return np.array(rows).reshape(-1, 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +86,8 @@ def response(kind: Kind, settings: PaperSettings, rate_hz: float) -> Response:
 
 
 def apply(kind: Kind, settings: PaperSettings, rate_hz: float, x: FloatArray) -> FloatArray:
-    """Filter an array of shape (N, 3) in the way the gateway does."""
-    return _low_pass(kind, settings, rate_hz).run(np.where(np.isfinite(x), x, 0.0))
-
-
-def _low_pass(kind: Kind, settings: PaperSettings, rate_hz: float) -> VectorFilter:
-    return VectorFilter(lambda hz: _design(kind, settings, hz), rate_hz)
+    """Filter an array of shape (N, 3) with the low-pass of the settings."""
+    return filtered(_design(kind, settings, rate_hz), np.where(np.isfinite(x), x, 0.0))
 
 
 def _design(kind: Kind, settings: PaperSettings, rate_hz: float) -> Coefficients:
@@ -143,11 +124,9 @@ def _properties(kind: Kind, settings: PaperSettings, rate_hz: float) -> dict[str
 
 def _time_ns(kind: Kind, settings: PaperSettings, rate_hz: float) -> float:
     """Measure the time per sample on three axes, best of several runs."""
-    x = np.zeros((TIMED_SAMPLES, 3))
-    low_pass = _low_pass(kind, settings, rate_hz)
-    low_pass.run(x)
-    seconds = min(timeit.repeat(lambda: low_pass.run(x), number=1, repeat=TIMED_RUNS))
-    return 1e9 / TIMED_SAMPLES * seconds
+    x, coefficients = np.zeros((TIMED_SAMPLES, 3)), _design(kind, settings, rate_hz)
+    seconds = timeit.repeat(lambda: filtered(coefficients, x), number=1, repeat=TIMED_RUNS)
+    return 1e9 / TIMED_SAMPLES * min(seconds)
 
 
 def power_density(x: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:

@@ -7,18 +7,15 @@ fusion and used to score it, so a filter that only copies its GPS, noise include
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 import numpy as np
 
-from gateway.analysis.blending import Judge, judge_of, make_judge, score, thin, withhold
+from gateway.analysis.blending import SplitFlight, score, thin, withhold
 from gateway.analysis.case import ESTIMATORS, setting_keys
 from gateway.analysis.flight import Flight, fuse_track
-from gateway.analysis.processes import forked
 from gateway.printable import UserError
 from gateway.recordings.fuse import FusionSettings
 from gateway.settings import fields_of
@@ -163,14 +160,13 @@ class Contest:
 
     fusion: FusionSettings
     keys: tuple[str, ...]
-    judge: Judge
+    split: SplitFlight
 
 
 def make_contest(
     flight: Flight,
     fusion: FusionSettings,
     keys: Sequence[str],
-    *,
     hold_out: int = 5,
     interval_s: float = 0.0,
 ) -> Contest:
@@ -182,16 +178,16 @@ def make_contest(
         keep = thin(flight, interval_s)
     elif hold_out:
         keep = withhold(flight, hold_out)
-    return Contest(fusion, tuple(keys), make_judge(flight, keep))
+    return Contest(fusion, tuple(keys), SplitFlight.by(flight, keep))
 
 
 def score_of(contest: Contest, fusion: FusionSettings) -> Scores:
     """Fuse the flight with given settings, and score it at the fixes of the contest."""
-    judge = contest.judge
-    if fusion.estimation.reference != judge.fused.fusion.estimation.reference:
+    split = contest.split
+    if fusion.estimation.reference != split.fused.fusion.estimation.reference:
         # Scored with the latency of the trial, as the recorded latency would favour itself.
-        judge = judge_of(*(replace(f, fusion=fusion) for f in (judge.fused, judge.held_flight)))
-    return score(fuse_track(judge.fused, fusion), judge)
+        split = SplitFlight(*(replace(f, fusion=fusion) for f in (split.fused, split.held)))
+    return score(fuse_track(split.fused, fusion), split)
 
 
 def run_trial(contest: Contest, values: Sequence[Value]) -> Scores:
@@ -217,8 +213,7 @@ def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> "p
     import pandas as pd
 
     rows = [{**dict(zip(keys, values, strict=True)), **scores} for values, scores in trials]
-    table = pd.DataFrame(rows)
-    column = COLUMN_OF[metric]
+    table, column = pd.DataFrame(rows), COLUMN_OF[metric]
     if not table[column].notna().any():
         raise SweepError(
             f"the flight has no {_LACKING[metric]} to score by; choose another --metric"
@@ -273,8 +268,8 @@ def optimise(
 
     bounds = []
     for axis in axes:
-        numbers = [v for v in axis.values if isinstance(v, int | float)]
-        if len(numbers) < 2 or len(numbers) < len(axis.values) or min(numbers) == max(numbers):
+        numbers = {value for value in axis.values if isinstance(value, int | float)}
+        if len(numbers) < 2 or not numbers.issuperset(axis.values):
             raise SweepError(f"{axis.key}: an optimiser needs a range low:high")
         bounds.append((min(numbers), max(numbers)))
 
@@ -283,6 +278,7 @@ def optimise(
         return [math.inf if math.isnan(s) else s for s in scores]
 
     def report_progress(intermediate_result: "OptimizeResult") -> None:
+        # SciPy passes a result only to a parameter of this name.
         on_generation(float(intermediate_result.fun))
 
     found = differential_evolution(
@@ -290,8 +286,3 @@ def optimise(
         updating="deferred", workers=many, callback=report_progress, tol=1e-3,
     )  # fmt: skip
     return tuple(float(v) for v in found.x)
-
-
-def pool(contest: Contest, jobs: int | None = None) -> AbstractContextManager[Run]:
-    """Open a pool of processes for trials."""
-    return forked(partial(run_trial, contest), jobs)

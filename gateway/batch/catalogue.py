@@ -121,7 +121,7 @@ class Catalogue:
         """Return size, modification time and digest of every file, by path."""
         with _catalogue_errors(self.path):
             rows = self._db.execute("SELECT DISTINCT path, size, modified, digest FROM flights")
-            return {path: (size, modified, digest) for path, size, modified, digest in rows}
+            return {path: known for path, *known in rows}
 
     def put(self, files: Iterable[CataloguedFile]) -> None:
         """Replace the rows of files, all or none of them."""
@@ -381,7 +381,7 @@ def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedF
         if found.digest == known_digest:
             return found
         found = replace(found, kind=format_of(path))
-        flights = tuple(_flights_in(path, options))
+        flights = tuple(flights_of(read_summary(path, None, lambda: options)))
     except OSError as error:
         return replace(found, error=error.strerror or as_text(str(error)))
     except (FlightError, ValueError) as error:
@@ -454,7 +454,3 @@ def _may_be_recording(path: Path) -> bool:
     except OSError:
         return False
     return any(knows(begin) for knows in OTHER_FORMATS.values())
-
-
-def _flights_in(path: Path, options: ReadOptions) -> list[Flown]:
-    return [*flights_of(read_summary(path, None, lambda: options))]

@@ -2,32 +2,21 @@
 
 import asyncio
 import ctypes
-import multiprocessing
-import os
-import signal
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from multiprocessing.synchronize import Event
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Protocol
 
 from gateway import __version__
-from gateway.analysis.processes import START, cores, keep_inherited, no_warning_of_threads
+from gateway.analysis.processes import Item, Result, cores, do, pool_of
 from gateway.extensions import load_extensions
 from gateway.printable import UserError, reason_of
 
 WAITING: Final = 2
 """Items submitted per process: one in work and one waiting, to bound the memory."""
-LOOK_S: Final = 1.0
-"""Interval of checking whether the parent process is alive, s."""
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 CONNECT_S: Final = 10.0
 WORKERS_S: Final = 30.0
 """Timeout for the first worker, s."""
@@ -106,11 +95,11 @@ def _run_in_one_pool(
 ) -> Any:
     """Process the queue until a process dies; return the items in work at that time."""
     running: dict[Future[Result], int] = {}
-    with _processes(jobs) as pool:
+    with pool_of(work, jobs) as pool:
         while queue or running:
             try:
                 while queue and len(running) < (jobs * WAITING if jobs > 1 else 1):
-                    running[pool.submit(work, items[queue[0]])] = queue[0]
+                    running[pool.submit(do, items[queue[0]])] = queue[0]
                     queue.popleft()
             except BrokenProcessPool:
                 return sorted(running.values())
@@ -129,37 +118,6 @@ def failure_of(error: BaseException) -> WorkFailed:
     if isinstance(error, OSError) and error.filename:
         return WorkFailed(f"{error.filename}: {error.strerror or reason_of(error)}")
     return WorkFailed(f"{type(error).__name__}: {error}")
-
-
-@contextmanager
-def _processes(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    context = multiprocessing.get_context(START)
-    stop = context.Event()
-    with no_warning_of_threads():
-        pool = ProcessPoolExecutor(jobs, context, _begin, (stop, os.getpid()))
-        # Start all processes now, before the pool starts a thread of its own.
-        pool.submit(os.getpid).result()
-    try:
-        yield pool
-    except BaseException:
-        stop.set()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _begin(stop: Event, parent: int) -> None:
-    """Leave interrupts to the parent, and exit when it does."""
-    keep_inherited()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            if stop.wait(LOOK_S):
-                break
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 class ClusterError(UserError):

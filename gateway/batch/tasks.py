@@ -8,12 +8,13 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, Final
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, NamedTuple
 
 import msgspec
 
@@ -44,6 +45,7 @@ from gateway.recordings.fuse import fuse
 from gateway.recordings.index import as_text, recording_name
 from gateway.recordings.recorded_fusion import fused_lines, header_of_states
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.table import TableHeader
 
 HELD: Final = "held_m"
 """Key of the errors at withheld fixes, by estimator."""
@@ -79,14 +81,13 @@ class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
     """Files written, relative to the folder of results."""
 
 
-@dataclass(frozen=True, slots=True)
-class Worked:
+class Worked(NamedTuple):
     """Outcome of a task on one recording, before it is stored."""
 
     vehicle: int | None
     began: str | None
     figures: dict[str, Any]
-    files: Files = field(default_factory=dict)
+    files: Files = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -131,20 +132,24 @@ class JudgeTask(FlightTask):
         """See `FlightTask`."""
         recorded = read_pilot_flight(files, self.options, name)
         try:
-            read = read_batch_flight(files, self.options, name)
+            flight, header, began = read_batch_flight(files, self.options, name)
         except (FlightError, ValueError):
             # The recording can be read, but it has no samples.
             made = _page_of(recorded, name) if self.pages else {}
             figures = {"summary": _known(recorded_summary(recorded))}
             return Worked(recorded.vehicle_id, began_text(recorded.begin_us), figures, made)
-        case = make_case(read.flight, recorded=recorded)
-        samples = read.flight.samples
+        case, samples = make_case(flight, recorded=recorded), flight.samples
         states = fuse(samples, samples.estimator_or_cold(case.fusion.estimation)).states
-        lines = fused_lines(read.header, read.flight.time_us, states)
-        made = {f"fused/{name}.csv": b"".join(lines)}
+        made = {f"fused/{name}.csv": b"".join(fused_lines(header, flight.time_us, states))}
         if self.pages:
             made |= _page_of(case, name)
-        return Worked(read.vehicle, read.began, _figures(case), made)
+        figures = {
+            "summary": summarise(case),
+            HELD: {name: withheld_error_m(case, name) for name in case.tracks},
+            DRIFT: {name: outage_error_m(case, name) for name in case.tracks},
+        }
+        known = {key: _known(values) for key, values in figures.items()}
+        return Worked(header.vehicle_id, began, known, made)
 
 
 def _known(figures: Mapping[str, float]) -> dict[str, float]:
@@ -183,41 +188,29 @@ class SweepTask(FlightTask):
 
     def do(self, files: list[Path], name: str) -> Worked:
         """See `FlightTask`."""
-        read = read_batch_flight(files, self.options, name)
-        flight = read.flight
-        contest = make_contest(
-            flight,
-            flight.fusion,
-            [axis.key for axis in self.axes],
-            hold_out=self.hold_out,
-            interval_s=self.interval_s,
-        )
+        flight, header, began = read_batch_flight(files, self.options, name)
+        keys, how = [axis.key for axis in self.axes], (self.hold_out, self.interval_s)
+        contest = make_contest(flight, flight.fusion, keys, *how)
         scores = [run_trial(contest, values)[self.metric_column] for values in grid(self.axes)]
         base = score_of(contest, flight.fusion)[self.metric_column]
         values = [None if score != score else score for score in (base, *scores)]
-        return Worked(read.vehicle, read.began, {"base": values[0], "scores": values[1:]})
+        figures = {"base": values[0], "scores": values[1:]}
+        return Worked(header.vehicle_id, began, figures)
 
 
-@dataclass(frozen=True, slots=True)
-class ReadFlight:
-    """A flight, and the facts in the header of its file."""
+def read_batch_flight(
+    files: Sequence[Path], options: ReadOptions, name: str
+) -> tuple[Flight, TableHeader, str | None]:
+    """Read the parts of a recording as one flight, the head of its states, and its begin.
 
-    flight: Flight
-    header: Any
-    vehicle: int
-    began: str | None
-
-
-def read_batch_flight(files: Sequence[Path], options: ReadOptions, name: str) -> ReadFlight:
-    """Read the parts of a recording as one flight; raises as `FlightTask.do`."""
+    Raises as `FlightTask.do`.
+    """
     flight, table, aircraft = flight_of_files(
         files, options, name=name, description="One recording of a batch."
     )
-    known = table.header
-    header = header_of_states(known, aircraft)
-    zero_us = known.unix_us_at_zero
+    zero_us = table.header.unix_us_at_zero
     began = None if zero_us is None else zero_us + int(flight.time_us[0])
-    return ReadFlight(flight, header, known.vehicle_id, began_text(began))
+    return flight, header_of_states(table.header, aircraft), began_text(began)
 
 
 def work_on(
@@ -242,14 +235,8 @@ def work_on(
             for location, file in zip(item.locations, files, strict=True):
                 text = text.replace(str(file), without_user(location))
             return msgspec.structs.replace(result, error=as_text(text)), {}
-    done = msgspec.structs.replace(
-        result,
-        vehicle=worked.vehicle,
-        began=worked.began,
-        figures=worked.figures,
-        files=tuple(worked.files),
-    )
-    return done, worked.files
+    known = worked._asdict() | {"files": tuple(worked.files)}
+    return msgspec.structs.replace(result, **known), worked.files
 
 
 def without_secrets(options: ReadOptions) -> ReadOptions:
@@ -274,16 +261,6 @@ def name_of(item: BatchItem) -> str:
     for ending in (".gz", ".csv", ".tlog"):
         name = name.removesuffix(ending)
     return name
-
-
-def _figures(case: Case) -> dict[str, Any]:
-    """Summarise one flight."""
-    held = {name: withheld_error_m(case, name) for name in case.tracks}
-    drift = {name: outage_error_m(case, name) for name in case.tracks}
-    found = {HELD: held, DRIFT: drift}
-    return {"summary": _known(summarise(case))} | {
-        key: _known(errors) for key, errors in found.items()
-    }
 
 
 class ResultFolder:
@@ -384,26 +361,33 @@ def run_batch(
     stamps = _stamps(items, executor, report)
     names = _names(items, stamps)
     for number, (item, stamp) in enumerate(zip(items, stamps, strict=True)):
+        location = as_text(item.location)
         if isinstance(stamp, WorkFailed):
-            found[number] = _failed(_blank(task, item, "", ""), stamp.reason)
+            found[number] = FlightResult(
+                location=location, digest="", key="", task=task.name, version=__version__,
+                error=stamp.reason,
+            )  # fmt: skip
             continue
         key = _key(task, stamp)
-        kept = folder.find(key) if folder is not None else None
-        if kept is not None:
-            found[number] = msgspec.structs.replace(kept, location=as_text(item.location))
-        else:
-            todo[number] = (item, names[number], _blank(task, item, stamp, key))
+        if folder is not None and (kept := folder.find(key)) is not None:
+            found[number] = msgspec.structs.replace(kept, location=location)
+            continue
+        blank = FlightResult(
+            location=location, digest=stamp, key=key, task=task.name, version=__version__
+        )
+        todo[number] = (item, names[number], blank)
     numbers = list(todo)
     outcomes = executor.run(partial(work_on, task), list(todo.values()))
     for done, (index, outcome) in enumerate(outcomes, len(items) - len(todo) + 1):
         item, _, blank = todo[numbers[index]]
         if isinstance(outcome, WorkFailed):
-            result = _failed(blank, outcome.reason)
+            result = msgspec.structs.replace(blank, error=outcome.reason)
+        elif (version := outcome[0].version) != __version__:
+            reason = f"done by mavgate {version}; this is {__version__}"
+            result = msgspec.structs.replace(blank, error=reason)
         else:
             result, files = outcome
-            if result.version != __version__:
-                result = _failed(blank, f"done by mavgate {result.version}; this is {__version__}")
-            elif folder is not None:
+            if folder is not None:
                 folder.keep(result, files)
         found[numbers[index]] = result
         report(item.location, done, len(items))
@@ -433,13 +417,3 @@ def _names(items: Sequence[BatchItem], stamps: Sequence[str | WorkFailed]) -> li
 def _key(task: FlightTask, stamp: str) -> str:
     values = "\n".join((task.name, stamp, __version__)).encode()
     return sha256(values + b"\n" + task.fingerprint).hexdigest()[:32]
-
-
-def _blank(task: FlightTask, item: BatchItem, stamp: str, key: str) -> FlightResult:
-    return FlightResult(
-        location=as_text(item.location), digest=stamp, key=key, task=task.name, version=__version__
-    )
-
-
-def _failed(blank: FlightResult, reason: str) -> FlightResult:
-    return msgspec.structs.replace(blank, error=reason)

@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 from gateway.analysis.blending import (
+    SplitFlight,
     error_at_fixes_m,
     grows,
     interpolate,
-    make_judge,
     paper_table,
     score,
     thin,
@@ -135,16 +135,16 @@ def test_errors_of_simulated_flight_grow_with_both_weights() -> None:
 
 def test_interpolated_gps_scores_zero_against_itself() -> None:
     flight = short_flight()
-    judge = make_judge(flight, withhold(flight, 5))
-    found = score(judge.interpolated, judge)
+    split = SplitFlight.by(flight, withhold(flight, 5))
+    found = score(split.interpolated, split)
     assert found["north_m"] == found["east_m"] == found["interpolated_m"] == 0.0
     assert 0.0 < found["held_m"] < 2.0
 
 
 def test_truth_scores_zero_against_itself() -> None:
     flight = short_flight()
-    judge = make_judge(flight, np.ones(len(flight.fixes), np.bool_))
-    found = score(true_track(flight), judge)
+    split = SplitFlight.by(flight, np.ones(len(flight.fixes), np.bool_))
+    found = score(true_track(flight), split)
     assert found["reference_m"] == pytest.approx(0.0)
     assert np.isnan(found["held_m"])
 

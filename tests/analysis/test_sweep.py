@@ -1,11 +1,13 @@
 """Settings tried out on a flight."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 
 from gateway.analysis.flight import fixes_of
+from gateway.analysis.processes import forked
 from gateway.analysis.sweep import (
     Axis,
     SweepError,
@@ -15,7 +17,6 @@ from gateway.analysis.sweep import (
     make_contest,
     optimise,
     parse_axis,
-    pool,
     run_trial,
     tabulate,
     with_value,
@@ -105,7 +106,7 @@ def test_settings_of_two_estimators_are_rejected() -> None:
 def test_withheld_fixes_are_not_fused(interval_s: float, share: float) -> None:
     flight = short_flight()
     contest = make_contest(flight, short_case().fusion, [ALPHA], hold_out=5, interval_s=interval_s)
-    fused, held = fixes_of(contest.judge.fused), contest.judge.held
+    fused, held = fixes_of(contest.split.fused), contest.split.held_fixes
     assert len(fused) + len(held) == len(fixes_of(flight))
     assert not set(fused.arrival_us.tolist()) & set(held.arrival_us.tolist())
     assert len(fused) / len(fixes_of(flight)) == pytest.approx(share, abs=0.03)
@@ -114,9 +115,9 @@ def test_withheld_fixes_are_not_fused(interval_s: float, share: float) -> None:
 def test_several_processes_give_results_of_one() -> None:
     contest = make_contest(short_flight(), short_case().fusion, [ALPHA, BETA])
     points = grid([Axis(ALPHA, (0.1, 0.9)), Axis(BETA, (0.1, 0.9))])
-    with pool(contest, 2) as run:
+    with forked(partial(run_trial, contest), 2) as run:
         several = dict(run(points))
-    with pool(contest, 1) as run:
+    with forked(partial(run_trial, contest), 1) as run:
         one = dict(run(points))
     assert several == one
     assert one[0]["held_m"] < one[3]["held_m"]

@@ -40,7 +40,7 @@ def test_every_command_uses_the_latency_estimated_from_manoeuvres(without_latenc
     assert latency_s == pytest.approx(0.16, abs=0.02)
     assert "GPS latency not in log; estimated 0.1" in table.remarks[0]
     assert load_flight(without_latency, TODAY, read_options(TODAY)).latency_s == latency_s
-    assert read_batch_flight([without_latency], OPTIONS, "log").flight.latency_s == latency_s
+    assert read_batch_flight([without_latency], OPTIONS, "log")[0].latency_s == latency_s
     fusion = RecordedFusion([without_latency], OPTIONS)
     assert fusion.remarks == table.remarks
     assert open_flown([without_latency], OPTIONS).gps_latency_s == latency_s

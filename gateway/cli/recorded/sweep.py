@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -10,7 +11,9 @@ import numpy as np
 import typer
 
 from gateway.analysis import sweep as sweeping
-from gateway.analysis.flight import Flight, max_speed_mps
+from gateway.analysis.flight import Flight
+from gateway.analysis.pilot import pilot_flight_of_samples
+from gateway.analysis.processes import forked
 from gateway.analysis.sweep import (
     COLUMN_OF,
     ESTIMATOR_KEY,
@@ -23,7 +26,7 @@ from gateway.analysis.sweep import (
     Values,
     grid,
     parse_axis,
-    pool,
+    run_trial,
     with_estimator_of,
     with_values,
 )
@@ -164,14 +167,15 @@ def run_sweep(
         hold_out=options.hold_out,
         interval_s=options.gps_interval_s,
     )
-    if (fastest := max_speed_mps(flight)) < AT_REST_MPS:
+    fastest = pilot_flight_of_samples(flight).facts.fastest_mps or 0.0
+    if fastest < AT_REST_MPS:
         console_of(stderr=True).print(
             f"{flight.name}: at rest throughout, at most {fastest:.1f} m/s by GPS: it contains no "
             "information on settings for flights",
             style="yellow",
         )
     _print_idle(contest, axes)
-    with pool(contest, options.jobs) as run:
+    with forked(partial(run_trial, contest), options.jobs) as run:
         if options.generations:
             trials = _search(axes, run, options.generations, options.metric)
         else:

@@ -47,9 +47,8 @@ from gateway.recordings.table import encode_block, encode_head
 from gateway.recordings.tlog import encode_record
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.recordings.workshop.editing import NOTHING_LEFT, TlogEdits
-from gateway.recordings.workshop.joining import joined_tables
+from gateway.recordings.workshop.joining import joined_tables, trimmed
 from gateway.recordings.workshop.merging import batched, intact, joined
-from gateway.recordings.workshop.trimming import trimmed
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.recorded_frames import Batch, RecordedFrame
 

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from gateway.recordings.files import FlightError, TlogSource
 from gateway.recordings.tlog import encode_record
 from gateway.recordings.workshop.selection import (
+    NOTHING_WITHIN,
     ChosenState,
     FrameChoice,
+    Limits,
     StateChoice,
     while_in_state,
     within,
 )
-from gateway.recordings.workshop.trimming import NOTHING_WITHIN, Limits
 from gateway.units import counted
 from gateway.vehicle_state.senders import Senders
 from gateway.vehicle_state.status_texts import text_of

@@ -11,20 +11,15 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.files import FlightError, open_tlog
+from gateway.recordings.files import open_tlog
 from gateway.recordings.tlog import TlogScanner
-from gateway.recordings.workshop.editing import Renumbering, TlogEdits
 from gateway.recordings.workshop.merging import MAX_SAMPLE, Alignment, FrameSample, batched
 from gateway.recordings.workshop.selection import (
     MAX_MARGIN_S,
     ChosenState,
-    FrameChoice,
     StateChoice,
-    message_ids_of,
     while_in_state,
 )
-from gateway.vehicle_state.senders import Senders
-from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 from gateway.wire.recorded_frames import RecordedFrame, fields_of
 from tests.kit.cli import run
@@ -44,8 +39,6 @@ from tests.kit.recordings import (
 )
 
 pytestmark = pytest.mark.io
-
-ATTITUDE = MESSAGE_IDS["ATTITUDE"]
 
 
 def as_float(whole: int) -> float:
@@ -108,6 +101,9 @@ def test_chosen_frames_are_kept_byte_for_byte(
         (("--margin", MAX_MARGIN_S + 1), "--margin"),
         (("--margin", 5), "--margin belongs to --armed"),
         (("--from-mode", "ATUO"), "no vehicle was in mode ATUO; the modes are "),
+        (("-o", "x.kml", "--without", "HEARTBEAT"), "ends in .tlog"),
+        (("-o", "x.kml", "--as", "1:2"), "ends in .tlog"),
+        (("-o", "x.kml", "--armed"), "ends in .tlog"),
     ],
 )
 def test_options_that_fit_nothing_are_refused(
@@ -116,13 +112,6 @@ def test_options_that_fit_nothing_are_refused(
     path, out = write_tlog(tmp_path / "a.tlog", MIXED), tmp_path / "out.tlog"
     assert text in run("convert", path, "-o", out, *options, code=2)
     assert not out.exists()
-
-
-def test_options_of_tlogs_are_refused_for_other_formats(tmp_path: Path) -> None:
-    path = write_tlog(tmp_path / "a.tlog", MIXED)
-    for options in (("--without", "HEARTBEAT"), ("--as", "1:2"), ("--armed",)):
-        text = run("convert", path, "-o", tmp_path / "x.kml", *options, code=2)
-        assert "ends in .tlog" in text
 
 
 def test_input_is_never_the_output(tmp_path: Path) -> None:
@@ -406,17 +395,22 @@ def test_renumbering_changes_headers_and_fields_with_valid_checksums(tmp_path: P
     assert [record.time_us for record in kept] == [record.time_us for record in records]
 
 
-def test_systems_can_swap_their_ids(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("options", "ids"),
+    [
+        (("--as", "2:1"), {2, 1}),
+        (("--merge-systems",), {2}),
+        (("--system", "1"), {2}),
+    ],
+    ids=["swapped", "merged", "one chosen"],
+)
+def test_systems_swap_or_share_an_id_only_if_wanted(
+    tmp_path: Path, options: tuple[str, ...], ids: set[int]
+) -> None:
     records = records_of(Sender(k % 2 + 1).heartbeat() for k in range(6))
-    kept, _ = convert(tmp_path, records, "--as", "1:2", "--as", "2:1")
-    assert [frame_of(r.frame).origin[0] for r in kept] == [2, 1, 2, 1, 2, 1]
-
-
-def test_systems_share_an_id_only_if_wanted(tmp_path: Path) -> None:
-    records = records_of(Sender(k % 2 + 1).heartbeat() for k in range(6))
-    for options in (("--merge-systems",), ("--system", "1")):
-        kept, _ = convert(tmp_path, records, "--as", "1:2", *options)
-        assert {frame_of(record.frame).origin[0] for record in kept} == {2}
+    kept, _ = convert(tmp_path, records, "--as", "1:2", *options)
+    assert {frame_of(record.frame).origin[0] for record in kept} == ids
+    assert frame_of(kept[0].frame).origin[0] == 2
 
 
 @pytest.mark.parametrize(
@@ -460,32 +454,6 @@ def test_unknown_message_that_cannot_be_renumbered_is_left_out_and_listed(tmp_pa
     assert len(kept) == 9
     assert "kept 9 of 10 records" in text
     assert re.search(r"unknown message 60001 +1", text)
-
-
-def test_encoded_batch_without_some_records_equals_their_bytes() -> None:
-    batch = TlogScanner().feed(b"\xff\xff" + make_tlog(MIXED) + bytes(99), final=True)
-    wanted = batch.origins >> 8 == 1
-    chosen = batch.chosen(wanted)
-    assert chosen.encoded() == make_tlog(chosen.records())
-    assert batch.chosen(wanted & False).encoded() == b""
-
-
-def test_message_patterns_are_ids_names_and_globs() -> None:
-    assert message_ids_of(["ATTITUDE", "0", "60001"]) == {ATTITUDE, 0, 60001}
-    assert ATTITUDE in message_ids_of(["att*"])
-    with pytest.raises(FlightError):
-        message_ids_of(["ATT?"])
-
-
-def test_edits_that_change_nothing_are_recognised() -> None:
-    assert TlogEdits().are_none
-    assert not TlogEdits(choice=FrameChoice(systems=frozenset({1}))).are_none
-    assert not TlogEdits(frames=(Renumbering({1: 2}),)).are_none
-
-
-def test_margin_out_of_range_is_refused() -> None:
-    with pytest.raises(ValueError, match="margin"):
-        list(while_in_state([], ChosenState(Senders(), StateChoice(margin_s=MAX_MARGIN_S + 1))))
 
 
 def test_empty_tlog_is_refused(tmp_path: Path) -> None:
