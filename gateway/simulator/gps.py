@@ -9,7 +9,7 @@ import numpy as np
 from gateway.geometry.geodesy import radii_m
 from gateway.gps_time import WEEK_US, gps_us_of_unix
 from gateway.records import GpsFixType
-from gateway.simulator.sensors import BoolArray, IntArray, Wander, White
+from gateway.simulator.sensors import BoolArray, IntArray, Noise, wander
 from gateway.simulator.simulator_settings import GpsOutages, SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S, FloatArray, SensorMotion
 
@@ -100,11 +100,11 @@ class GpsSampler:
         self._epoch = -(-self._start_unix_us // EPOCH_US)
         position, noise, speed, speed_noise, sky, self._latency = rng.spawn(6)
         interval_s = 1.0 / GPS_RATE_HZ
-        self._position_wander = Wander(position, 1.0, WANDER_S, interval_s)
-        self._position_noise = White(noise, 1.0)
-        self._velocity_wander = Wander(speed, 1.0, VELOCITY_WANDER_S, interval_s)
-        self._velocity_noise = White(speed_noise, 1.0)
-        self._sky = Wander(sky, 1.0, WANDER_S, interval_s)
+        self._position_wander = wander(position, 1.0, WANDER_S, interval_s)
+        self._position_noise = Noise(noise, 1.0)
+        self._velocity_wander = wander(speed, 1.0, VELOCITY_WANDER_S, interval_s)
+        self._velocity_noise = Noise(speed_noise, 1.0)
+        self._sky = wander(sky, 1.0, WANDER_S, interval_s)
 
     def take(self, until_s: float) -> GpsSamples:
         """Return all fixes that are valid before a true time; some arrive later than that."""

@@ -70,26 +70,19 @@ class Sent:
     payload: Payload
 
 
+@dataclass(slots=True)
 class Node:
     """A source of payloads: samples of its sensors in order, and its own reports between them."""
 
-    def __init__(
-        self,
-        node_id: NodeId,
-        clock: DeviceClock,
-        sensors: int,
-        rate_hz: int,
-        samples: Iterator[Sent],
-    ) -> None:
-        self.node_id = node_id
-        self.restart_s = 0.0
-        """True time at which the watchdog resets the node; 0 for never."""
-        self.radio_failed = 0
-        self.radio_retries = 0
-        self._clock = clock
-        self._sensors = sensors
-        self._rate_hz = rate_hz
-        self._samples = samples
+    node_id: NodeId
+    clock: DeviceClock
+    sensors: int
+    rate_hz: int
+    samples: Iterator[Sent]
+    restart_s: float = 0.0
+    """True time at which the watchdog resets the node; 0 for never."""
+    radio_failed: int = 0
+    radio_retries: int = 0
 
     def sent(self) -> Iterator[Sent]:
         """Yield all payloads passed to the radio, in order and without end; call it only once."""
@@ -98,7 +91,7 @@ class Node:
     def _with_reports(self) -> Iterator[Sent]:
         times = ((k + 0.5) * STATUS_S for k in count())
         report_s = next(times)
-        for sent in self._samples:
+        for sent in self.samples:
             while report_s <= sent.time_s:
                 yield self._report(report_s)
                 report_s = next(times)
@@ -110,7 +103,7 @@ class Node:
         """Drop payloads while a node restarts; its clock then starts from zero."""
         if not 0.0 < self.restart_s <= sent.time_s:
             return sent
-        node_time_us = sent.node_time_us - self._clock.at(self.restart_s)
+        node_time_us = sent.node_time_us - self.clock.at(self.restart_s)
         if node_time_us < STARTING_US:
             return None
         return Sent(sent.time_s, node_time_us, sent.payload)
@@ -119,17 +112,17 @@ class Node:
         status = NodeStatusPayload(
             firmware_version=(1, 1),
             reset_cause=POWER_ON,
-            sensors_present=self._sensors,
+            sensors_present=self.sensors,
             sensors_failed=0,
             bus_errors=0,
             radio_failed=self.radio_failed & UINT16_MAX,
             radio_retries=self.radio_retries & UINT16_MAX,
             loop_max_us=LOOP_US,
-            sample_rate_hz=self._rate_hz,
+            sample_rate_hz=self.rate_hz,
             supply_mv=SUPPLY_MV,
-            chips=IMU_CHIPS if self._sensors & SENSOR_IMU else GPS_CHIPS,
+            chips=IMU_CHIPS if self.sensors & SENSOR_IMU else GPS_CHIPS,
         )
-        return Sent(time_s, self._clock.at(time_s), status)
+        return Sent(time_s, self.clock.at(time_s), status)
 
 
 def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[Node, Node]:
@@ -147,8 +140,8 @@ def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[
             _baro_samples(aircraft, settings.baro_rate_hz),
             key=attrgetter("time_s"),
         ),
+        settings.imu_restart_s,
     )
-    imu.restart_s = settings.imu_restart_s
     gps = Node(
         NodeId(aircraft.vehicle_id, GPS_NODE),
         aircraft.gps_clock,
@@ -226,10 +219,7 @@ def gps_payloads(gps: GpsSamples, clock: DeviceClock, geoid_separation_m: float)
     h_acc_cm, v_acc_cm = _held(gps.h_acc_m), _held(gps.v_acc_m)
     speed_acc_cmps, course_acc_cdeg = _held(gps.speed_acc_mps), _held(gps.course_acc_deg)
     pdop_centi = _held(gps.pdop)
-    lat_dege7, lon_dege7 = (
-        np.rint(gps.lat_deg * DEGE7_PER_DEG),
-        np.rint(gps.lon_deg * DEGE7_PER_DEG),
-    )
+    lat_dege7, lon_dege7 = (np.rint(deg * DEGE7_PER_DEG) for deg in (gps.lat_deg, gps.lon_deg))
     vel_cmps = np.clip(np.rint(gps.vel_n_mps * 100.0), -INT16_MAX, INT16_MAX).astype(np.int64)
     for k, time_s in enumerate(gps.time_s.tolist()):
         itow_ms, node_us = int(gps.itow_ms[k]), clock.at(time_s)

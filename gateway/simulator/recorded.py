@@ -40,10 +40,10 @@ from gateway.simulator.sensors import (
     BoolArray,
     DeviceClock,
     IntArray,
+    inertial_counts,
     mag_counts,
     pressure_at,
     temperature_counts,
-    to_int16,
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
@@ -104,25 +104,11 @@ class RecordedFlight:
     def from_columns(
         columns: Mapping[str, FloatArray], gps_latency_s: float = 0.2
     ) -> "RecordedFlight":
-        """Build a flight from the columns of a log.
+        """Build a flight from the columns of a log, each (N,), where NaN means no new value.
 
-        Parameters
-        ----------
-        columns : mapping of str to ndarray, each (N,)
-            `time_s`, `ax` `ay` `az` in m/s2 and `gx` `gy` `gz` in rad/s are required. Optional:
-            `mx` `my` `mz` in uT, `baro_alt_m`, `gps_time_s`, `gps_lat`, `gps_lon`, `gps_alt_m`,
-            `gps_vn` `gps_ve` `gps_vd`. NaN means no new value.
-        gps_latency_s : float
-            GPS latency stated in the log.
-
-        Returns
-        -------
-        RecordedFlight
-
-        Raises
-        ------
-        ValueError
-            If a column is missing, there are fewer than two rows, or time does not increase.
+        `IMU_COLUMNS` in s, m/s2 and rad/s are required. Optional: `mx` `my` `mz` in uT,
+        `baro_alt_m`, `GPS_COLUMNS`, `gps_alt_m`, `gps_vn` `gps_ve` `gps_vd`. Raises ValueError if a
+        column is missing, there are fewer than two rows, or time does not increase.
         """
         missing = [name for name in IMU_COLUMNS if name not in columns]
         if missing:
@@ -189,15 +175,9 @@ def replay(
     if np.isfinite(flight.baro_alt_m).any():
         rounds = _rounds(flight, endless)
         pressures = chain.from_iterable(_baro_payloads(f, imu_clock) for f in rounds)
-    nodes: list[Node] = [
-        Node(
-            NodeId(settings.vehicle_id, IMU_NODE),
-            imu_clock,
-            _imu_sensors(flight),
-            round(flight.rate_hz),
-            heapq.merge(inertial, pressures, key=attrgetter("time_s")),
-        )
-    ]
+    samples = heapq.merge(inertial, pressures, key=attrgetter("time_s"))
+    node_id = NodeId(settings.vehicle_id, IMU_NODE)
+    nodes = [Node(node_id, imu_clock, _imu_sensors(flight), round(flight.rate_hz), samples)]
     if len(flight.gps_time_s):
         gps_clock = DeviceClock(GPS_BOOT_US, -settings.clock_skew_ppm)
         gaps_s = np.diff(flight.gps_time_s)
@@ -206,15 +186,8 @@ def replay(
             gps_payloads(_gps_samples(f, start_unix_us), gps_clock, settings.geoid_separation_m)
             for f in _rounds(flight, endless)
         )
-        nodes.append(
-            Node(
-                NodeId(settings.vehicle_id, GPS_NODE),
-                gps_clock,
-                GPS_SENSORS,
-                round(1.0 / spacing_s),
-                fixes,
-            )
-        )
+        node_id = NodeId(settings.vehicle_id, GPS_NODE)
+        nodes.append(Node(node_id, gps_clock, GPS_SENSORS, round(1.0 / spacing_s), fixes))
     return SimulatedReceiver(settings, nodes)
 
 
@@ -241,18 +214,14 @@ def _imu_payloads(flight: RecordedFlight, clock: DeviceClock, *, endless: bool) 
     if not np.isfinite(flight.baro_alt_m).any():
         absent |= ImuFlags.BARO_ABSENT
     mag_raw = _mag_words(flight.mag_b_ut, mag_new, mag_gain)
-    accel_lsb = (INT16_MAX + 1) / (ACCEL_RANGES_G[accel_range] * STANDARD_GRAVITY_MPS2)
-    gyro_lsb = math.degrees(GYRO_LSB_PER_DPS[gyro_range])
     temperature = temperature_counts(np.full(ROWS, TEMPERATURE_DEGC))
     for flown in _rounds(flight, endless):
         for start in range(0, len(flown.time_s), ROWS):
             rows = slice(start, start + ROWS)
             time_s = flown.time_s[rows]
-            accel, accel_clipped = to_int16(flown.accel_b_mps2[rows] * FACE_UP * accel_lsb)
-            gyro, gyro_clipped = to_int16(flown.gyro_b_radps[rows] * FACE_UP * gyro_lsb)
-            flags = absent | mag_new[rows] * int(ImuFlags.MAG_NEW)
-            flags |= accel_clipped * int(ImuFlags.ACCEL_CLIPPED)
-            flags |= gyro_clipped * int(ImuFlags.GYRO_CLIPPED)
+            vectors = (flown.accel_b_mps2[rows] * FACE_UP, flown.gyro_b_radps[rows] * FACE_UP)
+            accel, gyro, clipped = inertial_counts(*vectors, accel_range, gyro_range)
+            flags = absent | clipped | mag_new[rows] * int(ImuFlags.MAG_NEW)
             columns = (time_s, _on_clock(clock, time_s), accel, gyro, mag_raw[rows])
             yield from pack_imu((*columns, temperature[: len(time_s)], flags), ranges)
 

@@ -80,36 +80,19 @@ IMU_BOOT_US: Final = 2_718_281
 BARO_PHASE_US: Final = 3_300
 
 
-class White:
-    """Independent normal noise on three axes."""
-
-    def __init__(self, rng: np.random.Generator, sigma: float) -> None:
-        self._rng = rng
-        self._sigma = sigma
-
-    def draw(self, size: int) -> FloatArray:
-        """Draw the next values, shape (size, 3)."""
-        return self._sigma * self._rng.standard_normal((size, AXES))
-
-
-class Wander:
-    """First-order Gauss-Markov noise on three axes: `x' = retain * x + step`.
-
-    Its stationary standard deviation is `sigma`; after `correlation_s`, 37 % of a value remains.
-    """
+class Noise:
+    """Normal noise on three axes: `x' = retain * x + step`, white by default."""
 
     def __init__(
-        self, rng: np.random.Generator, sigma: float, correlation_s: float, interval_s: float
+        self, rng: np.random.Generator, step: float, retain: float = 0.0, spread: float = 0.0
     ) -> None:
-        self._rng = rng
-        self._retain = math.exp(-interval_s / correlation_s)
-        self._step = sigma * math.sqrt(1.0 - self._retain**2)
-        self._last = sigma * rng.standard_normal(AXES)
+        self._rng, self._step, self._retain = rng, step, retain
+        self._last = spread * rng.standard_normal(AXES) if spread else np.zeros(AXES)
 
     def draw(self, size: int) -> FloatArray:
         """Draw the next values, shape (size, 3)."""
         steps = self._step * self._rng.standard_normal((size, AXES))
-        if size == 0:
+        if not self._retain or not size:
             return steps
         columns = [
             list(accumulate(axis, lambda last, step: step + self._retain * last, initial=last))
@@ -120,22 +103,20 @@ class Wander:
         return values[1:]
 
 
-class Walk:
-    """Random walk on three axes, starting at zero."""
+def wander(
+    rng: np.random.Generator, sigma: float, correlation_s: float, interval_s: float
+) -> Noise:
+    """Return first-order Gauss-Markov noise of a stationary standard deviation.
 
-    def __init__(
-        self, rng: np.random.Generator, sigma_per_sqrt_s: float, interval_s: float
-    ) -> None:
-        self._rng = rng
-        self._step = sigma_per_sqrt_s * math.sqrt(interval_s)
-        self._last = np.zeros(AXES)
+    After `correlation_s`, 37 % of a value remains.
+    """
+    retain = math.exp(-interval_s / correlation_s)
+    return Noise(rng, sigma * math.sqrt(1.0 - retain**2), retain, sigma)
 
-    def draw(self, size: int) -> FloatArray:
-        """Draw the next values, shape (size, 3)."""
-        steps = self._step * self._rng.standard_normal((size, AXES))
-        values = np.cumsum(np.vstack([self._last, steps]), axis=0)
-        self._last = values[-1]
-        return values[1:]
+
+def walk(rng: np.random.Generator, sigma_per_sqrt_s: float, interval_s: float) -> Noise:
+    """Return a random walk that starts at zero."""
+    return Noise(rng, sigma_per_sqrt_s * math.sqrt(interval_s), 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,19 +130,6 @@ class SensorErrors:
     mag_soft_iron: Matrix3
 
 
-@dataclass(frozen=True, slots=True)
-class InertialCounts:
-    """Registers of the MPU6050 for N samples."""
-
-    accel: IntArray
-    """Shape (N, 3), in sensor axes."""
-    gyro: IntArray
-    temperature: IntArray
-    """Shape (N,)."""
-    accel_clipped: BoolArray
-    gyro_clipped: BoolArray
-
-
 class Mpu6050:
     """Accelerometer and gyroscope."""
 
@@ -173,15 +141,18 @@ class Mpu6050:
         self.gyro_bias_radps = GYRO_BIAS_RADPS * rng.standard_normal(3)
         self.accel_matrix = _imperfect(rng)
         self.gyro_matrix = _imperfect(rng)
-        self._accel_noise = White(accel, ACCEL_DENSITY * math.sqrt(noise_hz))
-        self._gyro_noise = White(gyro, GYRO_DENSITY * math.sqrt(noise_hz))
-        self._accel_shaking = White(shaking, settings.vibration_mps2)
-        self._gyro_shaking = White(shaking.spawn(1)[0], settings.vibration_mps2 * GYRO_SHAKING)
-        self._accel_walk = Walk(accel_walk, ACCEL_WALK, 1.0 / rate_hz)
-        self._gyro_walk = Walk(gyro_walk, GYRO_WALK, 1.0 / rate_hz)
+        self._accel_noise = Noise(accel, ACCEL_DENSITY * math.sqrt(noise_hz))
+        self._gyro_noise = Noise(gyro, GYRO_DENSITY * math.sqrt(noise_hz))
+        self._accel_shaking = Noise(shaking, settings.vibration_mps2)
+        self._gyro_shaking = Noise(shaking.spawn(1)[0], settings.vibration_mps2 * GYRO_SHAKING)
+        self._accel_walk = walk(accel_walk, ACCEL_WALK, 1.0 / rate_hz)
+        self._gyro_walk = walk(gyro_walk, GYRO_WALK, 1.0 / rate_hz)
 
-    def sample(self, truth: Truth) -> InertialCounts:
-        """Return the registers at the truth's times, which must follow the previous call's."""
+    def sample(self, truth: Truth) -> tuple[IntArray, IntArray, IntArray]:
+        """Return the registers of accelerometer and gyroscope, and the flags of `inertial_counts`.
+
+        The truth's times must follow those of the previous call.
+        """
         size = len(truth.time_s)
         power = (np.minimum(truth.airspeed_mps / CRUISE_MPS, 1.0) ** 2)[:, np.newaxis]
         accel = (truth.accel_b_mps2 * FACE_UP) @ self.accel_matrix.T + self.accel_bias_mps2
@@ -190,16 +161,7 @@ class Mpu6050:
         gyro = (truth.rate_b_radps * FACE_UP) @ self.gyro_matrix.T + self.gyro_bias_radps
         gyro += self._gyro_walk.draw(size) + self._gyro_noise.draw(size)
         gyro += power * self._gyro_shaking.draw(size)
-        accel_lsb = -INT16_MIN / (ACCEL_RANGES_G[ACCEL_RANGE] * STANDARD_GRAVITY_MPS2)
-        accel_counts, accel_clipped = to_int16(accel * accel_lsb)
-        gyro_counts, gyro_clipped = to_int16(np.degrees(gyro) * GYRO_LSB_PER_DPS[GYRO_RANGE])
-        return InertialCounts(
-            accel=accel_counts,
-            gyro=gyro_counts,
-            temperature=temperature_counts(warm_degc(truth.time_s)),
-            accel_clipped=accel_clipped,
-            gyro_clipped=gyro_clipped,
-        )
+        return inertial_counts(accel, gyro, ACCEL_RANGE, GYRO_RANGE)
 
 
 class Hmc5883l:
@@ -221,15 +183,12 @@ class Hmc5883l:
         self.hard_iron_ut: FloatArray = HARD_IRON_UT * direction / np.linalg.norm(direction)
         spread = SOFT_IRON_SPREAD * rng.standard_normal((3, 3))
         self.soft_iron: FloatArray = np.eye(3) + 0.5 * (spread + spread.T)
-        self._noise = White(rng.spawn(1)[0], MAG_NOISE_UT)
+        self._noise = Noise(rng.spawn(1)[0], MAG_NOISE_UT)
 
     def sample(self, q_nb: FloatArray) -> IntArray:
-        """Return the registers at attitudes of shape (N, 4), which must follow the previous call's.
+        """Return the registers, shape (N, 3), at attitudes that follow the previous call's, (N, 4).
 
-        Returns
-        -------
-        ndarray, shape (N, 3)
-            Counts; an axis out of range reads `MAG_OVERFLOW`.
+        An axis out of range reads `MAG_OVERFLOW`.
         """
         field_s = rotate_inverse(q_nb, self.field_n_ut) * FACE_UP
         measured_ut = field_s @ self.soft_iron.T + self.hard_iron_ut + self._noise.draw(len(q_nb))
@@ -242,8 +201,8 @@ class Bmp180:
     def __init__(self, settings: SimulatorSettings, rng: np.random.Generator) -> None:
         self.sea_level_pa = SEA_LEVEL_PA + SEA_LEVEL_SPREAD_PA * float(rng.standard_normal())
         noise, drift = rng.spawn(2)
-        self._noise = White(noise, BARO_NOISE_PA)
-        self._drift = Wander(drift, BARO_DRIFT_PA, BARO_DRIFT_S, 1.0 / settings.baro_rate_hz)
+        self._noise = Noise(noise, BARO_NOISE_PA)
+        self._drift = wander(drift, BARO_DRIFT_PA, BARO_DRIFT_S, 1.0 / settings.baro_rate_hz)
 
     def sample(self, truth: Truth) -> tuple[FloatArray, FloatArray]:
         """Return pressure in whole Pa and temperature in tenths of a degree, shapes (N,)."""
@@ -277,6 +236,20 @@ def warm_degc(time_s: FloatArray) -> FloatArray:
 def temperature_counts(temperature_degc: FloatArray) -> IntArray:
     """Convert deg C to counts of the MPU6050's temperature register."""
     return np.rint((temperature_degc - 36.53) * 340.0).astype(np.int64)
+
+
+def inertial_counts(
+    accel_s_mps2: FloatArray, gyro_s_radps: FloatArray, accel_range: int, gyro_range: int
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Convert to counts of the MPU6050, each (N, 3); also return the flags of rows that saturated.
+
+    The ranges are their codes.
+    """
+    accel_lsb = (INT16_MAX + 1) / (ACCEL_RANGES_G[accel_range] * STANDARD_GRAVITY_MPS2)
+    accel, accel_clipped = to_int16(accel_s_mps2 * accel_lsb)
+    gyro, gyro_clipped = to_int16(np.degrees(gyro_s_radps) * GYRO_LSB_PER_DPS[gyro_range])
+    flags = accel_clipped * int(ImuFlags.ACCEL_CLIPPED)
+    return accel, gyro, flags | gyro_clipped * int(ImuFlags.GYRO_CLIPPED)
 
 
 def to_int16(values: FloatArray) -> tuple[IntArray, BoolArray]:
@@ -383,24 +356,6 @@ class ImuSamples:
     truth: Truth
     """True state of the aircraft at `time_s`."""
 
-    @property
-    def accel_b_mps2(self) -> FloatArray:
-        """Specific force in body FRD from the counts, not calibrated."""
-        scale = ACCEL_RANGES_G[ACCEL_RANGE] * STANDARD_GRAVITY_MPS2 / (INT16_MAX + 1)
-        return np.asarray(self.accel_raw * FACE_UP * scale)
-
-    @property
-    def gyro_b_radps(self) -> FloatArray:
-        """Angular rate in body FRD from the counts, not calibrated."""
-        return np.asarray(np.radians(self.gyro_raw * FACE_UP / GYRO_LSB_PER_DPS[GYRO_RANGE]))
-
-    @property
-    def mag_b_ut(self) -> FloatArray:
-        """Magnetic field in body FRD, not calibrated; NaN unless it is a new reading in range."""
-        field = self.mag_raw * FACE_UP * (UT_PER_GAUSS / MAG_LSB_PER_GAUSS[MAG_GAIN])
-        usable = self.mag_new & ~np.any(self.mag_raw == MAG_OVERFLOW, axis=1)
-        return np.where(usable[:, np.newaxis], field, np.nan)
-
 
 class ImuSampler:
     """Sample MPU6050 and HMC5883L along a trajectory at the node's rate."""
@@ -420,7 +375,7 @@ class ImuSampler:
         """Return all samples before a true time that were not returned yet."""
         node_us, time_s = self._ticks.take(until_s)
         truth = self._trajectory.truth_at(time_s)
-        counts = self.inertial.sample(truth)
+        accel_raw, gyro_raw, clipped = self.inertial.sample(truth)
         mag_ticks = node_us * MAG_RATE_HZ // 1_000_000
         mag_new = np.diff(mag_ticks, prepend=self._mag_tick) > 0
         mag_time_s = self.clock.true_s(np.rint(mag_ticks * (1e6 / MAG_RATE_HZ)).astype(np.int64))
@@ -429,19 +384,16 @@ class ImuSampler:
         if len(node_us):
             self._mag_tick = int(mag_ticks[-1])
             self._mag_raw = mag_raw[-1:]
-        flags = mag_new * int(ImuFlags.MAG_NEW)
-        flags |= counts.accel_clipped * int(ImuFlags.ACCEL_CLIPPED)
-        flags |= counts.gyro_clipped * int(ImuFlags.GYRO_CLIPPED)
         return ImuSamples(
             time_s=time_s,
             node_time_us=node_us,
-            accel_raw=counts.accel,
-            gyro_raw=counts.gyro,
+            accel_raw=accel_raw,
+            gyro_raw=gyro_raw,
             mag_raw=mag_raw,
             mag_new=mag_new,
             mag_time_s=mag_time_s,
-            temperature_raw=counts.temperature,
-            flags=flags,
+            temperature_raw=temperature_counts(warm_degc(time_s)),
+            flags=clipped | mag_new * int(ImuFlags.MAG_NEW),
             truth=truth,
         )
 

@@ -125,8 +125,6 @@ class Truth:
     """Shape (N, 3), NED from home."""
     vel_n_mps: FloatArray
     """Shape (N, 3), velocity over ground."""
-    accel_n_mps2: FloatArray
-    """Shape (N, 3), kinematic acceleration: zero at rest."""
     q_nb: FloatArray
     """Shape (N, 4), scalar first, unit norm, continuous within one flight."""
     rate_b_radps: FloatArray
@@ -166,17 +164,7 @@ class Trajectory:
         self._airspeed = _spline(self._grid_s, airspeed)
 
     def truth_at(self, time_s: FloatArray) -> Truth:
-        """Return the true state at any times.
-
-        Parameters
-        ----------
-        time_s : ndarray, shape (N,)
-            Seconds since the start, not negative; beyond `FLIGHT_S` the flight repeats.
-
-        Returns
-        -------
-        Truth
-        """
+        """Return the true state at times from the start, (N,); beyond `FLIGHT_S` it repeats."""
         t = np.asarray(time_s, dtype=np.float64)
         phase = t % FLIGHT_S
         pos, accel, angles = self._pos(phase), self._accel(phase), self._angles(phase)
@@ -192,7 +180,6 @@ class Trajectory:
             alt_amsl_m=home.home_alt_m - pos[:, 2],
             pos_n_m=pos,
             vel_n_mps=self._vel(phase),
-            accel_n_mps2=accel,
             q_nb=q_nb,
             rate_b_radps=body_rates(angles, self._angle_rates(phase)),
             accel_b_mps2=rotate_inverse(q_nb, force_n),
@@ -287,27 +274,8 @@ class _Commands:
 
 
 def rotate_inverse(q_nb: FloatArray, v_n: FloatArray) -> FloatArray:
-    """Rotate many vectors from NED to the body frame.
-
-    Parameters
-    ----------
-    q_nb : ndarray, shape (N, 4)
-        Attitudes, scalar first.
-    v_n : ndarray, shape (N, 3) or (3,)
-        Vectors in NED.
-
-    Returns
-    -------
-    ndarray, shape (N, 3)
-        The same vectors in the body frame.
-    """
-    w, x, y, z = q_nb.T * ((1.0,), (-1.0,), (-1.0,), (-1.0,))
-    a, b, c = np.broadcast_to(v_n, (len(q_nb), 3)).T
-    # Written out: on short arrays NumPy's cross product takes longer than all the rest.
-    ta, tb, tc = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
-    return np.column_stack(
-        [a + w * ta + y * tc - z * tb, b + w * tb + z * ta - x * tc, c + w * tc + x * tb - y * ta]
-    )
+    """Rotate vectors from NED, (N, 3) or (3,), to the body frame of attitudes, shape (N, 4)."""
+    return np.asarray(Rotation.from_quat(q_nb, scalar_first=True).apply(v_n, inverse=True))
 
 
 def _runway_deg(settings: SimulatorSettings) -> float:
@@ -400,7 +368,6 @@ class Workbench:
             alt_amsl_m=np.full(len(t), home.home_alt_m),
             pos_n_m=still,
             vel_n_mps=still,
-            accel_n_mps2=still,
             q_nb=q_nb,
             rate_b_radps=body_rates(angles, rates),
             accel_b_mps2=rotate_inverse(q_nb, np.array([0.0, 0.0, -STANDARD_GRAVITY_MPS2])),

@@ -169,14 +169,13 @@ class TestThroughTheWire:
             if isinstance(record, ImuRaw | BaroRaw | GpsFix):
                 original = direct[type(record), record.node_time_us]
                 assert abs(record.time_us - original.time_us) < 12_000
-                if isinstance(record, ImuRaw):
-                    assert (record.accel_raw, record.gyro_raw, record.mag_raw, record.flags) == (
-                        original.accel_raw, original.gyro_raw, original.mag_raw, original.flags
-                    )  # fmt: skip
-                if isinstance(record, GpsFix):
-                    assert (record.lat_dege7, record.utc_us, record.fix_type) == (
-                        original.lat_dege7, original.utc_us, original.fix_type
-                    )  # fmt: skip
+                names = {
+                    ImuRaw: "accel_raw gyro_raw mag_raw flags temperature_raw accel_range_g",
+                    BaroRaw: "pressure_pa",
+                    GpsFix: "lat_dege7 lon_dege7 utc_us fix_type fix_ok satellites",
+                }[type(record)].split()
+                for name in names:
+                    assert getattr(record, name) == getattr(original, name), (name, record)
 
     def test_node_restart_is_counted_and_leaves_a_gap(self) -> None:
         records, report = feed(frames(30.0, imu_restart_s=12.0))

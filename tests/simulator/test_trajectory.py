@@ -37,8 +37,10 @@ def euler_deg(truth: Truth) -> np.ndarray:
 
 
 class TestConsistency:
-    def test_acceleration_integrates_to_velocity(self, truth: Truth) -> None:
-        vel = cumulative_simpson(truth.accel_n_mps2, dx=STEP_S, axis=0, initial=0.0)
+    def test_specific_force_without_gravity_integrates_to_velocity(self, truth: Truth) -> None:
+        force_n = Rotation.from_quat(truth.q_nb, scalar_first=True).apply(truth.accel_b_mps2)
+        accel_n = force_n + np.array([0.0, 0.0, STANDARD_GRAVITY_MPS2])
+        vel = cumulative_simpson(accel_n, dx=STEP_S, axis=0, initial=0.0)
         np.testing.assert_allclose(vel, truth.vel_n_mps, atol=1e-6)
 
     def test_velocity_integrates_to_position(self, truth: Truth) -> None:
@@ -56,11 +58,6 @@ class TestConsistency:
             attitude = attitude * steps[k]
         error = (attitude.inv() * Rotation.from_quat(edges.q_nb[-1], scalar_first=True)).magnitude()
         assert math.degrees(error) < 0.001
-
-    def test_specific_force_is_acceleration_without_gravity(self, truth: Truth) -> None:
-        force_n = Rotation.from_quat(truth.q_nb, scalar_first=True).apply(truth.accel_b_mps2)
-        accel_n = force_n + np.array([0.0, 0.0, STANDARD_GRAVITY_MPS2])
-        np.testing.assert_allclose(accel_n, truth.accel_n_mps2, atol=1e-9)
 
     def test_degrees_agree_with_metres(self, truth: Truth) -> None:
         for k in range(0, len(truth.time_s), 5000):
@@ -85,9 +82,6 @@ class TestFlight:
         np.testing.assert_allclose(truth.rate_b_radps[resting], 0.0, atol=1e-6)
         gravity = np.broadcast_to((0.0, 0.0, -STANDARD_GRAVITY_MPS2), (resting.sum(), 3))
         np.testing.assert_allclose(truth.accel_b_mps2[resting], gravity, atol=1e-6)
-
-    def test_flight_ends_at_home(self, truth: Truth) -> None:
-        np.testing.assert_allclose(truth.pos_n_m[-1], 0.0, atol=1e-4)
 
     def test_second_flight_equals_the_first(self, trajectory: Trajectory) -> None:
         times = np.linspace(0.0, FLIGHT_S, 40, endpoint=False)
