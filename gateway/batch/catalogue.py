@@ -121,7 +121,7 @@ class Catalogue:
         """Return size, modification time and digest of every file, by path."""
         with _catalogue_errors(self.path):
             rows = self._db.execute("SELECT DISTINCT path, size, modified, digest FROM flights")
-            return {path: known for path, *known in rows}
+            return {path: (*stamp, digest) for path, *stamp, digest in rows}
 
     def put(self, files: Iterable[CataloguedFile]) -> None:
         """Replace the rows of files, all or none of them."""
