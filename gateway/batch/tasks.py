@@ -13,7 +13,6 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import MappingProxyType
 from typing import Any, ClassVar, Final, NamedTuple
 
 import msgspec
@@ -87,7 +86,7 @@ class Worked(NamedTuple):
     vehicle: int | None
     began: str | None
     figures: dict[str, Any]
-    files: Files = MappingProxyType({})
+    files: Files
 
 
 @dataclass(frozen=True)
@@ -195,7 +194,7 @@ class SweepTask(FlightTask):
         base = score_of(contest, flight.fusion)[self.metric_column]
         values = [None if score != score else score for score in (base, *scores)]
         figures = {"base": values[0], "scores": values[1:]}
-        return Worked(header.vehicle_id, began, figures)
+        return Worked(header.vehicle_id, began, figures, {})
 
 
 def read_batch_flight(
