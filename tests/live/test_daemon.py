@@ -140,7 +140,7 @@ def _own_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
-@pytest.mark.parametrize("orderly", [True, False])
+@pytest.mark.parametrize("orderly", [True, False], ids=["orderly end", "killed"])
 async def test_signed_frame_is_not_accepted_again_after_a_restart(
     tmp_path: Path, orderly: bool
 ) -> None:
@@ -230,7 +230,7 @@ async def test_note_without_an_own_aircraft_is_sent_by_the_hub(tmp_path: Path) -
     assert "".join(chunk.text for chunk in chunks) == "Note: " + "x" * 50
 
 
-@pytest.mark.parametrize("due_us", [0, 999_000_000])
+@pytest.mark.parametrize("due_us", [0, 999_000_000], ids=["overdue", "far"])
 async def test_due_time_is_polled_neither_without_pause_nor_too_late(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, due_us: int
 ) -> None:
@@ -250,36 +250,41 @@ async def test_due_time_is_polled_neither_without_pause_nor_too_late(
         assert 0.001 <= delays[-1] <= 0.1
 
 
-async def test_ready_is_notified_once_the_control_socket_listens(
+async def test_start_notifies_once_the_control_socket_listens_and_begins_a_thread_of_look_ups(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ready: list[bool] = []
-    control = socket_path("run")
+    control, others = socket_path("run"), {*threading.enumerate()}
     monkeypatch.setattr(ServiceNotifier, "ready", lambda _: ready.append(control.is_socket()))
-    async with Running(tmp_path):
-        assert ready == [True]
-
-
-async def test_thread_of_look_ups_is_started_before_the_first_one(tmp_path: Path) -> None:
-    others = {*threading.enumerate()}
     async with Running(tmp_path) as running:
+        assert ready == [True]
         begun = running.threads - others
     assert sum("lookups" in thread.name for thread in begun) == 1
 
 
 @pytest.mark.parametrize("estimator", ["eskf", "paper"])
-async def test_reload_reports_settings_that_need_a_restart(tmp_path: Path, estimator: str) -> None:
+async def test_reload_reads_off_the_loop_and_reports_settings_that_need_a_restart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, estimator: str
+) -> None:
+    threads: list[int] = []
+
+    def noting(call: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *words: (threads.append(threading.get_ident()), call(*words))[1]
+
+    monkeypatch.setattr(daemon_module, "load_aircraft", noting(config.load_aircraft))
     running = Running(tmp_path)
     now = running.settings
     changed = replace(now, estimation=replace(now.estimation, estimator=estimator))
-    running.read = lambda: changed
+    running.read = noting(lambda: changed)
     async with running:
         status = await running.ask("reload")
     assert status.startswith("settings of the hub and of signing applied")
     assert ("others need a new start" in status) == (estimator != now.estimation.estimator)
+    assert len(threads) == 2
+    assert threading.get_ident() not in threads
 
 
-@pytest.mark.parametrize("failures", [0, 9])
+@pytest.mark.parametrize("failures", [0, 9], ids=["good disk", "failing disk"])
 async def test_settings_are_reported_as_stored_once_the_file_is_whole(
     tmp_path: Path, disk: SlowDisk, failures: int
 ) -> None:
@@ -305,20 +310,3 @@ async def test_settings_are_reported_as_stored_once_the_file_is_whole(
     else:
         assert (result, report) == (mavlink.MAV_RESULT_ACCEPTED, "Settings saved: 1.toml")
         assert "gyro_bias" in text
-
-
-async def test_files_of_settings_are_read_off_the_loop(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    threads: list[int] = []
-
-    def noting(call: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda *words: (threads.append(threading.get_ident()), call(*words))[1]
-
-    monkeypatch.setattr(daemon_module, "load_aircraft", noting(config.load_aircraft))
-    running = Running(tmp_path)
-    running.read = noting(running.read)
-    async with running:
-        await running.ask("reload")
-    assert len(threads) == 2
-    assert threading.get_ident() not in threads

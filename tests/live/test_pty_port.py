@@ -4,7 +4,8 @@ import asyncio
 import errno
 import os
 import select
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from gateway.live.pty_port import PtyPort
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.wire.framing import Fault, FrameDecoder, encode_frame
 from tests.conftest import LoopTime
+from tests.kit.process import until
 
 pytestmark = pytest.mark.io
 
@@ -37,14 +39,10 @@ class Reader:
         self.events: list[bytes | Fault] = []
         self._decoder = FrameDecoder()
         self.port = serial.Serial(path, 500_000, timeout=0, exclusive=True)
-        self._waiting: list[tuple[int, asyncio.Future[None]]] = []
         asyncio.get_running_loop().add_reader(self.port.fileno(), self.read)
 
     async def until(self, count: int) -> None:
-        done = asyncio.get_running_loop().create_future()
-        self._waiting.append((count, done))
-        self._wake()
-        await asyncio.wait_for(done, 60.0)
+        await until(lambda: len(self.events) >= count)
 
     def close(self) -> None:
         asyncio.get_running_loop().remove_reader(self.port.fileno())
@@ -52,28 +50,23 @@ class Reader:
 
     def read(self) -> None:
         self.events += self._decoder.feed(self.port.read(4096))
-        self._wake()
 
-    def _wake(self) -> None:
-        for count, done in self._waiting:
-            if len(self.events) >= count and not done.done():
-                done.set_result(None)
+
+Play = Callable[[Iterator[TimedFrame]], PtyPort]
 
 
 @pytest.fixture
-async def play() -> Iterator[Callable[..., PtyPort]]:
-    ports: list[PtyPort] = []
+async def play() -> AsyncIterator[Play]:
+    with ExitStack() as opened:
 
-    def make(source: Iterator[TimedFrame]) -> PtyPort:
-        ports.append(PtyPort(source))
-        return ports[-1]
+        def make(source: Iterator[TimedFrame]) -> PtyPort:
+            opened.callback((port := PtyPort(source)).close)
+            return port
 
-    yield make
-    for port in ports:
-        port.close()
+        yield make
 
 
-async def test_every_frame_reaches_the_reader(play: Callable[..., PtyPort]) -> None:
+async def test_every_frame_reaches_the_reader(play: Play) -> None:
     def paced() -> Iterator[TimedFrame]:
         for sent, frame in enumerate(frames(2000)):
             # The kernel keeps some kB only, and hands them over when it has the time.
@@ -92,7 +85,7 @@ async def test_every_frame_reaches_the_reader(play: Callable[..., PtyPort]) -> N
     assert port.ended.is_set()
 
 
-async def test_frames_keep_their_times(play: Callable[..., PtyPort]) -> None:
+async def test_frames_keep_their_times(play: Play) -> None:
     loop = asyncio.get_running_loop()
     port = play(frames(6, rate_hz=50.0))
     reader = Reader(port.path)
@@ -104,17 +97,21 @@ async def test_frames_keep_their_times(play: Callable[..., PtyPort]) -> None:
     reader.close()
 
 
-async def test_frames_without_a_reader_are_dropped(play: Callable[..., PtyPort]) -> None:
+async def test_frames_without_a_reader_are_dropped(play: Play) -> None:
     port = play(frames(3000))
     port.start()
     await asyncio.wait_for(port.ended.wait(), 60.0)
     assert port.written + port.dropped == 3000
     assert port.written * CONTENT_SIZE < 100_000, "only what the kernel holds"
     assert port.dropped > 500
+    assert Path(port.path).exists()
+    for _ in range(2):
+        port.close()
+    assert not Path(port.path).exists()
 
 
 async def test_reader_that_opens_late_and_again_gets_whole_frames(
-    play: Callable[..., PtyPort],
+    play: Play,
 ) -> None:
     port = play(frames(10**9))
     port.start()
@@ -131,7 +128,7 @@ async def test_reader_that_opens_late_and_again_gets_whole_frames(
 
 
 async def test_partly_written_frame_is_finished_before_the_next(
-    play: Callable[..., PtyPort],
+    play: Play,
 ) -> None:
     """A frame that half fits is finished before any other is begun."""
     port = play(frames(4000))
@@ -150,18 +147,8 @@ async def test_partly_written_frame_is_finished_before_the_next(
     assert seen == sorted(set(seen))
 
 
-async def test_closing_removes_the_terminal(play: Callable[..., PtyPort]) -> None:
-    port = play(frames(1000))
-    port.start()
-    assert Path(port.path).exists()
-    port.close()
-    port.close()
-    assert port.ended.is_set()
-    assert not Path(port.path).exists()
-
-
 async def test_frames_continue_at_their_rate_after_a_standstill(
-    play: Callable[..., PtyPort], loop_time: LoopTime
+    play: Play, loop_time: LoopTime
 ) -> None:
     port = play(frames(1000, rate_hz=100.0))
     reader = Reader(port.path)
@@ -178,7 +165,7 @@ async def test_frames_continue_at_their_rate_after_a_standstill(
 
 
 async def test_frames_that_are_made_too_slowly_are_not_all_dropped(
-    play: Callable[..., PtyPort], loop_time: LoopTime
+    play: Play, loop_time: LoopTime
 ) -> None:
     """Each takes twice its interval to be made, as on a computer without processor time."""
 
