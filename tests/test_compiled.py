@@ -108,19 +108,6 @@ def test_cached_machine_code_is_not_compiled_again_and_oldest_is_removed(
     assert use(scaling) == [12.25, 30.25]
 
 
-def write_as_other(cached: Path) -> None:
-    cached.chmod(0o666)
-
-
-def damage(cached: Path) -> None:
-    cached.write_bytes(cached.read_bytes()[:-1])
-
-
-def put_folder(cached: Path) -> None:
-    cached.unlink()
-    cached.mkdir()
-
-
 def swap(cached: Path) -> None:
     other = path_of("2")
     cached.unlink()
@@ -128,29 +115,34 @@ def swap(cached: Path) -> None:
     cached.symlink_to(other)
 
 
-@pytest.mark.parametrize("change", [write_as_other, damage, put_folder, swap])
+CHANGES: dict[str, Callable[[Path], object]] = {
+    "writable by others": lambda cached: cached.chmod(0o666),
+    "damaged": lambda cached: cached.write_bytes(cached.read_bytes()[:-1]),
+    "folder": lambda cached: (cached.unlink(), cached.mkdir()),
+    "link to another": swap,
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
 def test_cached_machine_code_that_is_damaged_or_another_users_is_compiled_again(
-    scaling: Scaling, cached: Path, tmp_path: Path, change: Callable[[Path], None]
+    scaling: Scaling, cached: Path, tmp_path: Path, change: str
 ) -> None:
     build_library(tmp_path / "first.so", [], cached=cached)
-    change(cached)
+    CHANGES[change](cached)
     build_library(path := tmp_path / "second.so", [scaling], cached=cached)
     scaling.load(path)
     assert use(scaling) == [12.25, 30.25]
 
 
-def test_link_in_the_place_of_the_cache_gets_no_file(
-    scaling: Scaling, cached: Path, tmp_path: Path
+def test_link_in_the_place_of_the_cache_or_a_missing_home_gets_no_file(
+    scaling: Scaling, cached: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (target := tmp_path / "documents").mkdir()
     cached.parent.parent.mkdir()
     cached.parent.symlink_to(target)
     build_library(tmp_path / "first.so", [scaling], cached=cached)
     assert [*target.iterdir()] == []
-
-
-def test_user_without_a_home_has_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError))
     assert cached_object("gateway/units.py 1") is None
 
@@ -184,29 +176,22 @@ def test_installed_library_is_current_and_complete() -> None:
     load_entry_points()
 
 
-@pytest.mark.parametrize(
-    ("source", "current"),
-    [
-        ("x = 3.0\ndef f():\n    return 2 * x\n", True),
-        ('"""Text."""\nx = 3.0  # m\n\n\ndef f():\n    """More."""\n    return 2 * x\n', True),
-        ("x = 3.0\ndef f():\n    return 3 * x\n", False),
-        ("x = 3.5\ndef f():\n    return 2 * x\n", False),
-        ("x = 3.0\ndef f(:\n", False),
-        (None, False),
-    ],
-)
 def test_only_a_change_of_code_makes_a_library_stale(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str | None, current: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(entry_point, "ROOT", tmp_path)
     file = tmp_path / "kernel.py"
     file.write_text("x = 3.0\ndef f():\n    return 2 * x\n")
     stamp = stamp_of(file)
-    if source is None:
-        file.unlink()
-    else:
+    assert changed_source(stamp) is None
+    file.write_text('"""Text."""\nx = 3.0  # m\n\n\ndef f():\n    """More."""\n    return 2 * x\n')
+    assert changed_source(stamp) is None
+    for source in ("x = 3.0\ndef f():\n    return 3 * x\n", "x = 3.5\ndef f():\n    return 2 * x\n",
+                   "x = 3.0\ndef f(:\n"):  # fmt: skip
         file.write_text(source)
-    assert changed_source(stamp) == (None if current else "kernel.py")
+        assert changed_source(stamp) == "kernel.py", source
+    file.unlink()
+    assert changed_source(stamp) == "kernel.py"
 
 
 def test_library_records_versions_of_its_sources(scaling: Scaling, tmp_path: Path) -> None:

@@ -112,72 +112,59 @@ def test_package_installs_and_purge_keeps_flights(package: Path, tmp_path: Path)
     assert not (root / "usr/lib/mavgate").exists()
 
 
-def test_program_starts_from_its_own_packages(unpacked: Path) -> None:
+def test_program_and_its_children_use_their_own_packages(unpacked: Path) -> None:
     program = unpacked / "usr/bin/mavgate"
-    where = f"import runpy, sys; sys.argv[:] = [{str(program)!r}, '--version'];"
-    where += f"runpy.run_path({str(program)!r}, run_name='__main__')"
-    done = python("-c", where, cwd=unpacked)
-    assert done.stdout.startswith("mavgate ")
+    code = f"""
+import atexit, runpy, subprocess, sys
+where = "import gateway; print(gateway.__file__)"
+atexit.register(subprocess.run, [sys.executable, "-c", where])
+sys.argv[:] = [{str(program)!r}, "--version"]
+runpy.run_path({str(program)!r}, run_name="__main__")
+"""
+    version, used = python("-c", code, cwd=unpacked).stdout.splitlines()
+    assert version.startswith("mavgate ")
+    assert used.startswith(str(unpacked))
     script = program.read_text()
     assert script.startswith("#!/usr/bin/python3\n")
     major, minor, *_ = sys.version_info
     assert f'MADE_FOR = "{major}.{minor}"' in script
 
 
-def test_child_processes_use_the_installed_packages(unpacked: Path) -> None:
-    program = str(unpacked / "usr/bin/mavgate")
-    code = f"""
-import atexit, runpy, subprocess, sys
-where = "import gateway; print(gateway.__file__)"
-atexit.register(subprocess.run, [sys.executable, "-c", where])
-sys.argv[:] = [{program!r}, "--version"]
-runpy.run_path({program!r}, run_name="__main__")
-"""
-    done = python("-c", code, cwd=unpacked)
-    assert done.stdout.splitlines()[1].startswith(str(unpacked))
-
-
-def test_settings_of_the_service_name_its_state_directory(unpacked: Path) -> None:
+def test_unit_starts_the_installed_program_with_its_settings(unpacked: Path) -> None:
+    lines = (unpacked / UNIT).read_text().splitlines()
+    [start] = (line.removeprefix("ExecStart=") for line in lines if line.startswith("ExecStart="))
+    assert os.access(unpacked / start.split()[0].lstrip("/"), os.X_OK)
+    assert "--config /etc/mavgate/gateway.toml" in start
+    # Without the last one it stays down after five bad starts.
+    assert {"User=mavgate", "StateDirectory=mavgate", "StartLimitIntervalSec=0"} <= {*lines}
+    assert f"RuntimeDirectory={SERVICE_FOLDER.name}" in lines
+    [guide] = (line for line in lines if line.startswith("Documentation=file://"))
+    assert (unpacked / guide.removeprefix("Documentation=file:///")).is_file()
+    assert "u mavgate " in (unpacked / "usr/lib/sysusers.d/mavgate.conf").read_text()
     settings = load(unpacked / "etc/mavgate/gateway.toml")
-    unit = (unpacked / UNIT).read_text()
-    assert "StateDirectory=mavgate" in unit
-    assert "--config /etc/mavgate/gateway.toml" in unit
     for folder in (aircraft_folder(settings), Path(settings.recording.folder)):
         assert folder.is_relative_to("/var/lib/mavgate")
 
 
-def test_unit_starts_the_installed_program(unpacked: Path) -> None:
-    lines = (unpacked / UNIT).read_text().splitlines()
-    [start] = (line.removeprefix("ExecStart=") for line in lines if line.startswith("ExecStart="))
-    program = unpacked / start.split()[0].lstrip("/")
-    assert os.access(program, os.X_OK)
-    assert f"RuntimeDirectory={SERVICE_FOLDER.name}" in lines
-    assert "User=mavgate" in lines
-    assert "StartLimitIntervalSec=0" in lines, "or it stays down after five bad starts"
-    [guide] = (line for line in lines if line.startswith("Documentation=file://"))
-    assert (unpacked / guide.removeprefix("Documentation=file:///")).is_file()
-    sysusers = (unpacked / "usr/lib/sysusers.d/mavgate.conf").read_text()
-    assert "u mavgate " in sysusers
-
-
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd-analyze")
-def test_systemd_accepts_the_unit(unpacked: Path, tmp_path: Path) -> None:
-    """With a program in place of ours, which is not installed here."""
+def test_systemd_accepts_the_unit_and_its_security_score_is_low(
+    unpacked: Path, tmp_path: Path
+) -> None:
+    """With a program in place of ours, which is not installed here.
+
+    Of 10, as `systemd-analyze security` counts; a service without any restriction has 9.6.
+    """
     unit = tmp_path / "mavgate.service"
     text = (unpacked / UNIT).read_text()
     unit.write_text(text.replace("/usr/bin/mavgate", "/bin/true").replace("User=mavgate\n", ""))
-    done = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", unit], capture_output=True, text=True, check=False
-    )
-    assert "mavgate" not in done.stderr, done.stderr
-
-
-@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd-analyze")
-def test_systemd_security_score_of_unit_is_low(unpacked: Path) -> None:
-    """Of 10, as `systemd-analyze security` counts; a service without any restriction has 9.6."""
-    words = ("security", "--offline=true", "--threshold=20", str(unpacked / UNIT))
-    done = subprocess.run(["systemd-analyze", *words], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout
+    security = ("security", "--offline=true", "--threshold=20", unpacked / UNIT)
+    for words in (("verify", "--man=no", unit), security):
+        command = ["systemd-analyze", *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if words == security:
+            assert done.returncode == 0, done.stdout
+        else:
+            assert "mavgate" not in done.stderr, done.stderr
 
 
 def test_every_known_adapter_has_its_rule(unpacked: Path) -> None:

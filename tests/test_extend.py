@@ -1,6 +1,5 @@
 """docs/extend.md: each example as it stands there, added from outside the package."""
 
-import asyncio
 import importlib
 import re
 import socket
@@ -34,6 +33,7 @@ from gateway.sources.kinds import SOURCE_KINDS, make_sources
 from gateway.sources.settings import SourceSettings
 from gateway.vehicle.telemetry.streams import ADDED_MESSAGES
 from gateway.wire.mavlink_splitter import message_id_of
+from tests.kit.process import until
 from tools.simulated_flight import fly
 
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "extend.md"
@@ -81,10 +81,6 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         registry.update(kept)
     for name in names:
         sys.modules.pop(name, None)
-
-
-def is_imu(record: object) -> bool:
-    return isinstance(record, ImuRaw)
 
 
 def fly_with(settings: AircraftSettings, seconds: float) -> list[bytes]:
@@ -142,9 +138,7 @@ async def test_added_endpoint_kind_sends_and_receives(install: Install, tmp_path
     assert message_id_of(data) == mavlink.MAVLINK_MSG_ID_ATTITUDE
     asking = mavlink.MAVLink_param_request_list_message(1, 1)
     station.sendto(bytes(asking.pack(mavlink.MAVLink(None, 255, 190))), address)
-    async with asyncio.timeout(60.0):
-        while not hub.clients()[0].received:
-            await asyncio.sleep(0)
+    await until(lambda: hub.clients()[0].received)
     (client,) = hub.clients()
     assert (client.state, client.sent, client.received) == ("open", 1, 1)
     hub.close()
@@ -152,6 +146,8 @@ async def test_added_endpoint_kind_sends_and_receives(install: Install, tmp_path
 
 
 def test_added_estimator_is_chosen_by_name(install: Install) -> None:
+    with pytest.raises(ValueError, match="unknown estimator 'gyro_only'; choose eskf, paper"):
+        EstimationSettings(estimator="gyro_only")
     install("gyro_only", example("An estimator"))
     load_extensions()
     settings = AircraftSettings(estimation=EstimationSettings(estimator="gyro_only"))
@@ -166,7 +162,9 @@ def test_added_format_is_written_and_read(install: Install, tmp_path: Path) -> N
     load_extensions()
     settings = AircraftSettings()
     options = ReadOptions(PipelineSettings(settings))
-    samples = [r for r in fly(SimulatorSettings(), duration_s=2.0).records() if is_imu(r)]
+    samples = [
+        r for r in fly(SimulatorSettings(), duration_s=2.0).records() if isinstance(r, ImuRaw)
+    ]
     table = tmp_path / "flight.csv"
     lines = [row_to_line(TableRow(r.time_us, raw=r)) for r in samples]
     table.write_text(encode_head(header_for(settings, 1)) + "".join(lines))
@@ -192,11 +190,6 @@ def test_added_view_is_built_on_page(install: Install, monkeypatch: pytest.Monke
     nicegui.ui.label().classes().set_text.assert_called_with("7 samples lost")
     with pytest.raises(ValueError, match="twice"):
         add_view("Radio", "radio", "my_tracker:build")
-
-
-def test_unknown_estimator_is_rejected_by_name() -> None:
-    with pytest.raises(ValueError, match="unknown estimator 'gyro_only'; choose eskf, paper"):
-        EstimationSettings(estimator="gyro_only")
 
 
 def test_stages_run_from_python(install: Install) -> None:

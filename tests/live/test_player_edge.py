@@ -60,7 +60,7 @@ async def test_player_emits_every_frame_and_ends(tlog: Path) -> None:
     played.close()
 
 
-def test_file_is_indexed_and_read_at_any_position(tlog: Path) -> None:
+def test_file_is_indexed_read_at_any_position_and_ends_early_if_it_shrinks(tlog: Path) -> None:
     seen: list[int] = []
     file = TlogFile(tlog, seen.append)
     assert sum(seen) == tlog.stat().st_size
@@ -68,13 +68,8 @@ def test_file_is_indexed_and_read_at_any_position(tlog: Path) -> None:
     track = Track(file, system_ids={1: 5})
     track.seek(RECORDS[500].time_us)
     assert track.peek_us() == RECORDS[500].time_us
-    file.close()
-
-
-def test_file_that_shrinks_during_playback_ends_early(tlog: Path) -> None:
-    file = TlogFile(tlog)
-    track = Track(file)
     tlog.write_bytes(make_tlog(RECORDS[:10]))
+    track = Track(file)
     track.seek(START_US)
     found = []
     while (time_us := track.peek_us()) is not None:
