@@ -54,12 +54,11 @@ def test_command_fits_the_environment(
     )
 
 
-def test_debian_package_refers_to_its_docs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_missing_modules_are_an_error_and_a_debian_package_refers_to_its_docs(
+    environment: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(extras, "DEBIAN_PACKAGE", Path(extras.__file__).parent)
     assert "/usr/share/doc/mavgate/service.md" in how_to_add("a report", "plot")
-
-
-def test_only_missing_modules_are_an_error(environment: Callable[..., Path]) -> None:
     environment("mcap")
     require("a report", "plot")
     with pytest.raises(MissingExtraError, match="needs the extra formats"):

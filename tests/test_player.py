@@ -257,20 +257,17 @@ REQUESTS = {
 """Component, message and parameters of a request; the numbers of the answers, or the result."""
 
 
-@pytest.mark.parametrize("name", REQUESTS)
-def test_request_selects_by_its_parameters(
-    make: Make, tmp_path: Path, clock: ManualClock, name: str
-) -> None:
-    component, message_id, params, expected = REQUESTS[name]
+def test_request_selects_by_its_parameters(make: Make, tmp_path: Path, clock: ManualClock) -> None:
     daemon = make(log=log_of("flight.tlog", tmp_path), paused=True)
     station = GroundStation(cast(Any, Played(daemon)), clock)
-    ack, *found = station.command(512, message_id, *params, target=(7, component))
-    numbers = [getattr(m, "storage_id", getattr(m, "image_index", None)) for m in found]
-    assert (numbers or ack.result) == expected
-    older = {261: 525, 263: 2002}.get(message_id)
-    if older is not None and len(params) == 1:
-        ack, *found = station.command(older, *params, target=(7, component))
-        assert (len(found) or ack.result) == (len(numbers) or ack.result)
+    for name, (component, message_id, params, expected) in REQUESTS.items():
+        ack, *found = station.command(512, message_id, *params, target=(7, component))
+        numbers = [getattr(m, "storage_id", getattr(m, "image_index", None)) for m in found]
+        assert (numbers or ack.result) == expected, name
+        older = {261: 525, 263: 2002}.get(message_id)
+        if older is not None and len(params) == 1:
+            ack, *found = station.command(older, *params, target=(7, component))
+            assert (len(found) or ack.result) == (len(numbers) or ack.result), name
 
 
 def test_instances_of_telemetry_are_those_played_last(

@@ -4,7 +4,6 @@ import asyncio
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -470,10 +469,10 @@ class Daemon:
 
     def _watch_loop(self, now_us: int) -> None:
         """Report once that the event loop is late; a stall is not counted as loss of the nodes."""
-        report = self._lag.update(now_us)
-        if report.stalled_us:
-            self._pipeline.on_stall(report.stalled_us, now_us)
-        if not report.changed:
+        was_slow = self._lag.is_slow
+        if stalled_us := self._lag.update(now_us):
+            self._pipeline.on_stall(stalled_us, now_us)
+        if self._lag.is_slow == was_slow:
             return
         if self._lag.is_slow:
             text = f"This computer is too slow: {self._lag.longest_us / US_PER_S:.1f} s late"
@@ -502,7 +501,7 @@ class Daemon:
             case ClientInterval():
                 self._hub.set_interval(order)
             case SaveSettings():
-                self._save(order)
+                self._save(self._pipeline.find(order.vehicle_id), order.request)
             case SavePlan():
                 self._plans.save(order.vehicle_id, order.plan)
             case RecordingRequest():
@@ -517,17 +516,17 @@ class Daemon:
             raise ControlError(f"aircraft {vehicle_id} is in flight")
         changed = msgspec.structs.replace(aircraft.settings, calibration=calibration)
         self._perform(self._pipeline.change(vehicle_id, changed, self.now_us()))
-        saved = self._files.submit(save_aircraft, self._settings, vehicle_id, aircraft.settings)
-        saved.add_done_callback(_report_saved)
+        self._save(aircraft)
 
-    def _save(self, save: SaveSettings) -> None:
-        """Write an aircraft's settings to its file, and report the outcome."""
-        aircraft, loop = self._pipeline.find(save.vehicle_id), asyncio.get_running_loop()
-        write = partial(save_aircraft, self._settings, save.vehicle_id, aircraft.settings)
-        saving = loop.run_in_executor(self._files, write)
-        saving.add_done_callback(partial(self._on_saved, aircraft, save.request))
+    def _save(self, aircraft: Aircraft, request: Request | None = None) -> None:
+        """Write an aircraft's settings to its file, and answer a request with the outcome."""
+        write = partial(save_aircraft, self._settings, aircraft.vehicle_id, aircraft.settings)
+        saving = asyncio.get_running_loop().run_in_executor(self._files, write)
+        saving.add_done_callback(partial(self._on_saved, aircraft, request))
 
-    def _on_saved(self, aircraft: Aircraft, request: Request, saving: asyncio.Future[Path]) -> None:
+    def _on_saved(
+        self, aircraft: Aircraft, request: Request | None, saving: asyncio.Future[Path]
+    ) -> None:
         vehicle_id, now_us = aircraft.vehicle_id, self.now_us()
         try:
             text, stored = saving.result().name, True
@@ -536,7 +535,9 @@ class Daemon:
             text, stored = reason_of(error), False
         else:
             log.info("settings of aircraft %d saved to %s", vehicle_id, saving.result())
-        self._perform_for(aircraft, aircraft.vehicle.on_saved(request, text, now_us, stored=stored))
+        if request is not None:
+            answer = aircraft.vehicle.on_saved(request, text, now_us, stored=stored)
+            self._perform_for(aircraft, answer)
 
     def _announce_plans(self, vehicle_id: int, trouble: str | None) -> None:
         status = StatusText(INFO, "Mission, mark and home are stored again")
@@ -559,10 +560,3 @@ def _with_simulated(settings: GatewaySettings, kind: str, path: str) -> GatewayS
     found = (SourceSettings(url=url),) if kind else ()
     serial = msgspec.structs.replace(settings.serial, port=NO_RECEIVER if kind else path)
     return msgspec.structs.replace(settings, sources=found, serial=serial)
-
-
-def _report_saved(saving: Future[Path]) -> None:
-    try:
-        log.info("calibration saved to %s", saving.result())
-    except OSError as error:
-        log.warning("the calibration cannot be saved: %s", reason_of(error))

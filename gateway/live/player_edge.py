@@ -65,7 +65,7 @@ class PlayerEdge:
         self._files = tuple(files)
         self._on_end = on_end
         self._wanted_us: int | None = None
-        self._timer: asyncio.TimerHandle | asyncio.Handle | None = None
+        self._timer: asyncio.TimerHandle | None = None
 
     def verbs(self) -> Verbs:
         """Return the handlers of the control socket; each returns the state."""
@@ -171,22 +171,17 @@ class PlayerEdge:
         if frames := self._player.poll(self._clock(), BATCH):
             self._emit(frames)
             self._emitted_us = self._clock()
-        is_idle = self._wanted_us is not None or self._player.state is not PlayState.PLAYING
-        if is_idle:
+        is_seeking, state = self._wanted_us is not None, self._player.state
+        if is_seeking or state is not PlayState.PLAYING:
             self._hold()
-        loop, due_us = asyncio.get_running_loop(), self._player.next_due_us()
-        if self._wanted_us is not None:
-            self._timer = loop.call_soon(self._turn)
+        due_us, wait_s = self._player.next_due_us(), LONGEST_WAIT_S
+        if is_seeking:
+            wait_s = 0.0
         elif due_us is not None:
-            wait_s = (due_us - self._clock()) / US_PER_S
-            if wait_s <= 0:
-                self._timer = loop.call_soon(self._turn)
-            else:
-                self._timer = loop.call_later(min(wait_s, LONGEST_WAIT_S), self._turn)
-        else:
-            self._timer = loop.call_later(LONGEST_WAIT_S, self._turn)
-            if was_playing and self._player.state is PlayState.ENDED and self._on_end is not None:
-                self._on_end()
+            wait_s = min(max((due_us - self._clock()) / US_PER_S, 0.0), LONGEST_WAIT_S)
+        self._timer = asyncio.get_running_loop().call_later(wait_s, self._turn)
+        if was_playing and state is PlayState.ENDED and not is_seeking and self._on_end is not None:
+            self._on_end()
 
     def _hold(self) -> None:
         """Repeat the state if nothing was emitted for a while."""

@@ -16,7 +16,6 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine
-from dataclasses import dataclass
 from typing import Any, Final
 
 from gateway.extras import how_to_add
@@ -118,16 +117,6 @@ def _watchdog_interval_s() -> float:
     return int(os.environ.get("WATCHDOG_USEC", "0")) / US_PER_S / 2
 
 
-@dataclass(frozen=True, slots=True)
-class LagReport:
-    """One measurement of the event loop."""
-
-    stalled_us: int
-    """Duration of a stall that has just ended; 0 for none."""
-    changed: bool
-    """Whether the state has just changed."""
-
-
 class LoopLag:
     """The delays of one event loop."""
 
@@ -147,8 +136,8 @@ class LoopLag:
         self._due_us = due_us
         self.stalled_after_us = due_us + STALL_US
 
-    def update(self, now_us: int) -> LagReport:
-        """Add one call of a timer."""
+    def update(self, now_us: int) -> int:
+        """Add one call of a timer; return the duration of a stall that has just ended, or 0."""
         self.stalled_after_us = NEVER_US
         if self._begin_us is None:
             self._begin_us = now_us
@@ -160,11 +149,10 @@ class LoopLag:
             self._delays.popleft()
         total_us = sum(delay for _, delay in self._delays)
         stalled_us = delay_us if delay_us >= STALL_US else 0
-        before = self.is_slow
         is_warm = now_us - self._begin_us >= WARM_UP_US
         if is_warm and (stalled_us or total_us > MAX_SHARE * SPAN_US):
-            self.longest_us = max(delay_us, self.longest_us if before else 0)
+            self.longest_us = max(delay_us, self.longest_us if self.is_slow else 0)
             self.is_slow, self._slow_us = True, now_us
         elif now_us - self._slow_us > RECOVERED_US:
             self.is_slow = False
-        return LagReport(stalled_us, self.is_slow != before)
+        return stalled_us

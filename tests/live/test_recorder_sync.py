@@ -92,7 +92,7 @@ async def test_recording_ends_after_the_running_sync(
 
 
 @pytest.mark.parametrize("failures", [2, 3])
-@pytest.mark.parametrize("is_stopped", [True, False])
+@pytest.mark.parametrize("is_stopped", [True, False], ids=["stopped", "closed"])
 async def test_failed_last_sync_is_reported(
     bench: RecorderBench,
     disk: SlowDisk,
@@ -124,7 +124,7 @@ async def test_recorder_closed_during_the_end_of_a_part_closes_its_files(
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-@pytest.mark.parametrize("is_corrected", [False, True])
+@pytest.mark.parametrize("is_corrected", [False, True], ids=["rotated", "corrected"])
 async def test_next_part_does_not_wait_for_the_sync_of_the_last(
     bench: RecorderBench, disk: SlowDisk, is_corrected: bool
 ) -> None:
