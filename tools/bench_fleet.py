@@ -25,7 +25,7 @@ import numpy as np
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.hub.transports.zenoh.session import open_session, out_key, presence_key, session_config
+from gateway.hub.transports.zenoh.session import open_session, session_config, site_key
 from gateway.live.control_socket import request
 from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter
 from tests.ports import free_port
@@ -138,8 +138,8 @@ def publish(locator: str, names: str, rate_hz: str, seconds: str) -> None:
     session, drop = open_session(session_config(locator, "")), zenoh.CongestionControl.DROP
     tokens, sends = [], list[Send]()
     for name in names.split(","):
-        publisher = session.declare_publisher(out_key(name, 1), congestion_control=drop)
-        tokens.append(session.liveliness().declare_token(presence_key(name, session.zid())))
+        publisher = session.declare_publisher(site_key(name, 1, "out"), congestion_control=drop)
+        tokens.append(session.liveliness().declare_token(site_key(name, "site", session.zid())))
         sends.append(publisher.put)
     load(sends, int(rate_hz), float(seconds))
 

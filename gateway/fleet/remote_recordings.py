@@ -9,7 +9,7 @@ import msgspec
 
 from gateway.fleet.session import FleetSession, NoAnswerError, QueryRefusedError, key_pattern
 from gateway.hub.endpoint import SITE_NAME
-from gateway.hub.transports.zenoh.session import off_loop, recordings_key
+from gateway.hub.transports.zenoh.session import off_loop, site_key
 from gateway.hub.transports.zenoh.site_queries import (
     DIGEST_TIMEOUT_S,
     RecordingQuery,
@@ -64,7 +64,7 @@ class RemoteRecordings:
     async def _query(self, site: str, query: RecordingQuery, timeout_s: float) -> dict[str, bytes]:
         payload = msgspec.json.encode(query)
         try:
-            return await self._session.query(recordings_key(site), payload, timeout_s)
+            return await self._session.query(site_key(site, "recordings"), payload, timeout_s)
         except NoAnswerError:
             return {}
         except QueryRefusedError as error:

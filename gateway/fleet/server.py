@@ -25,7 +25,7 @@ from gateway.hub.endpoint import SITE_NAME, Endpoint
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.hub.transports.base import Client
-from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, in_key
+from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, site_key
 from gateway.live.control_socket import ControlError, ControlServer, Verbs, socket_path
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.other_gateways import identity_verb
@@ -106,7 +106,7 @@ class SiteClient(Client):
             self.counters.dropped += 1
             return
         system_id, changed = found
-        key = in_key(self.endpoint.site, system_id)
+        key = site_key(self.endpoint.site, system_id, "in")
         if publishers.publish(key, changed.data, reliable=frame.message_id in RELIABLE_IDS):
             self.counters.sent += 1
             self.counters.bytes_sent += len(changed.data)

@@ -25,10 +25,9 @@ from gateway.hub.transports.zenoh.session import (
     is_local,
     off_loop,
     open_session,
-    out_key,
     payload_of,
-    ping_key,
     session_config,
+    site_key,
     site_of,
 )
 
@@ -162,7 +161,7 @@ class FleetSession:
 
         for pattern in self.patterns:
             self._connection.session.get(
-                ping_key(pattern),
+                site_key(pattern, "ping"),
                 record,
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -184,7 +183,7 @@ class FleetSession:
         self._round_trips = LoopQueue(lambda trip: self._events.round_trip(*trip))
         connection.readers.append(self._round_trips)
         for pattern in self.patterns:
-            frames = Subscription(connection.session, out_key(pattern, "*"), self._handle)
+            frames = Subscription(connection.session, site_key(pattern, "*", "out"), self._handle)
             self._subscriptions.append(frames)
             connection.readers.append(frames)
             connection.declared.append(frames)

@@ -31,16 +31,10 @@ import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Final
+from typing import Any, Final
 from urllib.parse import parse_qsl, urlsplit
 
-from gateway.hub.systems import (
-    FILTER_OPTIONS,
-    NO_FILTER,
-    SystemFilter,
-    new_ids_from,
-    system_filter_from,
-)
+from gateway.hub.systems import FILTER_OPTIONS, NO_FILTER, SystemFilter, ids_from, new_ids_from
 from gateway.printable import unknown_choice
 from gateway.units import BITS_PER_BYTE, US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
@@ -295,35 +289,24 @@ def parse_endpoint(url: str) -> Endpoint:
         options = _options(kind, query)
         added_kind = ADDED_KINDS.get(kind, AddedKind())
         added = {key: options.pop(key) for key in added_kind.options & options.keys()}
-        site, keys = options.get("site", ""), options.get("keys", SITE_KEYS)
-        _check_fleet(kind, site, keys)
         parts = [f"{key}={value}" for key, value in (options | added).items() if key in PARTS]
+        location = "?".join([f"{kind}:{rest}", *parts])
+        given: dict[str, Any] = {"name": location, "budget": _bandwidth(kind, port)}
+        for option, text in options.items():
+            if option in READERS:
+                name, read = READERS[option]
+                given[name] = read(text)
         endpoint = Endpoint(
             url=url,
             kind=kind,
             host=host,
             port=port,
-            location=(location := "?".join([f"{kind}:{rest}", *parts])),
-            name=name_from(options.get("name", location)),
-            allow=messages_from(options.get("allow", "")),
-            deny=messages_from(options.get("deny", "")),
+            location=location,
             systems=selection_from(options),
-            new_ids=new_ids_from(options.get("as", "")),
-            interval_us=intervals_from(options.get("rate", "")),
-            pack_bytes=number_from(options.get("pack", "0"), "pack", 0, MAX_PACK_BYTES),
-            pack_wait_s=number_from(options.get("wait", "0"), "wait", 0, MAX_WAIT_MS) / MS_PER_S,
-            budget=_budget(kind, port, options.get("budget")),
-            trusted=yes_or_no("trusted", options.get("trusted")),
-            cache=yes_or_no("cache", options.get("cache")),
-            monitor=yes_or_no("monitor", options.get("monitor")) or False,
-            mavlink=number_from(options.get("mavlink", "0"), "mavlink", 0, 2),
-            origins=_origins(options.get("origins", "")),
-            path=_path(options.get("path", "/")),
-            site=site,
-            keys=keys,
-            config=options.get("config", ""),
             added=added,
+            **given,
         )
+        _check_fleet(endpoint)
         added_kind.check(endpoint)
     except ValueError as error:
         raise ValueError(f"endpoint {url!r}: {error}") from None
@@ -332,9 +315,11 @@ def parse_endpoint(url: str) -> Endpoint:
 
 def selection_from(options: Mapping[str, str]) -> SystemFilter:
     """Read the options that select systems; raises ValueError."""
-    also = messages_from(options.get("also", ""))
-    only, without, components = (options.get(key, "") for key in FILTER_OPTIONS)
-    return system_filter_from(only, without, components, also)
+    only, without, components = (ids_from(key, options.get(key, "")) for key in FILTER_OPTIONS)
+    found = SystemFilter(only, without, components, messages_from(options.get("also", "")))
+    if both := found.only & found.without:
+        raise ValueError(f"system {min(both)} is in both systems= and not-systems=")
+    return found
 
 
 def host_and_port(host: object, port: object) -> str:
@@ -413,10 +398,8 @@ def _options(kind: str, query: str) -> dict[str, str]:
     return options
 
 
-def _budget(kind: str, baud: int, text: str | None) -> int:
-    """Read the bandwidth of a link; that of a serial line is at most its baud rate."""
-    if text is not None:
-        return number_from(text, "budget", 0, MAX_BUDGET)
+def _bandwidth(kind: str, baud: int) -> int:
+    """Return the bandwidth of a link without `budget`: that of a serial line is its baud rate."""
     return baud // BITS_PER_BYTE if kind == EndpointKind.SERIAL else 0
 
 
@@ -431,8 +414,9 @@ def _origins(text: str) -> frozenset[str]:
     return origins
 
 
-def _check_fleet(kind: str, site: str, keys: str) -> None:
-    if kind != EndpointKind.ZENOH:
+def _check_fleet(endpoint: Endpoint) -> None:
+    site, keys = endpoint.site, endpoint.keys
+    if endpoint.kind != EndpointKind.ZENOH:
         return
     if keys not in (SITE_KEYS, RAW_KEYS, JSON_KEYS):
         raise ValueError(unknown_choice("keys", keys, (SITE_KEYS, RAW_KEYS, JSON_KEYS)))
@@ -536,10 +520,38 @@ def intervals_from(text: str) -> dict[int, int]:
     return intervals
 
 
-def yes_or_no(option: str, text: str | None) -> bool | None:
-    """Read `yes` or `no`; None stays None."""
-    if text is None:
-        return None
-    if text not in {"yes", "no"}:
-        raise ValueError(f"{option} {text!r} is not yes or no")
-    return text == "yes"
+def yes_or_no(option: str) -> Callable[[str], bool]:
+    """Return the reader of an option that is `yes` or `no`."""
+
+    def read(text: str) -> bool:
+        if text not in {"yes", "no"}:
+            raise ValueError(f"{option} {text!r} is not yes or no")
+        return text == "yes"
+
+    return read
+
+
+def _number(option: str, high: int) -> Callable[[str], int]:
+    return lambda text: number_from(text, option, 0, high)
+
+
+READERS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
+    "name": ("name", name_from),
+    "allow": ("allow", messages_from),
+    "deny": ("deny", messages_from),
+    "rate": ("interval_us", intervals_from),
+    "pack": ("pack_bytes", _number("pack", MAX_PACK_BYTES)),
+    "wait": ("pack_wait_s", lambda text: number_from(text, "wait", 0, MAX_WAIT_MS) / MS_PER_S),
+    "budget": ("budget", _number("budget", MAX_BUDGET)),
+    "trusted": ("trusted", yes_or_no("trusted")),
+    "cache": ("cache", yes_or_no("cache")),
+    "monitor": ("monitor", yes_or_no("monitor")),
+    "mavlink": ("mavlink", _number("mavlink", 2)),
+    "as": ("new_ids", new_ids_from),
+    "origins": ("origins", _origins),
+    "path": ("path", _path),
+    "site": ("site", str),
+    "keys": ("keys", str),
+    "config": ("config", str),
+}
+"""The field of each option, and the function that reads its text or raises ValueError."""

@@ -288,36 +288,31 @@ class Fanout:
             skipped[origin] += 1
 
     def answer(
-        self, frame: MavFrame, sequence: int, client_ids: Collection[int], now_us: int
+        self,
+        frame: MavFrame,
+        sequence: int,
+        client_ids: Collection[int],
+        now_us: int,
+        *,
+        measures: bool = False,
     ) -> None:
-        """Send one of our own frames to some clients only, past their filters."""
+        """Send one of our own frames to some clients only, and leave no gap at the others.
 
-        def gets(each: _Subscription) -> bool:
-            is_one = each.client.client_id in client_ids
-            return (is_one or each.client.endpoint.monitor) and each.carries(frame)
-
-        self._send_some(frame, sequence, gets, now_us)
-
-    def measure(self, frame: MavFrame, client_ids: Collection[int], now_us: int) -> None:
-        """Send a frame that measures a round trip to some clients, whatever systems they select."""
-
-        def gets(each: _Subscription) -> bool:
-            client = each.client
-            return client.client_id in client_ids and client.endpoint.passes(frame.message_id)
-
-        self._send_some(frame, frame.sequence, gets, now_us)
-
-    def _send_some(
-        self, frame: MavFrame, sequence: int, gets: Callable[[_Subscription], bool], now_us: int
-    ) -> None:
-        """Send a frame of ours to some clients, and leave no gap in the numbers of the others."""
+        It passes their filters; one that `measures` a round trip is not of the selected systems,
+        and is sent to no monitor, and only if its message passes.
+        """
         # A copy: a client that breaks at this frame removes itself.
         for subscription in tuple(self._subscriptions.values()):
-            skipped = subscription.skipped
-            if gets(subscription):
+            client, skipped = subscription.client, subscription.skipped
+            gets = client.client_id in client_ids
+            if measures:
+                gets = gets and client.endpoint.passes(frame.message_id)
+            else:
+                gets = (gets or client.endpoint.monitor) and subscription.carries(frame)
+            if gets:
                 subscription.answered += len(frame.data)
                 number = sequence - skipped[frame.origin] & SEQUENCE_MASK
-                subscription.client.send(self._signer.sequence_and_sign(frame, number, now_us))
+                client.send(self._signer.sequence_and_sign(frame, number, now_us))
             else:
                 skipped[frame.origin] += 1
 

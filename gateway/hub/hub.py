@@ -128,7 +128,9 @@ class Hub:
         self._clients: dict[int, Client] = {}
         self._endpoints: dict[str, Client | Listener[Any]] = {}
         self._next_id = 1
-        self.forwarding = _new_forwarding()
+        self.forwarding = Forwarding()
+        if problem := self.forwarding.problem:
+            log.warning("%s; Python forwards, at less than half the speed", problem)
         self._share_reads()
         self._fanout = Fanout(signer, self.forwarding, on_foreign, on_run, is_recording=keeps_order)
         self.finish_run, self.update_buffer = self._fanout.finish_run, self._fanout.update_buffer
@@ -495,12 +497,4 @@ class Hub:
                 asked[system].add(client.client_id)
         for system, client_ids in asked.items():
             for frame in self._round_trip.ask(system, now_us):
-                self._fanout.measure(frame, client_ids, now_us)
-
-
-def _new_forwarding() -> Forwarding:
-    """Return the memory of the compiled step; log a warning if the step is missing."""
-    forwarding = Forwarding()
-    if forwarding.problem is not None:
-        log.warning("%s; Python forwards, at less than half the speed", forwarding.problem)
-    return forwarding
+                self._fanout.answer(frame, frame.sequence, client_ids, now_us, measures=True)

@@ -448,4 +448,6 @@ class Router:
             answer = self._round_trip.answer(frame, systems[0] if systems else NOBODY, now_us)
             if answer is not None:
                 self.charge(incoming.client_id, len(answer.data))
-                self._fanout.measure(answer, {client.client_id}, now_us)
+                self._fanout.answer(
+                    answer, answer.sequence, {client.client_id}, now_us, measures=True
+                )

@@ -163,17 +163,25 @@ class ClientAlert(NamedTuple):
     text: str
 
 
+@dataclass(slots=True)
+class _Known:
+    """Known problems of a client or listening port."""
+
+    away_since_us: int | None = None
+    is_away_reported: bool = False
+    note: str = ""
+    noted_us: int | None = None
+    """Since when the note waits to be announced."""
+    dropped: int | None = None
+    """Dropped frames at the last update, if the client was open."""
+    slow_until_us: int = 0
+
+
 class ClientAlerts:
     """Detect problems from the figures of clients and listening ports."""
 
     def __init__(self) -> None:
-        self._away_since_us: dict[Key, int] = {}
-        self._away_reported: set[Key] = set()
-        self._notes: dict[int, tuple[str, int | None]] = {}
-        """The note of each client, and since when it waits to be announced."""
-        self._dropped: dict[int, int] = {}
-        """Drop counts of the clients that were open at the last update."""
-        self._slow_until_us: dict[int, int] = {}
+        self._known: dict[Key, _Known] = {}
         self._limiter = LogRateLimiter(ALERTS_IN_FULL, "more alerts of clients of listening ports")
 
     def update(
@@ -184,15 +192,16 @@ class ClientAlerts:
     ) -> list[ClientAlert]:
         """Compare all figures with the previous ones."""
         ports = {listener.endpoint for listener in listeners}
-        self._keep_only({client.client_id for client in clients}, ports)
+        there: tuple[Key, ...] = (*ports, *(client.client_id for client in clients))
+        before = self._known
+        self._known = {key: before[key] if key in before else _Known() for key in there}
         alerts = [ClientAlert(True, text) for text in self._limiter.poll(now_us)]
-        for listener in listeners:
-            alerts += self._outage_alerts(listener.endpoint, listener.name, listener.reason, now_us)
+        for port in listeners:
+            alerts += _outages(self._known[port.endpoint], port.name, port.reason, now_us)
         for client in clients:
-            state = ALERT_STATES.get(client.state, "")
-            trouble = client.reason or state if state else ""
-            found = self._outage_alerts(client.client_id, client.name, trouble, now_us)
-            found += self._slow(client, now_us) + self._noted(client, now_us)
+            known, state = self._known[client.client_id], ALERT_STATES.get(client.state, "")
+            found = _outages(known, client.name, client.reason or state if state else "", now_us)
+            found += _drops(known, client, now_us) + _notes(known, client, now_us)
             if client.endpoint in ports:
                 found = [
                     ClientAlert(is_problem, line)
@@ -202,48 +211,32 @@ class ClientAlerts:
             alerts += found
         return alerts
 
-    def _outage_alerts(self, key: Key, name: str, trouble: str, now_us: int) -> list[ClientAlert]:
-        if not trouble:
-            self._away_since_us.pop(key, None)
-            if key in self._away_reported:
-                self._away_reported.remove(key)
-                return [ClientAlert(False, f"{name} is back")]
-            return []
-        since_us = self._away_since_us.setdefault(key, now_us)
-        if key in self._away_reported or now_us - since_us < ALERT_AFTER_US:
-            return []
-        self._away_reported.add(key)
-        return [ClientAlert(True, f"{name}: {trouble}")]
 
-    def _noted(self, client: ClientStats, now_us: int) -> list[ClientAlert]:
-        text, since_us = self._notes.get(client.client_id, ("", None))
-        if client.note != text:
-            self._notes[client.client_id] = client.note, now_us if client.note else None
-        elif since_us is not None and now_us - since_us >= ALERT_AFTER_US:
-            self._notes[client.client_id] = text, None
-            return [ClientAlert(True, f"{client.name}: {text}")]
+def _outages(known: _Known, name: str, trouble: str, now_us: int) -> list[ClientAlert]:
+    if not trouble:
+        ended, known.away_since_us, known.is_away_reported = known.is_away_reported, None, False
+        return [ClientAlert(False, f"{name} is back")] if ended else []
+    if known.away_since_us is None:
+        known.away_since_us = now_us
+    if known.is_away_reported or now_us - known.away_since_us < ALERT_AFTER_US:
         return []
+    known.is_away_reported = True
+    return [ClientAlert(True, f"{name}: {trouble}")]
 
-    def _slow(self, client: ClientStats, now_us: int) -> list[ClientAlert]:
-        key = client.client_id
-        before = self._dropped.pop(key, client.dropped)
-        if client.state == "open":
-            self._dropped[key] = client.dropped
-        if client.dropped == before or client.state != "open":
-            if self._slow_until_us.get(key, now_us + 1) <= now_us:
-                del self._slow_until_us[key]
-            return []
-        was_slow = key in self._slow_until_us
-        self._slow_until_us[key] = now_us + SLOW_FOR_US
-        return (
-            [] if was_slow else [ClientAlert(True, f"{client.name} is too slow: telemetry dropped")]
-        )
 
-    def _keep_only(self, clients: set[int], listeners: set[str]) -> None:
-        for known in (self._notes, self._dropped, self._slow_until_us):
-            for client_id in known.keys() - clients:
-                known.pop(client_id)
-        there = clients | listeners
-        for key in self._away_since_us.keys() - there:
-            del self._away_since_us[key]
-        self._away_reported &= there
+def _notes(known: _Known, client: ClientStats, now_us: int) -> list[ClientAlert]:
+    if client.note != known.note:
+        known.note, known.noted_us = client.note, now_us if client.note else None
+    elif known.noted_us is not None and now_us - known.noted_us >= ALERT_AFTER_US:
+        known.noted_us = None
+        return [ClientAlert(True, f"{client.name}: {client.note}")]
+    return []
+
+
+def _drops(known: _Known, client: ClientStats, now_us: int) -> list[ClientAlert]:
+    before, known.dropped = known.dropped, client.dropped if client.state == "open" else None
+    if before is None or known.dropped in (None, before):
+        return []
+    was_slow, known.slow_until_us = now_us < known.slow_until_us, now_us + SLOW_FOR_US
+    text = f"{client.name} is too slow: telemetry dropped"
+    return [] if was_slow else [ClientAlert(True, text)]

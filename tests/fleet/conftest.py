@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.fleet.server import FleetServer
 from gateway.fleet.settings import FleetSettings, SiteSettings
 from gateway.hub.settings import HubSettings
-from gateway.hub.transports.zenoh.session import open_session, presence_key, session_config
+from gateway.hub.transports.zenoh.session import open_session, session_config, site_key
 from gateway.live.control_socket import request
 from tests.kit.cli import invoke
 from tests.kit.hub import Rig, Station, rig
@@ -177,4 +177,4 @@ def forger(world: World) -> Iterator[Any]:
 
 def announce(session: Any, site: str, token: object = None) -> Any:
     """Announce a session of a site, by default the announcing one."""
-    return session.liveliness().declare_token(presence_key(site, str(token or session.zid())))
+    return session.liveliness().declare_token(site_key(site, "site", token or session.zid()))

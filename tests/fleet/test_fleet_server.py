@@ -16,7 +16,7 @@ from gateway.fleet.id_map import LAST_ID
 from gateway.fleet.server import FleetServer
 from gateway.fleet.settings import FleetSettings
 from gateway.hub.settings import HubSettings
-from gateway.hub.transports.zenoh.session import out_key
+from gateway.hub.transports.zenoh.session import site_key
 from gateway.live.control_socket import ControlError
 from gateway.wire.mavlink_signing import EPOCH_2015_US, TICK_US, key_from_passphrase
 from tests.fleet.conftest import World, announce, opened_world, run
@@ -78,7 +78,7 @@ async def test_abandoned_site_is_removed_when_sites_are_full(
     # Ids are saved at the intervals at which room is made: once for each of the vehicles.
     saved = Path(settings.ids_file)
     for system in (1, 2):
-        forger.put(out_key("field-1", system), world.rig.sender(system).heartbeat())
+        forger.put(site_key("field-1", system, "out"), world.rig.sender(system).heartbeat())
         await world.until(lambda n=system: saved.exists() and f"1/{n}" in saved.read_text())
     assert "field-2" in world.shown()
     monkeypatch.setattr(fleet_server, "ABANDONED_US", 0)
@@ -282,7 +282,7 @@ async def test_session_under_many_names_takes_ids_of_one_site(world: World, forg
     def forge(least: int) -> bool:
         for number in range(6):
             for system in range(1, 60):
-                key = out_key(f"field-{number}", system)
+                key = site_key(f"field-{number}", system, "out")
                 forger.put(key, world.rig.sender(system).heartbeat())
         return len(world.ids()) >= least
 

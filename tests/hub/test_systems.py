@@ -36,9 +36,9 @@ GCS = heartbeat(mavlink.MAV_TYPE_GCS, 8)
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ("systems=0", "systems 0 is not an id from 1 to 255"),
+        ("systems=0", "systems '0' is not an id from 1 to 255"),
         ("systems=1,x", "systems 'x' is not an id from 1 to 255"),
-        ("not-systems=256", "not-systems 256 is not an id"),
+        ("not-systems=256", "not-systems '256' is not an id"),
         ("systems=1,2&not-systems=2", "system 2 is in both"),
         ("components=-1", "components '-1' is not an id"),
         ("as=1:11,2:11", "an id is given twice"),

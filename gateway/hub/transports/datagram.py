@@ -79,18 +79,10 @@ class DatagramClient(Client):
 
     def transmit(self, frame: MavFrame) -> None:
         """Send one frame; count it as dropped if the network refuses it."""
-        data = frame.data
         if self._packer is not None:
-            self._packer.add(data)
-            return
-        try:
-            self.write(data)
-        except OSError as error:
-            self._recover(data, 1, error)
-            return
-        counters = self.counters
-        counters.sent += 1
-        counters.bytes_sent += len(data)
+            self._packer.add(frame.data)
+        else:
+            self._send(frame.data)
 
     def close(self) -> None:
         """Close the socket."""
@@ -176,7 +168,7 @@ class DatagramClient(Client):
             if number:
                 self._recover(data, 1, OSError(number, os.strerror(number)))
             else:
-                self._send_packed([data])
+                self._send(data)
             number = 0
 
     def _packer_of(self, endpoint: Endpoint) -> Packer | None:
@@ -186,13 +178,17 @@ class DatagramClient(Client):
         return Packer(endpoint.pack_bytes, self._send_packed, flush_soon)
 
     def _send_packed(self, frames: list[bytes]) -> None:
-        data = b"".join(frames)
+        self._send(b"".join(frames), len(frames))
+
+    def _send(self, data: bytes, frames: int = 1) -> None:
         try:
             self.write(data)
         except OSError as error:
-            self._recover(data, len(frames), error)
-            return
-        self._count_sent(len(frames), len(data))
+            self._recover(data, frames, error)
+        else:
+            counters = self.counters
+            counters.sent += frames
+            counters.bytes_sent += len(data)
 
     def _count_sent(self, frames: int, size: int) -> None:
         self.counters.sent += frames

@@ -1,6 +1,7 @@
 """The transport of each kind of endpoint."""
 
 from collections.abc import Callable, Iterable
+from importlib import import_module
 from typing import Any, Final
 
 from gateway.hub.endpoint import (
@@ -31,38 +32,29 @@ ZENOH: Final[dict[str, type[ZenohClient]]] = {
 }
 
 
-def _ws_client(context: HubContext, client_id: int, endpoint: Endpoint) -> Client:
-    # Imported here: most gateways have no WebSocket, and its library is slow to import.
-    from gateway.hub.transports.websocket import WsClient
-
-    return WsClient(context, client_id, endpoint)
-
-
-def _zenoh_client(context: HubContext, client_id: int, endpoint: Endpoint) -> Client:
-    return ZENOH[endpoint.keys](context, client_id, endpoint)
+def _websocket(module: str, name: str) -> Callable[..., Any]:
+    """Return a maker; most gateways have no WebSocket, and its library is slow to import."""
+    package = "gateway.hub.transports"
+    return lambda *arguments: getattr(import_module(f"{package}.{module}"), name)(*arguments)
 
 
-def _ws_listener(context: HubContext, endpoint: Endpoint) -> Listener[Any]:
-    from gateway.hub.transports.websocket_listen import WsListener
-
-    return WsListener(context, endpoint)
-
-
+_WS_CLIENT: Final = _websocket("websocket", "WsClient")
+_WS_LISTENER: Final = _websocket("websocket_listen", "WsListener")
 CLIENTS: Final[dict[str, ClientMaker]] = {
     EndpointKind.UDP: UdpClient,
     EndpointKind.UDP_BROADCAST: GroupClient,
     EndpointKind.UDP_MULTICAST: GroupClient,
     EndpointKind.TCP: TcpClient,
-    EndpointKind.WS: _ws_client,
-    EndpointKind.WSS: _ws_client,
-    EndpointKind.ZENOH: _zenoh_client,
+    EndpointKind.WS: _WS_CLIENT,
+    EndpointKind.WSS: _WS_CLIENT,
+    EndpointKind.ZENOH: lambda hub, number, url: ZENOH[url.keys](hub, number, url),
     EndpointKind.SERIAL: SerialClient,
 }
 LISTENERS: Final[dict[str, Callable[[HubContext, Endpoint], Listener[Any]]]] = {
     EndpointKind.UDP_LISTEN: UdpListener,
     EndpointKind.TCP_LISTEN: TcpListener,
-    EndpointKind.WS_LISTEN: _ws_listener,
-    EndpointKind.WSS_LISTEN: _ws_listener,
+    EndpointKind.WS_LISTEN: _WS_LISTENER,
+    EndpointKind.WSS_LISTEN: _WS_LISTENER,
 }
 
 

@@ -143,7 +143,7 @@ class StreamClient(QueuedClient):
 
     def transmit(self, frame: MavFrame) -> None:
         """Send one frame at once if nothing waits, else queue it."""
-        if self._socket is None:
+        if self._socket is None or self.state != "open":
             self.counters.dropped += 1
             return
         if self._partial or self._queue:

@@ -11,7 +11,6 @@ from gateway.hub.settings import HubSettings
 from gateway.hub.transports.stream import StreamClient
 from gateway.hub.transports.tcp import TcpClient
 from gateway.hub.transports.url_files import read_text, regular_file
-from gateway.wire.mavlink_splitter import MavFrame
 
 READ_BYTES: Final = 16_384
 """Bytes of one read: a TLS record."""
@@ -156,6 +155,9 @@ class TlsStream(StreamClient):
         """Return the network bytes of some bytes."""
         return data if self._tls is None else self._tls.wrap(data)
 
+    def _wrap(self, frames: bytes) -> bytes:
+        return self.encrypt(frames)
+
     def decrypt(self, data: bytes) -> bytes:
         """Return the bytes in some network bytes; answers of the handshake are sent."""
         if self._tls is None:
@@ -208,16 +210,6 @@ class TlsClient(TlsStream, TcpClient):
         """Close the connection, and keep the reason until another is made."""
         self._broke()
         self.state, self.reason = "unreachable", reason
-
-    def transmit(self, frame: MavFrame) -> None:
-        """Send one message after the handshake."""
-        if self.state == "open":
-            super().transmit(frame)
-        else:
-            self.counters.dropped += 1
-
-    def _wrap(self, frames: bytes) -> bytes:
-        return self.encrypt(frames)
 
     def accept(self, data: bytes, now_us: int) -> None:
         """Process received bytes."""

@@ -77,10 +77,7 @@ class WebStream(TlsStream):
 
     def transmit(self, frame: MavFrame) -> None:
         """Send one frame at once, or queue it if others wait or are to be packed with it."""
-        if self.state != "open":
-            self.counters.dropped += 1
-            return
-        if not self.endpoint.pack_bytes:
+        if not self.endpoint.pack_bytes or self.state != "open":
             super().transmit(frame)
             return
         self._push(frame)

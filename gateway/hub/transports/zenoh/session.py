@@ -53,7 +53,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ROOT: Final = "mavlink"
-ALL_SYSTEMS: Final = "*"
 OWN: Final = b"own"
 RAW_OUT: Final = "mavlink_raw/out"
 RAW_IN: Final = "mavlink_raw/in"
@@ -101,29 +100,9 @@ _Reliable = tuple["zenoh.Publisher", bytes, bytes | None]
 _calls: Final = ThreadPoolExecutor(MAX_CALLS, "zenoh")
 
 
-def out_key(site: str, system: object) -> str:
-    """Return the key of frames of a system of a site."""
-    return f"{ROOT}/{site}/{system}/out"
-
-
-def in_key(site: str, system: object) -> str:
-    """Return the key of frames for a system of a site."""
-    return f"{ROOT}/{site}/{system}/in"
-
-
-def presence_key(site: str, session: object) -> str:
-    """Return the key of the token of one session of a site."""
-    return f"{ROOT}/{site}/site/{session}"
-
-
-def ping_key(site: str) -> str:
-    """Return the key whose queries a site answers at once, to measure the round trip."""
-    return f"{ROOT}/{site}/ping"
-
-
-def recordings_key(site: str) -> str:
-    """Return the key of queries for a site's recordings."""
-    return f"{ROOT}/{site}/recordings"
+def site_key(site: str, *rest: object) -> str:
+    """Return a key of a site, as in the table above."""
+    return "/".join(map(str, (ROOT, site, *rest)))
 
 
 def site_of(key: str) -> str:
@@ -456,7 +435,7 @@ class Connection:
             presence.put((site_of(key), key.rpartition("/")[2], sample.kind == here))
 
         self.readers.append(presence)
-        tokens, liveliness = presence_key(site, "*"), self.session.liveliness()
+        tokens, liveliness = site_key(site, "site", "*"), self.session.liveliness()
         self.declared.append(liveliness.declare_subscriber(tokens, put, history=True))
 
     def close(self) -> None:

@@ -4,16 +4,7 @@ import logging
 from typing import Final
 
 from gateway.hub.transports.zenoh.client import Topic, ZenohClient
-from gateway.hub.transports.zenoh.session import (
-    ALL_SYSTEMS,
-    OWN,
-    Connection,
-    in_key,
-    out_key,
-    ping_key,
-    presence_key,
-    recordings_key,
-)
+from gateway.hub.transports.zenoh.session import OWN, Connection, site_key
 from gateway.hub.transports.zenoh.site_queries import QueryAnswers, RecordingAnswers
 from gateway.wire.mavlink_splitter import MavFrame
 
@@ -34,23 +25,23 @@ class ZenohSite(ZenohClient):
     @property
     def in_key(self) -> str:
         """The key of frames for any system of the site."""
-        return in_key(self.endpoint.site, ALL_SYSTEMS)
+        return site_key(self.endpoint.site, "*", "in")
 
     def topic_of(self, frame: MavFrame) -> Topic:
         """Return where a frame is published: by its system, and marked if that is our own."""
         attachment = OWN if self.context.is_own(frame.origin) else None
-        return Topic(out_key(self.endpoint.site, frame.origin[0]), attachment)
+        return Topic(site_key(self.endpoint.site, frame.origin[0], "out"), attachment)
 
     def declare(self, connection: Connection) -> None:
         """Announce the site's presence, and answer queries."""
         session, site = connection.session, self.endpoint.site
         self._duplicate_sessions.clear()
-        token = session.liveliness().declare_token(presence_key(site, session.zid()))
-        connection.declared += [token, QueryAnswers(session, ping_key(site), lambda _: b"")]
+        token = session.liveliness().declare_token(site_key(site, "site", session.zid()))
+        connection.declared += [token, QueryAnswers(session, site_key(site, "ping"), lambda _: b"")]
         connection.watch_presence(site, self._handle_presence)
         if self.trusted and self.context.recordings is not None:
             answers = RecordingAnswers(self.context.recordings)
-            connection.declared.append(QueryAnswers(session, recordings_key(site), answers))
+            connection.declared.append(QueryAnswers(session, site_key(site, "recordings"), answers))
 
     def tick(self, now_us: int) -> None:
         """Open the session, check whether it has a router, and report duplicate names."""
