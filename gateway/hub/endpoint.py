@@ -64,10 +64,6 @@ RAW_KEYS: Final = "mavlink_raw"
 JSON_KEYS: Final = "mavlink_json"
 SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
 """A segment of a Zenoh key or of a path without special characters."""
-COMMON_OPTIONS: Final = frozenset(
-    {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted", "monitor", "mavlink"}
-    | {*FILTER_OPTIONS, "also", "as", "cache"}
-)
 ALIASES: Final = {
     "udpin": "udp-listen",
     "udps": "udp-listen",
@@ -178,14 +174,12 @@ OPEN_TO_ALL: Final = LISTENING | {EndpointKind.UDP_BROADCAST, EndpointKind.UDP_M
 """Kinds that serve unknown peers. They bind to an address; looking up a name would block."""
 TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
 """Kinds that use TLS."""
-OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
-    EndpointKind.WS: frozenset({"path"}),
-    EndpointKind.WSS: frozenset({"path"}),
-    EndpointKind.WS_LISTEN: frozenset({"origins"}),
-    EndpointKind.WSS_LISTEN: frozenset({"origins"}),
-    EndpointKind.ZENOH: frozenset({"site", "keys", "config"}),
+OWN_OPTIONS: Final[dict[str, frozenset[EndpointKind]]] = {
+    "path": frozenset({EndpointKind.WS, EndpointKind.WSS}),
+    "origins": frozenset({EndpointKind.WS_LISTEN, EndpointKind.WSS_LISTEN}),
+    **dict.fromkeys(("site", "keys", "config"), frozenset({EndpointKind.ZENOH})),
 }
-"""Options that only some kinds have."""
+"""Kinds of the options that only some have."""
 HOSTED: Final = LISTENING | {EndpointKind.UDP, EndpointKind.TCP, EndpointKind.WS, EndpointKind.WSS}
 """Kinds whose frames are sent to the addresses of single hosts."""
 
@@ -272,13 +266,6 @@ class Endpoint:
 
 def parse_endpoint(url: str) -> Endpoint:
     """Read one endpoint URL, as in the table of this module.
-
-    Options are `name`, `allow`, `deny` (message names or numbers, separated by commas), `rate`
-    (`NAME:hertz`, separated by commas), `pack` (bytes), `wait` (milliseconds), `budget` (bytes a
-    second), `trusted`, `monitor` and `cache` (yes or no), `mavlink` (1 or 2), `systems`,
-    `not-systems`, `components` (ids, separated by commas), `also` (messages), `as` (see
-    `new_ids_from`), and of some kinds `origins` (separated by commas), `path`, `site`, `keys` and
-    `config`.
 
     Raises ValueError if a part of it is invalid; the text gives the allowed values.
     """
@@ -384,8 +371,9 @@ def stays_here(endpoint: Endpoint) -> bool:
 
 def _options(kind: str, query: str) -> dict[str, str]:
     """Read the options; a repeated one is refused, since their order would decide its value."""
-    own = ADDED_KINDS[kind].options if kind in ADDED_KINDS else OWN_OPTIONS.get(kind, frozenset())
-    known = COMMON_OPTIONS | own
+    names = (*READERS, *FILTER_OPTIONS, "also")
+    known = {name for name in names if name not in OWN_OPTIONS or kind in OWN_OPTIONS[name]}
+    known |= ADDED_KINDS[kind].options if kind in ADDED_KINDS else set()
     options: dict[str, str] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in known:

@@ -36,6 +36,7 @@ from gateway.hub.transports.base import (
     UNTRUSTED_READ_BURST,
     UNTRUSTED_READ_RATE,
     Client,
+    HubContext,
 )
 from gateway.hub.transports.listener import Listener
 from gateway.hub.transports.registry import CLIENTS, LISTENERS
@@ -71,7 +72,7 @@ _Queued = tuple[MavFrame, int | None, int | None, int]
 the client that it answers, and since when it waits."""
 
 
-class Hub:
+class Hub(HubContext):
     """Send MAVLink to many clients, receive theirs, and route between them.
 
     Parameters

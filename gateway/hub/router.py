@@ -13,11 +13,10 @@ from typing import Final
 from pymavlink.dialects.v20 import all as dialect
 
 from gateway.answers.answer_cache import AnswerCache
-from gateway.hub.duplicates import LATE, NEW, DuplicateFilter, FrameMemory
+from gateway.hub.duplicates import LATE, NEW, DuplicateFilter, FrameMemory, RedundantLinks
 from gateway.hub.fanout import Fanout
 from gateway.hub.limits import RequestQueue
 from gateway.hub.own_vehicles import OwnVehicles
-from gateway.hub.redundant_links import RedundantLinks
 from gateway.hub.round_trip import MAX_ASKED, NOBODY, RoundTrip, is_of_gateway
 from gateway.hub.route import OnForeign
 from gateway.hub.routing_table import MEMORY_US, Origin, RoutingTable, SystemPath

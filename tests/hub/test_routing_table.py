@@ -5,10 +5,16 @@ import random
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.duplicates import LATE, MEMORY_FRAMES, NEW, DuplicateFilter
+from gateway.hub.duplicates import (
+    LATE,
+    LINKED_US,
+    MEMORY_FRAMES,
+    NEW,
+    DuplicateFilter,
+    RedundantLinks,
+)
 from gateway.hub.frame_stream import FrameStream
 from gateway.hub.own_vehicles import OWN_FRESH_US, OwnVehicles
-from gateway.hub.redundant_links import LINKED_US, RedundantLinks
 from gateway.hub.routing_table import MEMORY_US, ROUTE_FRESH_US, RoutingTable, SystemPath
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame, frame_of

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import ClassVar, Final, Protocol
+from typing import ClassVar, Final
 
 from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import OPEN_TO_ALL, Endpoint, EndpointKind, is_loopback
@@ -47,7 +47,7 @@ RETRY_US: Final = US_PER_S
 """Interval of attempts to reopen a socket."""
 
 
-class HubContext(Protocol):
+class HubContext:
     """The part of the hub that a transport uses."""
 
     settings: HubSettings
@@ -60,45 +60,31 @@ class HubContext(Protocol):
     """Bytes that may still be read from all untrusted clients together."""
     recordings: Path | None
     """Folder of the recordings that a fleet may fetch, if any."""
-
     read_bytes: int
     """Bytes to read from one client at one wake-up, before others get their turn."""
-
-    def new_client_id(self) -> int:
-        """Return an id that no client had before."""
-
-    def is_own(self, origin: Origin) -> bool:
-        """Return whether a system and component is one of our vehicles."""
-
-    def deliver(self, client: "Client", frame: MavFrame, now_us: int) -> None:
-        """Route one received frame for which there is no cached route."""
-
-    def finish_run(self, now_us: int) -> None:
-        """Complete the forwarding of a run: the part that the compiled step leaves to Python."""
-
-    def appear(self, client: "Client") -> None:
-        """Add a client."""
-
-    def greet(self, client_id: int) -> None:
-        """Send the vehicles' greetings to a new peer."""
-
-    def reconfigure(self, client: "Client") -> None:
-        """Apply a client's changed options."""
-
-    def numbers(self, client_id: int, origin: Origin) -> bool:
-        """Return whether frames of another system are numbered for a client."""
-
-    def reroute(self, client: "Client") -> None:
-        """Route the frames to a client again, since it sends them in another way."""
-
-    def flush_soon(self, wait_s: float, flush: Callable[[], None]) -> None:
-        """Call back after the present events are handled, or after a wait."""
-
-    def update_buffer(self, client_id: int, free_percent: int) -> None:
-        """Adapt the rate to a client to the free part of its radio's buffer."""
-
-    def vanish(self, client: "Client") -> None:
-        """Remove a client and close it."""
+    new_client_id: Callable[[], int]
+    is_own: Callable[[Origin], bool]
+    """Returns whether a system and component is one of our vehicles."""
+    deliver: Callable[["Client", MavFrame, int], None]
+    """Routes one received frame for which there is no cached route."""
+    finish_run: Callable[[int], None]
+    """Completes the forwarding of a run: the part that the compiled step leaves to Python."""
+    appear: Callable[["Client"], None]
+    """Adds a client."""
+    greet: Callable[[int], None]
+    """Sends the vehicles' greetings to a new peer."""
+    reconfigure: Callable[["Client"], None]
+    """Applies a client's changed options."""
+    numbers: Callable[[int, Origin], bool]
+    """Returns whether frames of another system are numbered for a client."""
+    reroute: Callable[["Client"], None]
+    """Routes the frames to a client again, since it sends them in another way."""
+    flush_soon: Callable[[float, Callable[[], None]], None]
+    """Calls back after the present events are handled, or after a wait."""
+    update_buffer: Callable[[int, int], None]
+    """Adapts the rate to a client to the free percentage of its radio's buffer."""
+    vanish: Callable[["Client"], None]
+    """Removes a client and closes it."""
 
 
 @dataclass(eq=False)

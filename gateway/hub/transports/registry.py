@@ -20,9 +20,7 @@ from gateway.hub.transports.tcp import TcpClient, TcpListener
 from gateway.hub.transports.udp import UdpClient
 from gateway.hub.transports.udp_group import GroupClient
 from gateway.hub.transports.udp_listen import UdpListener
-from gateway.hub.transports.zenoh.client import ZenohClient
-from gateway.hub.transports.zenoh.mavlink_server import ZenohJson, ZenohRaw
-from gateway.hub.transports.zenoh.site import ZenohSite
+from gateway.hub.transports.zenoh.client import ZenohClient, ZenohJson, ZenohRaw, ZenohSite
 
 ClientMaker = Callable[[HubContext, int, Endpoint], Client]
 ZENOH: Final[dict[str, type[ZenohClient]]] = {
@@ -32,29 +30,27 @@ ZENOH: Final[dict[str, type[ZenohClient]]] = {
 }
 
 
-def _websocket(module: str, name: str) -> Callable[..., Any]:
+def _websocket(name: str) -> Callable[..., Any]:
     """Return a maker; most gateways have no WebSocket, and its library is slow to import."""
-    package = "gateway.hub.transports"
-    return lambda *arguments: getattr(import_module(f"{package}.{module}"), name)(*arguments)
+    module = "gateway.hub.transports.websocket"
+    return lambda *arguments: getattr(import_module(module), name)(*arguments)
 
 
-_WS_CLIENT: Final = _websocket("websocket", "WsClient")
-_WS_LISTENER: Final = _websocket("websocket_listen", "WsListener")
 CLIENTS: Final[dict[str, ClientMaker]] = {
     EndpointKind.UDP: UdpClient,
     EndpointKind.UDP_BROADCAST: GroupClient,
     EndpointKind.UDP_MULTICAST: GroupClient,
     EndpointKind.TCP: TcpClient,
-    EndpointKind.WS: _WS_CLIENT,
-    EndpointKind.WSS: _WS_CLIENT,
+    EndpointKind.WS: _websocket("WsClient"),
+    EndpointKind.WSS: _websocket("WsClient"),
     EndpointKind.ZENOH: lambda hub, number, url: ZENOH[url.keys](hub, number, url),
     EndpointKind.SERIAL: SerialClient,
 }
 LISTENERS: Final[dict[str, Callable[[HubContext, Endpoint], Listener[Any]]]] = {
     EndpointKind.UDP_LISTEN: UdpListener,
     EndpointKind.TCP_LISTEN: TcpListener,
-    EndpointKind.WS_LISTEN: _WS_LISTENER,
-    EndpointKind.WSS_LISTEN: _WS_LISTENER,
+    EndpointKind.WS_LISTEN: _websocket("WsListener"),
+    EndpointKind.WSS_LISTEN: _websocket("WsListener"),
 }
 
 

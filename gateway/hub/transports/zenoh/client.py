@@ -1,4 +1,4 @@
-"""Base of the endpoints behind a Zenoh router, whose frames have different keys.
+"""The zenoh: endpoint: frames or messages under the keys of a site, or of mavlink-server.
 
 The session finds its router again by itself. While it has none nothing is sent and nothing is
 queued, so that old data never arrives as new.
@@ -7,15 +7,21 @@ queued, so that old data never arrives as new.
 import asyncio
 import logging
 from functools import partial
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from gateway.extras import how_to_add
 from gateway.hub.endpoint import Endpoint
 from gateway.hub.packer import Packer
 from gateway.hub.transports.base import READ_BYTES, Client
 from gateway.hub.transports.zenoh.session import (
+    JSON_IN,
+    JSON_OUT,
     MAX_MESSAGE,
+    OWN,
+    RAW_IN,
+    RAW_OUT,
     RELIABLE_IDS,
+    ROOT,
     SECURED,
     Connection,
     LoopQueue,
@@ -26,11 +32,17 @@ from gateway.hub.transports.zenoh.session import (
     part_of_turn,
     payload_of,
     session_config,
+    site_key,
 )
+from gateway.hub.transports.zenoh.site_queries import QueryAnswers, RecordingAnswers
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_json import frame_from_json, json_from_frame
 from gateway.wire.mavlink_splitter import MavFrame, split_datagram
 
 log = logging.getLogger(__name__)
+
+MAX_DUPLICATE_SESSIONS: Final = 16
+"""Maximum registered sessions with this site's name; more are forged."""
 
 
 class Topic(NamedTuple):
@@ -175,6 +187,96 @@ class ZenohClient(Client):
             self.receive(split_datagram(frames), size, self.context.now_us())
         else:
             self.count_garbage(size)
+
+
+class ZenohSite(ZenohClient):
+    """One site, whose name no other site of the fleet may have."""
+
+    def __post_init__(self) -> None:
+        """Begin without other sessions of the same name."""
+        super().__post_init__()
+        self._duplicate_sessions: set[str] = set()
+
+    @property
+    def in_key(self) -> str:
+        """The key of frames for any system of the site."""
+        return site_key(self.endpoint.site, "*", "in")
+
+    def topic_of(self, frame: MavFrame) -> Topic:
+        """Return where a frame is published: by its system, and marked if that is our own."""
+        attachment = OWN if self.context.is_own(frame.origin) else None
+        return Topic(site_key(self.endpoint.site, frame.origin[0], "out"), attachment)
+
+    def declare(self, connection: Connection) -> None:
+        """Announce the site's presence, and answer queries."""
+        session, site = connection.session, self.endpoint.site
+        self._duplicate_sessions.clear()
+        token = session.liveliness().declare_token(site_key(site, "site", session.zid()))
+        connection.declared += [token, QueryAnswers(session, site_key(site, "ping"), lambda _: b"")]
+        connection.watch_presence(site, self._handle_presence)
+        if self.trusted and self.context.recordings is not None:
+            answers = RecordingAnswers(self.context.recordings)
+            connection.declared.append(QueryAnswers(session, site_key(site, "recordings"), answers))
+
+    def tick(self, now_us: int) -> None:
+        """Open the session, check whether it has a router, and report duplicate names."""
+        super().tick(now_us)
+        self._report_duplicates()
+
+    def _handle_presence(self, _site: str, session: str, is_here: bool) -> None:
+        if self._connection is None or session == str(self._connection.session.zid()):
+            return
+        if is_here and len(self._duplicate_sessions) < MAX_DUPLICATE_SESSIONS:
+            self._duplicate_sessions.add(session)
+        elif not is_here:
+            self._duplicate_sessions.discard(session)
+        self._report_duplicates()
+
+    def _report_duplicates(self) -> None:
+        """Report, for as long as it lasts, that another session uses this site's name."""
+        text = (
+            f"another site is called {self.endpoint.site!r} too" if self._duplicate_sessions else ""
+        )
+        if self.state != "open" or text == self.reason:
+            return
+        self.reason = text
+        if text:
+            log.warning("%s: %s; rename one of them", self.name, text)
+
+
+class ZenohRaw(ZenohClient):
+    """Frames as they are, all under one key."""
+
+    in_key = RAW_IN
+
+    def topic_of(self, frame: MavFrame) -> Topic:  # noqa: ARG002
+        """Return the one key."""
+        return Topic(RAW_OUT)
+
+
+class ZenohJson(ZenohClient):
+    """Messages as JSON: each as a whole, by its name, and by its fields."""
+
+    in_key = JSON_IN
+
+    def frames_in(self, data: bytes) -> bytes:
+        """Encode a received message; empty if it is malformed."""
+        return frame_from_json(data)
+
+    def transmit(self, frame: MavFrame) -> None:
+        """Publish one message."""
+        found = json_from_frame(frame.data) if self.state == "open" else None
+        if found is None or self._connection is None:
+            self.counters.dropped += 1
+            return
+        name, whole, fields = found
+        system_id, component_id = frame.origin
+        key = f"{ROOT}/{system_id}/{component_id}/{name}"
+        self.publish(Topic(JSON_OUT), [whole], reliable=frame.message_id in RELIABLE_IDS)
+        publishers = self._connection.publishers
+        publishers.put_once(key, whole)
+        for field, value in fields.items():
+            publishers.put_once(f"{key}/{field}", value)
 
 
 def _cost_of(payload: Payload) -> float:
