@@ -17,7 +17,6 @@ from gateway.hub.forwarding import Forwarding
 from gateway.hub.frame_stream import FrameStream
 from gateway.hub.numbering import Numbering
 from gateway.hub.own_vehicles import OwnVehicles
-from gateway.hub.round_trip import RoundTrip
 from gateway.hub.route import OnForeign
 from gateway.hub.router import Router
 from gateway.hub.routing_table import Origin
@@ -137,18 +136,10 @@ class Hub(HubContext):
         self.finish_run, self.update_buffer = self._fanout.finish_run, self._fanout.update_buffer
         self.observe = self._fanout.observe
         self.reroute, self.numbers = self._fanout.reconfigure, self._fanout.numbers
-        self._round_trip, self._vehicles = RoundTrip(), OwnVehicles()
+        self._vehicles = OwnVehicles()
         self.greet = self._vehicles.await_greeting
-        self._router = Router(
-            self,
-            self._clients,
-            self._fanout,
-            self._vehicles,
-            self._round_trip,
-            on_frame,
-            on_foreign,
-            rejects,
-        )
+        routing = (self._clients, self._fanout, self._vehicles, on_frame, on_foreign, rejects)
+        self._router = Router(self, *routing)
         self.deliver = self._router.deliver
         self._ping_us = self._proof_us = self._alerts_us = 0
         self._timer: asyncio.TimerHandle | None = None
@@ -272,7 +263,7 @@ class Hub(HubContext):
         now_us, systems = self.now_us(), self.routed_vehicles()
         for message in messages:
             for system in systems:
-                frame = self._round_trip.encode(message, system)
+                frame = self._router.round_trip.encode(message, system)
                 self._fanout.publish(frame, frame.sequence, now_us)
                 if self._on_foreign is not None:
                     self._on_foreign((frame.data,))
@@ -497,5 +488,5 @@ class Hub(HubContext):
             if system is not None and (is_due or (is_proof_due and not client.is_proven)):
                 asked[system].add(client.client_id)
         for system, client_ids in asked.items():
-            for frame in self._round_trip.ask(system, now_us):
+            for frame in self._router.round_trip.ask(system, now_us):
                 self._fanout.answer(frame, frame.sequence, client_ids, now_us, measures=True)

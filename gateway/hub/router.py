@@ -49,7 +49,6 @@ class Router:
         clients: Mapping[int, Client],
         fanout: Fanout,
         vehicles: OwnVehicles,
-        round_trip: RoundTrip,
         on_frame: Callable[[Incoming], None],
         on_foreign: OnForeign | None,
         rejects: Callable[[bytes, int], bool] | None,
@@ -60,7 +59,7 @@ class Router:
         self._clients = clients
         self._fanout = fanout
         self._vehicles = vehicles
-        self._round_trip = round_trip
+        self.round_trip = RoundTrip()
         self._on_frame = on_frame
         self._on_foreign = on_foreign
         self._rejects = rejects
@@ -137,10 +136,10 @@ class Router:
         origin = frame.origin
         if self._rejects is not None and self._rejects(frame.data, now_us):
             return
-        if self._vehicles.is_own(origin, now_us) or self._round_trip.is_returned(frame):
+        if self._vehicles.is_own(origin, now_us) or self.round_trip.is_returned(frame):
             self.counters.looped += 1
             return
-        round_trip_us = self._round_trip.read(frame, now_us)
+        round_trip_us = self.round_trip.read(frame, now_us)
         measures = round_trip_us is not None or is_of_gateway(frame)
         reach = Reach.EVERYWHERE if measures else self._reach(client, frame, now_us)
         if reach is Reach.NOWHERE:
@@ -444,7 +443,7 @@ class Router:
         systems = self._vehicles.systems(now_us)
         if client is not None:
             # A panel has no vehicle, and must answer to get the telemetry of a UDP port.
-            answer = self._round_trip.answer(frame, systems[0] if systems else NOBODY, now_us)
+            answer = self.round_trip.answer(frame, systems[0] if systems else NOBODY, now_us)
             if answer is not None:
                 self.charge(incoming.client_id, len(answer.data))
                 self._fanout.answer(
