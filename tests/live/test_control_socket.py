@@ -222,10 +222,9 @@ async def test_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> None:
 def test_missing_gateway_is_reported(folders: Path) -> None:
     with pytest.raises(ControlError, match="nobody listens at the socket"):
         request(folders / "run.sock", "status")
-    with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate run` or"):
-        find_socket("run")
-    with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate play` first"):
-        find_socket("play")
+    for name, starter in {"run": "`mavgate run` or", "play": "`mavgate play` first"}.items():
+        with pytest.raises(ControlError, match=f"nothing runs.*: start {starter}"):
+            find_socket(name)
 
 
 async def test_command_finds_the_gateway_of_its_user_before_the_service(

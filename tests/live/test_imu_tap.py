@@ -26,12 +26,9 @@ def samples(count: int, begin_us: int = 0) -> list[FusedSample]:
     first = make_fused(rng, 0)
     assert first.imu is not None
     still = msgspec.structs.replace(first.imu, accel_raw=(0, 0, 4096), gyro_raw=(100, 0, 0))
-    return [
-        msgspec.structs.replace(
-            first, imu=msgspec.structs.replace(still, time_us=begin_us + k * STEP_US)
-        )
-        for k in range(count)
-    ]
+    times_us = (begin_us + k * STEP_US for k in range(count))
+    raws = [msgspec.structs.replace(still, time_us=time_us) for time_us in times_us]
+    return [msgspec.structs.replace(first, imu=raw) for raw in raws]
 
 
 def test_samples_are_collected_only_while_they_are_requested() -> None:
