@@ -76,17 +76,21 @@ def test_output_that_is_an_input_is_rejected(tmp_path: Path, way: str) -> None:
     assert flight.read_bytes() == b"precious"
 
 
-@pytest.mark.parametrize("old", [None, b"old"], ids=["new", "replaced"])
-def test_interrupted_write_leaves_previous_content(tmp_path: Path, old: bytes | None) -> None:
+@pytest.mark.parametrize("before", [{}, {"a": b"old"}], ids=["new", "replaced"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.EIO, "broken", "input.csv")])
+def test_interrupted_write_leaves_previous_content(
+    tmp_path: Path, before: dict[str, bytes], error: BaseException
+) -> None:
     def broken() -> Iterator[bytes]:
         yield b"half"
-        raise KeyboardInterrupt
+        raise error
 
-    if old is not None:
-        (tmp_path / "a").write_bytes(old)
-    with pytest.raises(KeyboardInterrupt):
+    for name, old in before.items():
+        (tmp_path / name).write_bytes(old)
+    with pytest.raises(type(error)) as caught:
         write_new(tmp_path / "a", broken(), overwrite=True)
-    assert content(tmp_path) == ({} if old is None else {"a": old})
+    assert content(tmp_path) == before
+    assert getattr(caught.value, "filename", "input.csv") == "input.csv", "it names the input"
 
 
 def no_links(*_: object) -> None:
@@ -181,17 +185,6 @@ def test_error_of_unwritable_folder_names_requested_folder(
         pytest.fail("nothing can be written")
     assert caught.value.filename == str(tmp_path / "new")
     assert not (tmp_path / "new").exists()
-
-
-def test_read_error_names_the_input(tmp_path: Path) -> None:
-    def pieces() -> Iterator[bytes]:
-        yield b"1"
-        raise OSError(errno.EIO, "is broken", "input.csv")
-
-    with pytest.raises(OSError, match="is broken") as caught:
-        write_new(tmp_path / "a.csv", pieces())
-    assert caught.value.filename == "input.csv"
-    assert not [*tmp_path.iterdir()]
 
 
 def test_missing_or_read_only_folder_is_reported_before_the_work(

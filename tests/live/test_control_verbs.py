@@ -19,7 +19,7 @@ from gateway.live import control_verbs
 from gateway.live.control_socket import ControlError, ControlServer
 from gateway.live.control_verbs import client_verbs, mark_verbs, recorder_verbs
 from gateway.outputs import extend
-from gateway.recordings.index import Recording
+from gateway.recordings.index import Recording, list_recordings
 from gateway.vehicle.plan import Location
 from tests.conftest import ManualClock
 from tests.kit.recorder import RecorderBench
@@ -44,8 +44,15 @@ async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[RecorderBen
 
 
 async def test_recording_is_started_renamed_stopped_listed_and_deleted(
-    bench: RecorderBench, tmp_path: Path
+    bench: RecorderBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    threads: set[threading.Thread] = set()
+
+    def looked(folder: Path) -> list[Recording]:
+        threads.add(threading.current_thread())
+        return list_recordings(folder)
+
+    monkeypatch.setattr(control_verbs, "list_recordings", looked)
     server = ControlServer(tmp_path / "s", recorder_verbs(bench.recorder))
     started = (await ask(server, "record.start"))["result"]
     assert (started["state"], started["part"]) == ("recording", 1)
@@ -66,24 +73,10 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(
     assert (await ask(server, "record.list"))["result"] == []
     assert not (await ask(server, "record.delete", name="first"))["ok"]
     assert bench.announced[1] == (False, "Note: here")
+    assert threading.main_thread() not in threads, "the event loop does not wait for the disk"
     server = ControlServer(tmp_path / "s", recorder_verbs(bench.recorder, lambda: False))
     refused = await ask(server, "record.note", text="here")
     assert "no vehicle is received" in refused["error"]
-
-
-async def test_recordings_are_listed_off_the_event_loop(
-    bench: RecorderBench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    server = ControlServer(tmp_path / "s", recorder_verbs(bench.recorder))
-    looked: list[threading.Thread] = []
-
-    def look(_folder: Path) -> list[Recording]:
-        looked.append(threading.current_thread())
-        return []
-
-    monkeypatch.setattr("gateway.live.control_verbs.list_recordings", look)
-    assert (await ask(server, "record.list"))["result"] == []
-    assert looked != [threading.main_thread()]
 
 
 async def test_location_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None:

@@ -115,8 +115,7 @@ async def test_reader_that_opens_late_and_again_gets_whole_frames(
 ) -> None:
     port = play(frames(10**9))
     port.start()
-    while not port.dropped:
-        await asyncio.sleep(0)
+    await until(lambda: port.dropped)
     for _ in range(3):
         reader = Reader(port.path)
         await reader.until(50)

@@ -75,8 +75,7 @@ async def test_ignored_hangup_stays_ignored(is_ignored: bool) -> None:
     try:
         signal.raise_signal(signal.SIGHUP)
         signal.raise_signal(signal.SIGTERM)
-        while not calls:
-            await asyncio.sleep(0)
+        await until(lambda: calls)
         assert len(calls) == (1 if is_ignored else 2)
     finally:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
