@@ -276,7 +276,6 @@ def _read(path: Path, kind: type[Settings]) -> dict[str, Any]:
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a tree of settings merged with overriding values."""
     merged = dict(base)
     for key, value in over.items():
         below = merged.get(key)
@@ -290,7 +289,6 @@ def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 def _write_difference(
     table: MutableMapping[str, Any], default: Mapping[str, Any], value: Mapping[str, Any]
 ) -> None:
-    """Write values that differ from the default to a TOML table, and remove the others."""
     for key, new in value.items():
         old = default.get(key)
         if new == old:

@@ -134,7 +134,6 @@ def written_together(folder: Path) -> Iterator[Path]:
 
 
 def _remove_if_empty(folder: Path) -> None:
-    """Remove a folder that was created for files that were not written."""
     with contextlib.suppress(OSError):
         folder.rmdir()
 

@@ -233,7 +233,6 @@ class PlayerDaemon:
         self._hub.send_all(answers)
 
     def _poll(self) -> None:
-        """Send the due frames of long answers, and schedule the next call."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

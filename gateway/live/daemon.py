@@ -45,7 +45,6 @@ from gateway.live.vehicle_watch import VehicleWatch
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.printable import NO_RECEIVER, reason_of, without_folders
 from gateway.recordings.recorded_table import header_for
-from gateway.recordings.table import TableHeader
 from gateway.recordings.tlog import UNRECORDED
 from gateway.records import RECORDED_ONLY, ClientInterval, FusedSample, Incoming, Outgoing
 from gateway.sensing.calibration import NodeCalibration
@@ -123,7 +122,8 @@ class Daemon:
             # No secret is in a run: messages with a target are not forwarded in runs.
             on_run=lambda run: self._recorder.run(run),
             on_gone=self._on_gone,
-            on_alert=self._alert,
+            # Others need not know the folders of this machine.
+            on_alert=lambda is_trouble, text: self._announce(is_trouble, without_folders(text)),
             signer=self._pipeline.signer,
             recordings=Path(settings.recording.folder).expanduser(),
         )
@@ -162,7 +162,7 @@ class Daemon:
             self._settings.recording,
             self.now_us,
             unix_time_us,
-            self._table_head,
+            lambda vehicle_id: header_for(self._pipeline.find(vehicle_id).settings, vehicle_id),
             self._announce,
             lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
             self._introduction,
@@ -181,7 +181,9 @@ class Daemon:
             socket_path("run"),
             {"status": self.snapshot, "reload": self._reload_or_refuse},
             identity_verb(lambda: self._own_ids | self._hub.routed_vehicles(), self._hub.endpoints),
-            recorder_verbs(self._recorder, self._has_vehicle),
+            recorder_verbs(
+                self._recorder, lambda: bool(self._pipeline.aircraft) or self._hub.say(())
+            ),
             mark_verbs(self._mark),
             serial_verbs(self._serial, is_simulated=self._receiver is not None),
             client_verbs(self._hub, self._folder),
@@ -327,15 +329,8 @@ class Daemon:
         except ConfigError as error:
             raise ControlError(f"settings not reloaded: {error}") from error
 
-    def _has_vehicle(self) -> bool:
-        return bool(self._pipeline.aircraft) or self._hub.say(())
-
     def _mark(self, location: Location | None, vehicle_id: int | None) -> None:
         self._perform(self._pipeline.mark(location, vehicle_id, self.now_us()))
-
-    def _alert(self, is_trouble: bool, text: str) -> None:
-        # Others need not know the folders of this machine.
-        self._announce(is_trouble, without_folders(text))
 
     def _announce(self, is_trouble: bool, text: str) -> None:
         status = StatusText(WARNING if is_trouble else INFO, text)
@@ -354,16 +349,11 @@ class Daemon:
         await asyncio.to_thread(log_other_gateways)
 
     def _warn_of_conflicts(self, appeared: set[int]) -> None:
-        """Warn where another gateway sends an aircraft that has just appeared; in a thread."""
         for text in conflicts(appeared, self._hub.endpoints()):
             log.warning("%s", text)
 
     def _introduction(self, vehicle_id: int) -> list[bytes]:
-        vehicle = self._pipeline.find(vehicle_id).vehicle
-        return [sent.frame for sent in vehicle.introduction()]
-
-    def _table_head(self, vehicle_id: int) -> TableHeader:
-        return header_for(self._pipeline.find(vehicle_id).settings, vehicle_id)
+        return [sent.frame for sent in self._pipeline.find(vehicle_id).vehicle.introduction()]
 
     def _on_bytes(self, data: bytes, now_us: int) -> None:
         if now_us > self._lag.stalled_after_us:
@@ -397,7 +387,6 @@ class Daemon:
             self._vehicles.feed(frame_of(frame), now_us)
 
     def _watch_vehicles(self) -> VehicleWatch:
-        """Return the states of all vehicles, brought up to date."""
         self._vehicles.update(self._hub.newest_frames(), self._hub.streams())
         return self._vehicles
 
@@ -446,7 +435,6 @@ class Daemon:
         self._lag.expect(self.now_us() + round(wait_s * US_PER_S))
 
     def _note_recorder(self, now_us: int) -> None:
-        """Report the state of the vehicles to the recorder, and its state to the pipeline."""
         vehicles = [each.vehicle for each in self._pipeline.aircraft.values()]
         recorder = self._recorder
         recorder.set_in_flight(
@@ -459,7 +447,6 @@ class Daemon:
         )
 
     def _locations(self) -> VehicleLocations:
-        """Return the homes of the aircraft."""
         return {
             vehicle_id: None
             if (home := each.vehicle.telemetry.home) is None

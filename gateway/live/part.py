@@ -57,7 +57,10 @@ class Part:
         for vehicle_id, table in self.tables.items():
             if table.begun and not table.has_head:
                 table.has_head = True
-                heads[table_ending(vehicle_id)] = self._head_of(table)
+                # The name may have changed since the table was prepared.
+                header = msgspec.structs.replace(table.header, session=self.session)
+                state = "" if table.state is None else encode_line(table.state)
+                heads[table_ending(vehicle_id)] = (encode_head(header) + state).encode()
         pending, self.pending, self.size = self.pending, {}, 0
         endings = dict.fromkeys((*pending, *heads))
         return {each: heads.get(each, b"") + bytes(pending.get(each, b"")) for each in endings}
@@ -103,12 +106,6 @@ class Part:
         """Buffer the records that still wait for the row of an IMU sample."""
         for table in self.tables.values():
             self._write(table, table.rows.flush())
-
-    def _head_of(self, table: _Table) -> bytes:
-        # The name may have changed since the table was prepared.
-        header = msgspec.structs.replace(table.header, session=self.session)
-        state = "" if table.state is None else encode_line(table.state)
-        return (encode_head(header) + state).encode()
 
     def _write(self, table: _Table, rows: list[TableRow]) -> None:
         for row in rows:

@@ -73,7 +73,6 @@ class PtyPort:
         self.ended.set()
 
     def _advance(self) -> None:
-        """Write the frames due and wait for the next."""
         loop = asyncio.get_running_loop()
         self._timer = None
         budget = MAX_BATCH * DROPS_AT_ONCE

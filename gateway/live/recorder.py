@@ -1,16 +1,13 @@
 """The recorder: records the traffic of the gateway without delaying it.
 
 Linux has no way to write to a disk without waiting for it: a card that cleans up, or a network
-folder, blocks for seconds. So two other threads do all disk work. They get immutable values and
-return results; nothing is shared, so there is nothing to lock. The event loop buffers the next
-bytes while they work, up to a limit.
+folder, blocks for seconds. So two other threads do all disk work, with immutable values, and the
+event loop buffers the next bytes meanwhile, up to a limit.
 
 Every `flush_s` one thread gives the buffered bytes to the kernel, where they survive a crash of the
 gateway; every `sync_s` the other has the kernel write them to the disk, where they survive a power
 loss, and it closes, renames and copies finished files. So no write waits for a slow sync, and the
-next sync begins once the last has ended. By default both times are half a second, so that a crash
-or a power loss costs less than a second of data if the disk syncs as fast; a longer `sync_s` wears
-a card less.
+next sync begins once the last has ended.
 """
 
 import asyncio
@@ -279,7 +276,6 @@ class Recorder:
                 part.change_settings(self._header(vehicle_id, part))
 
     def _parts(self) -> list[Part]:
-        """Return the part being written, or else those in memory."""
         return [part for _, part in self._memory] if self._part is None else [self._part]
 
     def _hold(self) -> None:
@@ -439,7 +435,6 @@ class Recorder:
                 self._say(action)
 
     def _trouble_of(self, error: OSError) -> str:
-        """Return the reason why no part could be opened, with the path that was refused."""
         return f"{error.filename or self.folder}: {reason_of(error)}"
 
     async def _open_part(self, action: OpenPart) -> list[SessionAction]:

@@ -239,7 +239,6 @@ class SourcePort(ByteLink):
         return parts
 
     async def _feed_parts(self, data: bytes) -> None:
-        """Process bytes in several turns of the loop."""
         for part in self.parts_of(data):
             self.feed(part)
             await asyncio.sleep(0)
