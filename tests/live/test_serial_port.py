@@ -201,7 +201,9 @@ async def test_gateway_without_receiver_opens_no_port(
 
 
 @pytest.mark.io
-async def test_retries_back_off(listener: Listener, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_retries_back_off_and_the_reason_is_logged_once(
+    listener: Listener, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """The delays double up to a second: a port that is back for long is found at once."""
     loop = asyncio.get_running_loop()
     delays: list[float] = []
@@ -219,6 +221,7 @@ async def test_retries_back_off(listener: Listener, monkeypatch: pytest.MonkeyPa
         pending.pop()()
     assert delays == [0.25, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
     assert delays[-1] == LONGEST_RETRY_S
+    assert len(caplog.records) == 1
     link.close()
 
 
