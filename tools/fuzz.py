@@ -47,7 +47,7 @@ from gateway.recordings.formats.maps import (
     to_kml,
     tracks_of_messages,
 )
-from gateway.recordings.formats.ulog import TOPICS
+from gateway.recordings.formats.ulog_record import table as ulog_table
 from gateway.recordings.moment import parse_moment
 from gateway.recordings.reading import has_record, open_record
 from gateway.recordings.recorded_table import ReadOptions
@@ -390,7 +390,7 @@ TIMES: Final = st.integers(0, 2**64 - 1) | st.integers(10**6, 10**6 + 10**5)
 @st.composite
 def ulog_messages(draw: st.DrawFn) -> bytes:
     """Make a format, a subscription, a row, or any other message of a ULog."""
-    name = draw(st.sampled_from(TOPICS)).encode()
+    name = draw(st.sampled_from(sorted(ulog_table().sampled))).encode()
     number = struct.pack("<H", draw(st.integers(0, 3)))
     instance = bytes([draw(st.integers(0, 2))])
     time_us = struct.pack("<Q", draw(TIMES))

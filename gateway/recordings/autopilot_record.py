@@ -135,10 +135,17 @@ class AutopilotLog:
     custom_mode: int = 0
     remarks: list[str] = field(default_factory=list)
     """Remarks for the user; complete once all entries are read."""
+    why_no_samples: str = ""
+    """Reason for the user why no samples of the IMU are found."""
 
     def unit(self, topic: str, name: str) -> str | None:
         """Return the unit that the log itself states; None if it states none."""
         return self.units.get((topic, name))
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether there is a row of an attitude, a position or the IMU."""
+        return any(topic in self.present for row in self.table.samples for topic in row.of)
 
     @property
     def without_counterpart(self) -> dict[str, int]:
@@ -153,64 +160,72 @@ class AutopilotLog:
         return listed and f"messages without a counterpart in MAVLink: {listed}"
 
 
-class _Newest:
+class NewestRows:
     """The newest rows of a log, and the instance to read them from."""
 
-    def __init__(self, log: AutopilotLog) -> None:
+    def __init__(self, log: AutopilotLog, max_age_us: int = MAX_AGE_US) -> None:
         self.kind = log.kind
         self.now_us = 0
         self.instance: int | None = None
         """Instance to read; None for the primary one of each topic."""
         self.parameters = dict(log.parameters)
-        self._log = log
+        self._max_age_us, self._health = max_age_us, log.table.health
         self._rows: dict[tuple[str, int], LogRow] = {}
-        self._firsts = dict(log.primary)
-        self._seen: set[str] = set()
+        self._firsts, self._primary = dict(log.primary), dict(log.primary)
+        self._lanes: dict[str, list[tuple[str, str]]] = {}
+        """Topics of several filters by the topic with the number of the filter, and its column."""
+        for topic, where in log.table.lanes.items():
+            name, _, column = where.partition(".")
+            self._lanes.setdefault(name, []).append((topic, column))
 
     def add(self, row: LogRow) -> None:
         """Add the next row."""
+        topic, instance = row.topic, row.instance
         self.now_us = row.time_us
-        self._rows[row.topic, row.instance] = row
-        self._seen.add(row.topic)
-        self._firsts.setdefault(row.topic, row.instance)
+        self._rows[topic, instance] = row
+        if topic not in self._firsts:
+            self._firsts[topic] = instance
+            self._primary.setdefault(topic, instance)
+        for of, column in self._lanes.get(topic, ()) if instance == self._firsts[topic] else ():
+            if isinstance(lane := row.values.get(column), int):
+                self._primary[of] = lane
 
     def has(self, topic: str) -> bool:
         """Return whether there was a row of a topic."""
-        return topic in self._seen
+        return any(name == topic for name, _ in self._rows)
 
     def primary(self, topic: str) -> int:
         """Return the primary instance of a topic."""
-        where = self._log.table.lanes.get(topic)
-        if where is not None:
-            name, _, column = where.partition(".")
-            row = self._rows.get((name, self._firsts.get(name, 0)))
-            lane = None if row is None else row.values.get(column)
-            if isinstance(lane, int):
-                return lane
-        return self._firsts.get(topic, 0)
+        return self._primary.get(topic, 0)
 
     def value(self, topic: str, name: str) -> float:
         """Return a field of the newest row; see `Context`."""
+        instance = self.instance
+        if instance is None:
+            instance = self._primary.get(topic, 0)
+        row = self._rows.get((topic, instance))
+        if row is None or name == "instance":
+            return self._other(topic, name, instance)
+        if self.now_us - row.time_us > self._max_age_us and topic not in LASTING:
+            return NAN
+        value = row.values.get(name, NAN)
+        return value if isinstance(value, (int, float)) else NAN
+
+    def _other(self, topic: str, name: str, instance: int) -> float:
+        """Return a parameter, the bits of the sensors, or the instance."""
         if topic == "PARM":
             number = self.instance or 0
             found = self.parameters.get(name.replace("#", str(number + 1) if number else ""), NAN)
             return float(found)
         if topic == "SENSORS":
             return float(self._sensors(only_healthy=name == "healthy"))
-        instance = self.primary(topic) if self.instance is None else self.instance
-        if name == "instance":
-            return float(instance)
-        row = self._rows.get((topic, instance))
-        if row is None or (self.now_us - row.time_us > MAX_AGE_US and topic not in LASTING):
-            return NAN
-        value = row.values.get(name, NAN)
-        return value if isinstance(value, int | float) else NAN
+        return float(instance) if name == "instance" else NAN
 
     def _sensors(self, *, only_healthy: bool) -> int:
         bits = 0
         for (topic, _), row in self._rows.items():
-            if not only_healthy or self.now_us - row.time_us <= MAX_AGE_US:
-                bits |= self._log.table.health.get(topic, 0)
+            if not only_healthy or self.now_us - row.time_us <= self._max_age_us:
+                bits |= self._health.get(topic, 0)
         return bits
 
 
@@ -220,7 +235,7 @@ class RecordTranslator:
     def __init__(self, log: AutopilotLog, system_id: int | None = None) -> None:
         self._log = log
         self._encoder = Encoder(system_id or log.vehicle_id)
-        self._newest = _Newest(log)
+        self._newest = NewestRows(log)
         self._bound: dict[tuple[str, int], BoundMessage] = {}
         self._by_topic: dict[str, list[MessageRow]] = {}
         self._repeated: list[tuple[MessageRow, BoundMessage]] = []

@@ -14,6 +14,9 @@ of vehicle, and `PARM.NAME` is a parameter, where `#` is the number of the insta
 
 With `each` a message is sent for every instance of its topic, by the names in that list, or by its
 own name if the list is empty. With `every_s` it is repeated at that interval, from the newest rows.
+
+A section such as `[samples.gps]` gives, in the same way, the columns of a table for the samples
+that are fused: they keep the resolution of the log.
 """
 
 import math
@@ -24,21 +27,25 @@ from typing import Any, Final, Protocol
 
 import msgspec
 
+from gateway.geometry.atmosphere import pressure_at_height
 from gateway.geometry.quaternion import from_euler, to_euler
-from gateway.records import NAN
-from gateway.units import DEG_PER_DEGE7, RAD_PER_DEG, STANDARD_GRAVITY_MPS2
+from gateway.recordings.columns import unit_of
+from gateway.records import NAN, ImuFlags
+from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 from gateway.vehicle.encoding import MessagePacker
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
 
 UNITS: Final[dict[str, tuple[str, float]]] = {
     "rad": ("angle", 1.0), "deg": ("angle", RAD_PER_DEG), "cdeg": ("angle", RAD_PER_DEG * 1e-2),
-    "degE7": ("angle", RAD_PER_DEG * DEG_PER_DEGE7), "degE5": ("angle", RAD_PER_DEG * 1e-5),
+    "degE7": ("angle", RAD_PER_DEG * DEG_PER_DEGE7),
+    "1e-7 deg": ("angle", RAD_PER_DEG * DEG_PER_DEGE7), "degE5": ("angle", RAD_PER_DEG * 1e-5),
     "degheading": ("angle", RAD_PER_DEG), "deglatitude": ("angle", RAD_PER_DEG),
     "deglongitude": ("angle", RAD_PER_DEG),
     "rad/s": ("rate", 1.0), "deg/s": ("rate", RAD_PER_DEG), "mrad/s": ("rate", 1e-3),
     "m": ("length", 1.0), "cm": ("length", 1e-2), "mm": ("length", 1e-3),
     "m/s": ("speed", 1.0), "cm/s": ("speed", 1e-2), "mm/s": ("speed", 1e-3),
-    "m/s/s": ("acceleration", 1.0), "mG": ("acceleration", STANDARD_GRAVITY_MPS2 * 1e-3),
+    "m/s/s": ("acceleration", 1.0), "m/s^2": ("acceleration", 1.0),
+    "mG": ("acceleration", STANDARD_GRAVITY_MPS2 * 1e-3),
     "V": ("voltage", 1.0), "cV": ("voltage", 1e-2), "mV": ("voltage", 1e-3),
     "A": ("current", 1.0), "cA": ("current", 1e-2), "mA": ("current", 1e-3),
     "Ah": ("charge", 1.0), "mAh": ("charge", 1e-3),
@@ -46,11 +53,11 @@ UNITS: Final[dict[str, tuple[str, float]]] = {
     "Pa": ("pressure", 1.0), "hPa": ("pressure", 100.0),
     "degC": ("temperature", 1.0), "cdegC": ("temperature", 1e-2),
     "Gauss": ("field", 1.0), "gauss": ("field", 1.0), "mGauss": ("field", 1e-3),
-    "mgauss": ("field", 1e-3),
+    "mgauss": ("field", 1e-3), "uT": ("field", 1e-2),
     "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6), "µs": ("time", 1e-6),
     "ratio": ("share", 1.0), "%": ("share", 1e-2), "d%": ("share", 1e-3), "c%": ("share", 1e-4),
 }  # fmt: skip
-"""Quantity and factor to SI of each unit, by its name in MAVLink or in the logs."""
+"""Quantity and factor to SI of each unit, by its name in MAVLink, in the logs or in tables."""
 TURN: Final = 2.0 * math.pi
 MAX_AGE_US: Final = 3_000_000
 """Maximum age of a row whose values are used in a message."""
@@ -59,6 +66,13 @@ _EKF_FLAGS: Final = 0x3FF
 _LANDED, _IN_AIR = 1, 2
 """Values of MAV_LANDED_STATE."""
 WRAPPED: Final = frozenset({"compass", "course", "heading"})
+OPTIONAL: Final = frozenset({"valid", "new", "pressure_at", "clipping"})
+"""Functions of which only the first value must be known."""
+NOT_NEW: Final = 0x7FFFFFFF
+"""Value of a time relative to PX4's sample that means "no new value"."""
+LEAST_PA: Final = 2000.0
+"""Minimum pressure; smaller values are in hPa, as in `sensor_baro` before PX4 1.14. No aircraft
+flies that high."""
 Values = Mapping[str, Any]
 _CALL: Final = re.compile(r"(?:(?P<kind>\w+): )?(?:(?P<function>\w+)\()?(?P<values>[^()]*)\)?")
 _VALUE: Final = re.compile(
@@ -80,6 +94,11 @@ def _euler(part: int) -> Callable[..., float]:
     return lambda w, x, y, z: to_euler((w, x, y, z))[part]
 
 
+def _clipping(accel: float, gyro: float) -> float:
+    accel_flag = ImuFlags.ACCEL_CLIPPED if accel else ImuFlags(0)
+    return accel_flag | (ImuFlags.GYRO_CLIPPED if gyro > 0 else ImuFlags(0))
+
+
 FUNCTIONS: Final[dict[str, Callable[..., float]]] = {
     "up": lambda down: -down,
     "hypot": math.hypot,
@@ -98,6 +117,11 @@ FUNCTIONS: Final[dict[str, Callable[..., float]]] = {
     "measured": lambda value: value if value >= 0 else NAN,
     "known": lambda value: value if value > 0 else NAN,
     "minus": lambda value, other: value - other,
+    "valid": lambda value, is_valid: NAN if is_valid == 0 else value,
+    "new": lambda value, age: NAN if age == NOT_NEW else value,
+    "pressure": lambda value: value * PA_PER_HPA if value < LEAST_PA else value,
+    "pressure_at": lambda height, age=0: NAN if age == NOT_NEW else pressure_at_height(height),
+    "clipping": _clipping,
 }  # fmt: skip
 """Functions of SI values; `compass`, `course` and `heading` are angles from north in [0, 2π)."""
 
@@ -183,28 +207,23 @@ class Value:
             return None
         if not self.sources:
             return lambda _: self.number
-        if any(one.topic not in log.present for one in self.sources):
+        needed = 1 if self.function in OPTIONAL else len(self.sources)
+        if any(one.topic not in log.present for one in self.sources[:needed]):
             return None
         parts = [(one.topic, one.name, one.factor_in(log)) for one in self.sources]
         if not self.function:
             ((topic, name, scale),) = parts
             scale /= factor if self.sources[0].quantity else 1.0
             return lambda context: context.value(topic, name) * scale
-        return _call(FUNCTIONS[self.function], parts, factor, wraps=self.function in WRAPPED)
+        return _call(self.function, parts, needed, factor)
 
 
-def _call(
-    function: Callable[..., float],
-    parts: Sequence[tuple[str, str, float]],
-    factor: float,
-    *,
-    wraps: bool,
-) -> Read:
-    turn = round(TURN / factor) if wraps else 0
+def _call(name: str, parts: Sequence[tuple[str, str, float]], needed: int, factor: float) -> Read:
+    function, turn = FUNCTIONS[name], round(TURN / factor) if name in WRAPPED else 0
 
     def read(context: Context) -> float:
         values = [context.value(topic, name) * scale for topic, name, scale in parts]
-        if not all(map(math.isfinite, values)):
+        if not all(map(math.isfinite, values[:needed])):
             return NAN
         found = function(*values) / factor
         # A value within half a unit of the full turn would be rounded to it.
@@ -257,6 +276,8 @@ class MessageTable:
     """The table of one autopilot."""
 
     messages: tuple[MessageRow, ...]
+    samples: tuple[MessageRow, ...] = ()
+    """Columns of a table by the kind of sample: imu, mag, baro, gps, nav."""
     aliases: dict[str, tuple[str, int]] = field(default_factory=dict)
     """Topic and instance by former topic name."""
     lanes: dict[str, str] = field(default_factory=dict)
@@ -282,10 +303,33 @@ class MessageTable:
     @property
     def sources(self) -> Iterator[LogField]:
         """All fields in use."""
-        for one in self.messages:
+        for one in (*self.messages, *self.samples):
             for values in one.fields.values():
                 for value in values:
                     yield from value.sources
+
+    @property
+    def sampled(self) -> frozenset[str]:
+        """The topics of the samples, and those with the number of their filter."""
+        used = {
+            source.topic
+            for row in self.samples
+            for values in row.fields.values()
+            for value in values
+            for source in value.sources
+        }
+        return frozenset(used | {self.lanes[one].partition(".")[0] for one in used & {*self.lanes}})
+
+    @property
+    def columns(self) -> dict[str, set[str]]:
+        """Columns in use by topic."""
+        found: dict[str, set[str]] = {}
+        for source in self.sources:
+            found.setdefault(source.topic, set()).add(source.name)
+        for where in self.lanes.values():
+            topic, _, name = where.partition(".")
+            found.setdefault(topic, set()).add(name)
+        return found
 
     def bind(self, row: MessageRow, name: str, log: LogFacts, kind: str) -> BoundMessage:
         """Bind a message to a log, under a name for an instance."""
@@ -301,20 +345,38 @@ class MessageTable:
                 timed.append((len(reads), one, UINT32 if types[one] == "uint32_t" else UINT64))
             for number in range(lengths[one] or 1):
                 given = row.fields.get(f"{one}.{number}", ()) + row.fields.get(one, ())
-                bound = tuple(read for v in given if (read := v.bind(log, kind, factor)))
-                reads.append((types[one] != "float", bound))
+                reads.append((types[one] != "float", _bound(given, log, kind, factor)))
         return BoundMessage(name, MessagePacker(definition), tuple(reads), tuple(timed))
+
+
+def bind_columns(
+    row: MessageRow, columns: Sequence[str], log: LogFacts, kind: str
+) -> dict[str, tuple[Read, ...]]:
+    """Bind a sample to a log: the readers of each of its columns."""
+    return {
+        name: _bound(row.fields[name], log, kind, UNITS[unit][1] if unit else 1.0)
+        for name in columns
+        for unit in (unit_of(name),)
+        if name in row.fields
+    }
+
+
+def _bound(given: Sequence[Value], log: LogFacts, kind: str, factor: float) -> tuple[Read, ...]:
+    return tuple(read for value in given if (read := value.bind(log, kind, factor)))
 
 
 def read_table(text: bytes) -> MessageTable:
     """Read a table; raises ValueError if it has an error."""
     raw = msgspec.toml.decode(text)
-    messages = tuple(_message(name, dict(row)) for name, row in raw["messages"].items())
+    messages, samples = (
+        tuple(_message(name, dict(row)) for name, row in raw[section].items())
+        for section in ("messages", "samples")
+    )
     aliases = {old: (topic, int(n)) for old, (topic, n) in raw.get("aliases", {}).items()}
     lanes = {topic: where for where, topics in raw.get("lanes", {}).items() for topic in topics}
     return MessageTable(
-        messages, aliases, lanes, raw.get("health", {}), frozenset(raw.get("also_used", ())),
-        raw.get("modes", {}), raw.get("vehicle_types", {}),
+        messages, samples, aliases, lanes, raw.get("health", {}),
+        frozenset(raw.get("also_used", ())), raw.get("modes", {}), raw.get("vehicle_types", {}),
         {state: tuple(given) for state, given in raw.get("nav_states", {}).items()},
     )  # fmt: skip
 

@@ -35,6 +35,7 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.formats.mavlink import AutopilotReader
+from gateway.recordings.logged_samples import read_samples
 from gateway.recordings.recorded_clock import ORDER_US
 from gateway.recordings.recorded_table import (
     ReadOptions,
@@ -75,16 +76,6 @@ def import_format(module: str, name: str) -> Any:
         raise FlightError(how_to_add(name, "formats")) from error
 
 
-def _add_packaged(name: str, module: str) -> None:
-    """Add a reader whose dependencies are imported with the first file of its format."""
-
-    def read(path: Path, options: ReadOptions) -> RecordedTable:
-        table: RecordedTable = import_format(module, name).read(path, options)
-        return table
-
-    READERS[name] = read
-
-
 def has_record(path: Path) -> bool:
     """Return whether a file is an autopilot's log, with its own estimates."""
     return format_of(path) in RECORDS
@@ -92,9 +83,26 @@ def has_record(path: Path) -> bool:
 
 def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
     """Open an autopilot's own log for playback; raises FlightError and OSError as `open_rows`."""
+    log = _open_log(path, options)
+    if not log.is_shown:
+        raise FlightError(f"{path}: nothing to play: {log.why_no_samples}")
+    return log
+
+
+def _open_log(path: Path, options: ReadOptions, *, sampled: bool = False) -> AutopilotLog:
     kind = format_of(path)
-    record: AutopilotLog = import_format(RECORDS[kind], kind).open_record(path, options)
-    return record
+    module = import_format(RECORDS[kind], kind)
+    log: AutopilotLog = module.open_record(path, options, sampled=sampled)
+    return log
+
+
+def _open_samples(path: Path, options: ReadOptions) -> RecordedTable:
+    return read_samples(path, _open_log(path, options, sampled=True), options)
+
+
+def _open_parquet(path: Path, options: ReadOptions) -> RecordedTable:
+    table: RecordedTable = import_format("parquet", PARQUET).read(path, options)
+    return table
 
 
 def estimates_of(files: Iterable[Path], *, fuse: bool, both: bool) -> Estimates:
@@ -239,6 +247,5 @@ def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
     return RecordedTable(header, map(TableBlock, chain([first], stream)), remarks)
 
 
-READERS |= {TABLE: _open_table, CSV: _open_csv, TLOG: _open_autopilot}
-for _name, _module in (("ULog", "ulog"), ("DataFlash", "dataflash"), (PARQUET, "parquet")):
-    _add_packaged(_name, _module)
+READERS |= {TABLE: _open_table, CSV: _open_csv, TLOG: _open_autopilot, PARQUET: _open_parquet}
+READERS |= dict.fromkeys(RECORDS, _open_samples)

@@ -6,6 +6,8 @@
 | `Timeline`   | the time of a tlog whose clock was set while it was written: steps are removed |
 | `FrameClock` | the time of a capture without time stamps, from the times in its messages      |
 | `CivilClock` | civil time of the running gateway: GPS if available, else the machine's clock  |
+| `sound_times`| times of one topic that are near the median of those around them               |
+| `LogClock`   | the time of an autopilot's log, whose clock may jump or restart                |
 | `Stamper`    | the increasing timestamps of a file that is written                            |
 
 A step of more than `DAY_US`, or back by more than `BACK_US`, is a change of a clock. Times from
@@ -17,9 +19,10 @@ requires a new file.
 """
 
 from dataclasses import dataclass, replace
-from typing import Final, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from gateway.units import US_PER_S
@@ -29,6 +32,7 @@ from gateway.wire.recorded_frames import Batch, IntArray, fields_of
 from gateway.wire.timesync import GpsTime
 
 Times = TypeVar("Times", int, NDArray[np.int64])
+Item = TypeVar("Item")
 
 DAY_US: Final = 86_400 * US_PER_S
 """Records further apart are of different days: the time between them is not counted."""
@@ -44,6 +48,17 @@ LINE_BPS: Final = 57_600
 """Bit rate assumed for captures without times, that of usual telemetry radios; 10 bits per byte."""
 LAST_CIVIL_US: Final = 4_102_444_800 * US_PER_S
 """The year 2100; later times are not civil time."""
+AROUND: Final = 5
+"""Number of a topic's times around a time whose median it is compared with."""
+FAR_US: Final = US_PER_S
+"""Maximum difference from that median, and of the messages of one loop of an autopilot, which are
+not quite in order; at the ends of a topic it is `BACK_US`, as a gap makes it large there."""
+AHEAD_US: Final = 3_600 * US_PER_S
+"""Maximum step of an autopilot's clock; a message further ahead has a damaged time as well."""
+AGREEING: Final = 50
+"""Consecutive messages with consistent deviating times that prove a jump of the clock."""
+LEAST_AGREEING: Final = 3
+"""The same at the end of the log, where no more messages follow."""
 _UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "time_unix_usec": 1}
 """Fields with the sender's time, and their unit in µs."""
 _TIMES: Final = {
@@ -66,6 +81,27 @@ def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDAr
     is_in_order = (gap_us >= -ORDER_US) & (gap_us <= DAY_US)
     is_outside = (time_us < before_us - ORDER_US) | (time_us > after_us + ORDER_US)
     return is_in_order & is_outside
+
+
+def is_civil(time_us: int | IntArray) -> bool | NDArray[np.bool_]:
+    """Return whether a time is civil; others count from the start of a clock."""
+    return (time_us > FIRST_CIVIL_US) & (time_us < LAST_CIVIL_US)
+
+
+def sound_times(times_us: NDArray[Any]) -> tuple[NDArray[np.bool_], IntArray]:
+    """Return which times are not damaged, and the order of these.
+
+    A time is damaged if it is absent, or far from those around it: a topic is nearly in order.
+    """
+    time_us = times_us.astype(np.int64)
+    sound = (time_us > 0) & (time_us < LAST_CIVIL_US)
+    if len(time_us) >= AROUND:
+        around = np.median(sliding_window_view(time_us, AROUND), axis=1)
+        early_us = np.pad(around, AROUND // 2, mode="edge") - time_us
+        far_us = np.full((2, len(time_us)), FAR_US)
+        far_us[0, : AROUND // 2] = far_us[1, -(AROUND // 2) :] = BACK_US
+        sound &= (early_us < far_us[0]) & (-early_us < far_us[1])
+    return sound, np.flatnonzero(sound)[np.argsort(time_us[sound], kind="stable")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +162,65 @@ class Timeline:
         at = np.searchsorted(self._begins, batch.starts + batch.offset, side="right") - 1
         corrected: IntArray = batch.time_us + shifts_us[np.maximum(at, 0)]
         return replace(batch, time_us=corrected)
+
+
+class LogClock(Generic[Item]):
+    """Map autopilot times to times from 0: damaged times are discarded, clock jumps followed."""
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        """Messages with an impossible time."""
+        self.leaps = 0
+        """Number of jumps of the autopilot's clock forward by more than `AHEAD_US`."""
+        self.restarts = 0
+        """Number of restarts of the autopilot's clock."""
+        self.zero_us: int | None = None
+        """Autopilot time at zero of the records' clock."""
+        self._newest_us = 0
+        self._held: list[tuple[int, Item]] = []
+        """Items with consistent times that deviate from the times before them."""
+
+    def feed(self, own_us: int | None, item: Item) -> list[tuple[int, Item]]:
+        """Process an item with its time on the autopilot's clock; return the items that are timed.
+
+        An item without a time gets that of the one before.
+        """
+        if own_us is None:
+            return [(self._newest_us, item)]
+        if self.zero_us is None:
+            self.zero_us = own_us
+        if -FAR_US <= own_us - self.zero_us - self._newest_us <= AHEAD_US:
+            self._drop_held()
+            return [self._timed(own_us, item)]
+        if self._held and abs(own_us - self._held[-1][0]) > FAR_US:
+            self._drop_held()
+        self._held.append((own_us, item))
+        return self._follow() if len(self._held) == AGREEING else []
+
+    def flush(self) -> list[tuple[int, Item]]:
+        """Return the items that are still held at the end of the log."""
+        held = self._follow() if len(self._held) >= LEAST_AGREEING else []
+        self._drop_held()
+        return held
+
+    def _timed(self, own_us: int, item: Item) -> tuple[int, Item]:
+        """Return an item with its time on the records' clock, which never decreases."""
+        self._newest_us = max(self._newest_us, own_us - (self.zero_us or 0))
+        return self._newest_us, item
+
+    def _drop_held(self) -> None:
+        self.dropped += len(self._held)
+        self._held.clear()
+
+    def _follow(self) -> list[tuple[int, Item]]:
+        """Follow the clock to the times of the held items."""
+        held, self._held = self._held, []
+        step_us = held[0][0] - (self.zero_us or 0) - self._newest_us
+        self.leaps += step_us > 0
+        self.restarts += step_us < 0
+        # After a restart, times continue from the last one.
+        self.zero_us = (self.zero_us or 0) + min(step_us, 0)
+        return [self._timed(*one) for one in held]
 
 
 class CivilClock:
@@ -210,8 +305,7 @@ class FrameClock:
         return round(self._line_us) if self._by_size else self._now_us
 
     def _update(self, own_us: int, key: tuple[int | str, ...]) -> None:
-        is_civil = FIRST_CIVIL_US < own_us < LAST_CIVIL_US
-        if is_civil and self.civil_us_at_zero is None:
+        if is_civil(own_us) and self.civil_us_at_zero is None:
             self.civil_us_at_zero = own_us - self._now_us
         self.is_timed = True
         base_us, newest_us = self._bases_us.get(key, (self._now_us - own_us, own_us))

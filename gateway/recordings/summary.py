@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -281,24 +280,7 @@ def _of_other_file(file: Path, kind: str, options: ReadOptions) -> Summary:
     # These import all stages, which the summary of our own recordings does not need.
     from gateway.recordings.reading import has_record
 
-    if not has_record(file):
-        return _of_rows(file, kind, options)
-    try:
-        rows = _of_rows(file, kind, options)
-    except FlightError as no_samples:
-        try:
-            return _of_log(file, kind, options)
-        except FlightError:
-            raise no_samples from None
-    with suppress(FlightError):
-        found = _of_log(file, kind, options)
-        (vehicle,) = found.info.vehicles
-        vehicle = replace(vehicle, rates=rows.info.vehicles[0].rates)
-        # The samples are those of the log.
-        info = replace(found.info, vehicles=(vehicle,), records=rows.info.records)
-        remarks = dict.fromkeys([*rows.info.remarks, *found.info.remarks])
-        return _with(replace(found, info=info), kind, remarks)
-    return rows
+    return _of_log(file, kind, options) if has_record(file) else _of_rows(file, kind, options)
 
 
 def _of_rows(file: Path, kind: str, options: ReadOptions) -> Summary:
@@ -319,12 +301,8 @@ def _of_log(file: Path, kind: str, options: ReadOptions) -> Summary:
     """Summarise an autopilot's log by the MAVLink that is made of it."""
     from gateway.recordings.workshop.convert import FlightToWrite
 
-    flight = FlightToWrite([file], replace(options, progress=None))
+    flight = FlightToWrite([file], options)
     batches = flight.chosen()
     found = _of_messages(flight.senders, batches, file.stat().st_size)
-    (log,), info = flight.logs, found.info
-    counts = [(name, count) for name, count in sorted(log.counts.items()) if count]
-    rates = tuple(_rate(*one, info.duration_s) for one in counts)
-    info = replace(info, vehicles=tuple(replace(one, rates=rates) for one in info.vehicles))
-    remarks = [*flight.remarks, *filter(None, [log.lacks])]
-    return _with(replace(found, info=info), kind, remarks)
+    lacks = filter(None, [log.lacks for log in flight.logs])
+    return _with(found, kind, [*flight.remarks, *lacks])

@@ -5,6 +5,7 @@ import math
 import struct
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.message_table import UNITS
 from gateway.recordings.opening import open_flights
 from gateway.recordings.reading import open_record
+from gateway.recordings.summary import read_summary
 from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
@@ -432,6 +434,16 @@ def test_state_of_px4_is_shown_with_its_mode(px4_records: list[RecordedFrame]) -
 def test_info_lists_rows_without_counterpart(tmp_path: Path) -> None:
     output = run("info", write(tmp_path / "flight.bin"))
     assert "without a counterpart in MAVLink: ODD 40" in output
+
+
+@pytest.mark.parametrize("name", ["flight.bin", "flight.ulg"])
+def test_log_and_the_tlog_made_of_it_have_the_same_summary(tmp_path: Path, name: str) -> None:
+    log, tlog = tmp_path / name, tmp_path / "made.tlog"
+    flown.write(log, px4_log()) if log.suffix == ".ulg" else write(log)
+    run("convert", log, "-o", tlog)
+    found, made = (read_summary(path, None, lambda: OPTIONS).info for path in (log, tlog))
+    assert found.records > 100
+    assert replace(found, kind="", size=0, remarks=()) == replace(made, kind="", size=0, remarks=())
 
 
 def test_tlog_has_own_estimates_fused_ones_or_both(tmp_path: Path) -> None:

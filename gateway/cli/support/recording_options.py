@@ -104,7 +104,7 @@ DESCRIPTIONS: Final = {
 
 def read_sensors(texts: Sequence[str] | None) -> tuple[tuple[str, int], ...]:
     """Read --sensor; raises FlightError if one is invalid."""
-    from gateway.recordings.formats.dataflash import SENSORS
+    from gateway.recordings.formats.dataflash_record import SENSORS
 
     found = []
     for text in texts or ():

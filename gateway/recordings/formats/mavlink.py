@@ -12,7 +12,6 @@ fix. Of the autopilot's own estimates (ATTITUDE, with the position known at that
 before each sample is kept.
 """
 
-import math
 from collections import defaultdict
 from typing import Final
 
@@ -24,7 +23,7 @@ from gateway.geometry.quaternion import from_euler_array
 from gateway.recordings.columns import BARO, COLUMNS, GPS, LARGEST_WHOLE, NAV, SI, FloatArray
 from gateway.recordings.formats.csv import level_velocity
 from gateway.recordings.recorded_clock import FIRST_CIVIL_US
-from gateway.records import NAN, UNKNOWN_VEC3, GpsFixType, ImuFlags, NavFlags, NavState, Quat, Vec3
+from gateway.records import NAN, GpsFixType, ImuFlags, NavFlags
 from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S, UT_PER_GAUSS
 from gateway.vehicle_state.positions import is_located
 from gateway.vehicle_state.senders import Senders
@@ -179,22 +178,6 @@ def _of_position(positions: Fields, position_at: IntArray, name: str, scale: flo
     known = position_at >= 0
     found[known] = positions[name][position_at[known]] * scale
     return found
-
-
-def autopilot_state(
-    time_us: int, q_nb: Quat, position: tuple[float, float, float] | None, vel_n_mps: Vec3
-) -> NavState:
-    """Make a state from an autopilot's own solution, without standard deviations."""
-    flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
-    if position is not None:
-        flags |= NavFlags.POSITION_VALID | NavFlags.ALTITUDE_VALID
-    if math.isfinite(sum(vel_n_mps)):
-        flags |= NavFlags.VELOCITY_VALID
-    unknown = UNKNOWN_VEC3
-    lat_deg, lon_deg, alt_m = position or unknown
-    return NavState(
-        time_us, q_nb, unknown, lat_deg, lon_deg, alt_m, vel_n_mps, unknown, unknown, unknown, flags
-    )
 
 
 class AutopilotReader:

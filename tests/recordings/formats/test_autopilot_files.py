@@ -187,7 +187,8 @@ def test_info_convert_and_play_accept_autopilot_logs(folder: Path, tmp_path: Pat
 def test_missing_package_is_named(
     short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delitem(sys.modules, "gateway.recordings.formats.ulog", raising=False)
+    for module in ("ulog", "ulog_record"):
+        monkeypatch.delitem(sys.modules, f"gateway.recordings.formats.{module}", raising=False)
     monkeypatch.setitem(sys.modules, "pyulog", None)
     text = run("convert", short / "new.ulg", "-o", tmp_path / "x.csv", code=2)
     assert "needs the extra formats" in text
