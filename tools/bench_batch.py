@@ -43,7 +43,7 @@ from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S
 from gateway.units import US_PER_S
-from tests.batch.season_flights import line_of
+from tests.batch.flights import line_of
 from tools.harness import Figures, arguments, show, write_json
 
 SEEDS = 4

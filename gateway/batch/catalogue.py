@@ -326,10 +326,10 @@ def _unpacked(packed: bytes) -> Segments:
 class IndexReport:
     """Counts of an indexing run."""
 
-    read: int = 0
-    unchanged: int = 0
-    gone: int = 0
-    broken: int = 0
+    read: int
+    unchanged: int
+    gone: int
+    broken: int
     """Number of unreadable files among those that were read."""
 
 
@@ -343,8 +343,7 @@ def index_folder(
 
     Raises CatalogueError if the catalogue cannot be written.
     """
-    catalogue = Catalogue(folder)
-    try:
+    with closing(Catalogue(folder)) as catalogue:
         known = catalogue.known()
         there = {as_text(str(path.relative_to(folder))): path for path in recordings_below(folder)}
         gone = known.keys() - there.keys()
@@ -354,10 +353,29 @@ def index_folder(
             for name, path in there.items()
             if name not in known or _stamp_if_there(path) != known[name][:2]
         ]
-        report = IndexReport(unchanged=len(there) - len(wanted), gone=len(gone))
-        return _read_all(catalogue, folder, options, executor, wanted, on_progress, report)
-    finally:
-        catalogue.close()
+        read = broken = 0
+        waiting: list[CataloguedFile] = []
+        kept_s = time.monotonic()
+        try:
+            for number, outcome in executor.run(partial(read_file, folder, options), wanted):
+                name, digest = wanted[number]
+                file = outcome
+                if isinstance(outcome, WorkFailed):
+                    file = _unread(folder, name, outcome)
+                read += 1
+                if file.digest and file.digest == digest:
+                    catalogue.touch(file.path, file.modified_ns)
+                else:
+                    waiting.append(file)
+                    broken += file.error is not None
+                if time.monotonic() - kept_s > KEEP_S:
+                    catalogue.put(waiting)
+                    waiting, kept_s = [], time.monotonic()
+                if on_progress is not None:
+                    on_progress(read, len(wanted))
+        finally:
+            catalogue.put(waiting)
+    return IndexReport(read, len(there) - len(wanted), len(gone), broken)
 
 
 def recordings_below(folder: Path) -> Iterator[Path]:
@@ -393,37 +411,6 @@ def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file's bytes; raises OSError."""
     with open_recording(path) as file:
         return file_digest(file, "sha256").hexdigest()
-
-
-def _read_all(
-    catalogue: Catalogue,
-    folder: Path,
-    options: ReadOptions,
-    executor: Executor,
-    wanted: list[Wanted],
-    on_progress: Callable[[int, int], None] | None,
-    report: IndexReport,
-) -> IndexReport:
-    waiting: list[CataloguedFile] = []
-    kept_s = time.monotonic()
-    try:
-        for number, outcome in executor.run(partial(read_file, folder, options), wanted):
-            name, known_digest = wanted[number]
-            file = _unread(folder, name, outcome) if isinstance(outcome, WorkFailed) else outcome
-            report = replace(report, read=report.read + 1)
-            if file.digest and file.digest == known_digest:
-                catalogue.touch(file.path, file.modified_ns)
-            else:
-                waiting.append(file)
-                report = replace(report, broken=report.broken + (file.error is not None))
-            if time.monotonic() - kept_s > KEEP_S:
-                catalogue.put(waiting)
-                waiting, kept_s = [], time.monotonic()
-            if on_progress is not None:
-                on_progress(report.read, len(wanted))
-    finally:
-        catalogue.put(waiting)
-    return report
 
 
 def _unread(folder: Path, name: str, failed: WorkFailed) -> CataloguedFile:

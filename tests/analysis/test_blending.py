@@ -47,14 +47,16 @@ def test_interpolation_is_linear_between_times_of_validity() -> None:
     assert track.vel_n_mps[1] == pytest.approx([1.5, 3.0, 4.5])
 
 
-def test_interpolation_is_nan_outside_fixes_and_across_long_gaps() -> None:
+@pytest.mark.parametrize(
+    ("valid_s", "known"),
+    [([0.0, 1.0, 5.0, 6.0], [False, True, False, True, False]), ([1.0], [False] * 5)],
+    ids=["long gap", "single fix"],
+)
+def test_interpolation_is_nan_outside_fixes_and_across_long_gaps(
+    valid_s: list[float], known: list[bool]
+) -> None:
     time_us = np.array([-1, 500_000, 3_000_000, 5_500_000, 6_000_001])
-    track = interpolate(line([0.0, 1.0, 5.0, 6.0]), time_us)
-    assert np.isfinite(track.lat_deg).tolist() == [False, True, False, True, False]
-
-
-def test_single_fix_is_not_interpolated() -> None:
-    assert np.isnan(interpolate(line([1.0]), np.array([1_000_000])).lat_deg).all()
+    assert np.isfinite(interpolate(line(valid_s), time_us).lat_deg).tolist() == known
 
 
 def test_track_across_date_line_is_compared_with_fixes_near_it() -> None:
@@ -111,15 +113,11 @@ def test_truth_agrees_with_fixes_at_their_time_of_validity() -> None:
     assert np.nanmean(np.hypot(*worse.T)) > np.nanmean(np.hypot(*error.T))
 
 
-def test_errors_of_published_table_grow_with_both_weights() -> None:
-    assert grows(paper_table(), "north_m")
-    assert grows(paper_table(), "east_m")
-
-
 def test_table_with_one_decrease_does_not_grow() -> None:
-    table = paper_table().copy()
-    table.loc[4, "east_m"] = 1.0
+    table = paper_table()
     assert grows(table, "north_m")
+    assert grows(table, "east_m")
+    table.loc[4, "east_m"] = 1.0
     assert not grows(table, "east_m")
 
 
@@ -133,16 +131,12 @@ def test_errors_of_simulated_flight_grow_with_both_weights() -> None:
     assert table["held_m"].idxmin() == 0
 
 
-def test_interpolated_gps_scores_zero_against_itself() -> None:
+def test_interpolated_gps_and_truth_score_zero_against_themselves() -> None:
     flight = short_flight()
     split = SplitFlight.by(flight, withhold(flight, 5))
     found = score(split.interpolated, split)
     assert found["north_m"] == found["east_m"] == found["interpolated_m"] == 0.0
     assert 0.0 < found["held_m"] < 2.0
-
-
-def test_truth_scores_zero_against_itself() -> None:
-    flight = short_flight()
     split = SplitFlight.by(flight, np.ones(len(flight.fixes), np.bool_))
     found = score(true_track(flight), split)
     assert found["reference_m"] == pytest.approx(0.0)

@@ -1,14 +1,14 @@
-"""A small season, written once for all tests of the package."""
+"""A small folder of recordings, written once for all tests of the package."""
 
 from pathlib import Path
 
 import pytest
 
-from tests.batch.season_flights import write_flight
+from tests.batch.flights import write_flight
 
 
 @pytest.fixture(scope="session")
-def season(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four flights of two aircraft on three days, and a broken file."""
     folder = tmp_path_factory.mktemp("flights")
     write_flight(folder / "alpha_01_v1.csv", vehicle=1, day=0, noise_m=0.2)

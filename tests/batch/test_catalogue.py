@@ -37,7 +37,7 @@ from gateway.pipeline import PipelineSettings
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.vehicle_state.positions import TrackPoint
 from gateway.wire.recorded_frames import RecordedFrame
-from tests.batch.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
+from tests.batch.flights import DURATION_S, OUTAGE_S, simulated, write_flight
 from tests.kit.cli import invoke
 from tests.kit.mavlink import packed
 from tests.kit.recordings import make_records, make_tlog, write_tlog
@@ -92,7 +92,7 @@ def index(folder: Path) -> IndexReport:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all kinds of files, indexed."""
-    folder = tmp_path_factory.mktemp("season")
+    folder = tmp_path_factory.mktemp("recordings")
     write_flight(folder / "one_01_v1.csv", vehicle=1, day=0)
     write_flight(folder / "deeper" / "two_01_v2.csv", vehicle=2, day=3, lost=10)
     write_tlog(folder / "far.tlog", far_flight())

@@ -1,5 +1,6 @@
 """Compare the estimators, or two cases; and Table I of the paper."""
 
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -128,12 +129,11 @@ def error_table(
     tracks: dict[str, FlightTrack], reference: Reference, scored: BoolArray
 ) -> pd.DataFrame:
     """Return a table of the errors of tracks against a reference."""
-    rows = []
-    for name, track in tracks.items():
-        found = errors_over_time(track, reference.track)
-        errors = {key: np.where(scored, value, np.nan) for key, value in found.items()}
-        figures = {column: figure(errors[key]) for column, figure, key in ERROR_COLUMNS}
-        rows.append({"estimator": name, **figures})
+    errors = {name: errors_over_time(track, reference.track) for name, track in tracks.items()}
+    rows = [
+        {"estimator": name, **{c: figure(of[key][scored]) for c, figure, key in ERROR_COLUMNS}}
+        for name, of in errors.items()
+    ]
     return pd.DataFrame(rows).dropna(axis="columns", how="all")
 
 
@@ -168,9 +168,6 @@ def _draw_errors(case: Case, reference: Reference, table: pd.DataFrame, width_in
     figure, bars, axes = _error_panels(width_in, [kinds[key] for key in known], table)
     for panel, column in zip(bars, filter(table.__contains__, BARS), strict=True):
         _draw_bars(panel, table, column)
-    for panel, key in zip(axes, known, strict=True):
-        panel.set_ylabel(kinds[key])
-    axes[-1].set_xlabel("time (s)")
     for panel, key in zip(axes, known, strict=True):
         for name, found in errors.items():
             colour = COLOURS.get(name, OTHER)
@@ -215,37 +212,25 @@ def comparison(a: Case, b: Case) -> Section:
     same = np.array_equal(a.flight.time_us, b.flight.time_us)
     what = "the same flight with other settings" if same else b.flight.name
     lead = f"A is {a.flight.name}, fused by `{a.chosen}`; B is {what}, fused by `{b.chosen}`."
-    if same:
-        picture = Picture(
-            "comparison_difference",
-            lambda width: _draw_difference(a, b, width),
-            "Distance between the two fused tracks over time.",
-        )
-    else:
-        picture = Picture(
-            "comparison_profiles",
-            lambda width: _draw_profiles(a, b, width),
-            "Height above the start and ground speed of both flights, each from its own start.",
-        )
-    pictures = [picture]
-    if _on_one_map(a, b):
-        pictures.append(
-            Picture(
-                "comparison_map",
-                lambda width: _draw_map(a, b, width),
-                "Both fused tracks from above.",
-            )
-        )
+    apart = "Distance between the two fused tracks over time."
+    profiles = "Height above the start and ground speed of both flights, each from its own start."
+    known = [
+        (same, "comparison_difference", _draw_difference, apart),
+        (not same, "comparison_profiles", _draw_profiles, profiles),
+        (_on_one_map(a, b), "comparison_map", _draw_map, "Both fused tracks from above."),
+    ]
+    pictures = [
+        Picture(name, partial(draw, a, b), caption)
+        for is_shown, name, draw, caption in known
+        if is_shown
+    ]
     return Section("Comparison", lead, pictures, _tables(a, b))
 
 
 def _tables(a: Case, b: Case) -> list[ReportTable]:
     first, second = summarise(a), summarise(b)
-    rows = [
-        {"": key, "A": first.get(key, np.nan), "B": second.get(key, np.nan)}
-        for key in dict.fromkeys([*first, *second])
-    ]
-    numbers = pd.DataFrame(rows)
+    numbers = pd.DataFrame({"A": first, "B": second}, [*(first | second)])
+    numbers = numbers.reset_index(names="")
     numbers["B − A"] = numbers["B"] - numbers["A"]
     tables = [ReportTable("comparison", numbers, "Both in figures, and B minus A.")]
     if changes := changed_settings(a.fusion, b.fusion):
@@ -292,14 +277,11 @@ def _draw_profiles(a: Case, b: Case, width_in: float) -> Figure:
 
 
 def _draw_map(a: Case, b: Case, width_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, min(0.7 * width_in, 4.6)))
-    axes = figure.subplots()
+    figure, axes = style.ground_map(width_in, min(0.7 * width_in, 4.6), "A's first fix")
     frame = a.frame
     for case, name, colour, width in zip((a, b), NAMES, AB_COLOURS, (2.6, 1.0), strict=True):
         if frame is not None:
             draw_path(axes, frame, case.track, colour, name, lw=width)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="east of A's first fix (m)", ylabel="north of A's first fix (m)")
     style.legend_above(axes)
     return figure
 

@@ -14,9 +14,10 @@ from gateway.analysis.case import Case
 from gateway.analysis.flight import FlightTrack, FloatArray, IntArray
 from gateway.analysis.metrics import euler_rad, rms, worst
 from gateway.analysis.reporting import style
-from gateway.analysis.reporting.page import Picture, ReportTable, Section
+from gateway.analysis.reporting.page import Picture, ReportTable, Section, table_of_series
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.quaternion import integrate_rate
+from gateway.records import NAN
 from gateway.units import US_PER_S
 from gateway.vehicle_state.positions import LocalFrame
 
@@ -119,19 +120,15 @@ def continuous_yaw_deg(q_nb: FloatArray) -> FloatArray:
 
 
 def _yaw_table(lines: YawLines) -> pd.DataFrame:
-    rows = []
-    for name in lines.yaw_deg:
-        error = lines.error_deg(name)
+    def last(error: FloatArray) -> float:
         known = error[np.isfinite(error)]
-        rows.append(
-            {
-                "yaw from": name,
-                "RMS error, deg": rms(error),
-                "greatest, deg": worst(error),
-                "at the end, deg": float(known[-1]) if len(known) else float("nan"),
-            }
-        )
-    return pd.DataFrame(rows)
+        return float(known[-1]) if len(known) else NAN
+
+    return table_of_series(
+        "yaw from",
+        {name: lines.error_deg(name) for name in lines.yaw_deg},
+        {"RMS error, deg": rms, "greatest, deg": worst, "at the end, deg": last},
+    )
 
 
 def _attitude_by_rate(time_us: IntArray, gyro_b_radps: FloatArray, q_nb: FloatArray) -> FloatArray:
@@ -234,24 +231,21 @@ def _draw_map(case: Case, width_in: float) -> Figure:
     frame = case.frame
     assert frame is not None
     fixes = case.fixes
-    figure = Figure(figsize=(width_in, width_in * 0.72 if width_in >= style.WIDE_IN else 4.2))
-    axes = figure.subplots()
+    height_in = width_in * 0.72 if width_in >= style.WIDE_IN else 4.2
+    figure, axes = style.ground_map(width_in, height_in, "the first fix")
     reference = case.flight.reference
     if reference is not None:
         draw_path(
             axes, frame, reference.track, style.REFERENCE, case.truth_name, lw=4.0, alpha=0.25
         )
-    north_m, east_m = frame.north_m(fixes.lat_deg), frame.east_m(fixes.lon_deg)
-    axes.plot(east_m, north_m, ".", color=style.ORANGE, ms=3.2, label="GPS fixes")
+    pos_m = frame.local_m(fixes.lat_deg, fixes.lon_deg)
+    axes.plot(pos_m[:, 1], pos_m[:, 0], ".", color=style.ORANGE, ms=3.2, label="GPS fixes")
     draw_path(axes, frame, case.track, style.BLUE, "fused", lw=1.2)
-    axes.plot(east_m[0], north_m[0], "^", color=style.GREEN, ms=7, label="start")
-    axes.plot(east_m[-1], north_m[-1], "s", color=style.RED, ms=6, label="end", mfc="none")
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="east of the first fix (m)", ylabel="north of the first fix (m)")
+    style.mark_ends(axes, pos_m)
     style.legend_outside(figure, axes, 5 if width_in >= style.WIDE_IN else 3)
     figure.draw_without_rendering()
     _graticule(axes, frame)
-    _scale_and_north(axes, east_m, north_m)
+    _scale_and_north(axes, pos_m[:, 1], pos_m[:, 0])
     return figure
 
 

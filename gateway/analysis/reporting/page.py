@@ -1,7 +1,7 @@
 """Write the report as one self-contained HTML page, and its figures and tables as files."""
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -11,6 +11,7 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from gateway.analysis.flight import FloatArray
 from gateway.analysis.processes import START, forked
 from gateway.analysis.reporting.style import (
     NARROW_IN,
@@ -61,6 +62,20 @@ class ReportTable:
         if isinstance(value, float):
             return figure(value, f"z.{self.digits}f")
         return str(value)
+
+
+def table_of_series(
+    head: str,
+    series: Mapping[str, FloatArray],
+    figures: Mapping[str, Callable[[FloatArray], float]],
+) -> pd.DataFrame:
+    """Return a table with a row of figures for each of some series of values."""
+    return pd.DataFrame(
+        [
+            {head: name, **{title: figure_of(values) for title, figure_of in figures.items()}}
+            for name, values in series.items()
+        ]
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -145,8 +145,8 @@ def _draw_map(flight: PilotFlight, width_in: float) -> Figure:
     step = max(1, len(points) // LINE_POINTS)
     pos_m = frame.local_m(points.lat_deg[::step], points.lon_deg[::step])
     height = points.height_m[::step]
-    figure = Figure(figsize=(width_in, width_in * 0.66 if width_in >= style.WIDE_IN else 4.0))
-    axes = figure.subplots()
+    height_in = width_in * 0.66 if width_in >= style.WIDE_IN else 4.0
+    figure, axes = style.ground_map(width_in, height_in, str(flight.facts.height_above))
     if len(pos_m) > 1:
         drawn = pos_m[:, ::-1].reshape(-1, 1, 2)
         segments = np.concatenate([drawn[:-1], drawn[1:]], axis=1)
@@ -159,12 +159,8 @@ def _draw_map(flight: PilotFlight, width_in: float) -> Figure:
         bar = figure.colorbar(line, ax=axes, fraction=0.04, pad=0.02)
         bar.set_label(f"height above {flight.facts.height_above} (m)")
         bar.outline.set_visible(False)
-    axes.plot(pos_m[0, 1], pos_m[0, 0], "^", color=style.GREEN, ms=8, label="start")
-    axes.plot(pos_m[-1, 1], pos_m[-1, 0], "s", color=style.RED, ms=7, mfc="none", label="end")
+    style.mark_ends(axes, pos_m)
     _mark_events(axes, flight)
-    axes.set_aspect("equal", adjustable="datalim")
-    zero = flight.facts.height_above
-    axes.set(xlabel=f"east of {zero} (m)", ylabel=f"north of {zero} (m)")
     style.legend_outside(figure, axes, 5 if width_in >= style.WIDE_IN else 3)
     return figure
 

@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 from gateway.analysis.blending import MAX_GAP_S
 from gateway.analysis.case import Case
 from gateway.analysis.flight import Flight, FloatArray, IntArray
+from gateway.analysis.metrics import rms, worst
 from gateway.analysis.reporting import style
-from gateway.analysis.reporting.page import Picture, ReportTable, Section
+from gateway.analysis.reporting.page import Picture, ReportTable, Section, table_of_series
 from gateway.analysis.signals import (
     KINDS,
     PAPER_RATE_HZ,
@@ -202,21 +203,16 @@ def loss_table(flight: Flight, node_time_us: IntArray) -> pd.DataFrame:
     """Return a table of jitter and loss."""
     interval_us = np.diff(node_time_us) % NODE_WRAP_US
     nominal_us = float(np.median(interval_us))
-    missing = missing_samples(node_time_us)
-    count = len(node_time_us)
     jitter_ms = (np.diff(flight.time_us) - interval_us) * 1e-3
-    return pd.DataFrame(
-        [
-            {
-                "samples": count,
-                "nominal interval, ms": nominal_us * 1e-3,
-                "lost": int(missing.sum()),
-                "lost, %": 100.0 * (lost_share(node_time_us) or 0.0),
-                "longest gap, ms": float(np.diff(flight.time_us).max()) * 1e-3,
-                "jitter of gateway time, ms RMS": float(np.sqrt(np.mean(jitter_ms**2))),
-            }
-        ]
-    )
+    row = {
+        "samples": len(node_time_us),
+        "nominal interval, ms": nominal_us * 1e-3,
+        "lost": int(missing_samples(node_time_us).sum()),
+        "lost, %": 100.0 * (lost_share(node_time_us) or 0.0),
+        "longest gap, ms": float(np.diff(flight.time_us).max()) * 1e-3,
+        "jitter of gateway time, ms RMS": rms(jitter_ms),
+    }
+    return pd.DataFrame([row])
 
 
 def magnetometer(case: Case) -> Section | None:
@@ -226,17 +222,12 @@ def magnetometer(case: Case) -> Section | None:
         return None
     before, after = before[np.isfinite(before[:, 0])], after[np.isfinite(after[:, 0])]
     strengths = {"before": np.linalg.norm(before, axis=1), "after": np.linalg.norm(after, axis=1)}
-    table = pd.DataFrame(
-        [
-            {
-                "calibration": name,
-                "mean field, uT": float(strength.mean()),
-                "spread, uT": float(strength.std()),
-                "spread, %": 100.0 * float(strength.std() / strength.mean()),
-            }
-            for name, strength in strengths.items()
-        ]
-    )
+    figures = {
+        "mean field, uT": np.mean,
+        "spread, uT": np.std,
+        "spread, %": lambda strength: 100.0 * np.std(strength) / np.mean(strength),
+    }
+    table = table_of_series("calibration", strengths, figures)
     return Section(
         "Magnetometer before and after calibration",
         "A magnetometer that turns in the Earth's field alone measures points on a sphere about "
@@ -290,19 +281,10 @@ def baro_offset_m(case: Case) -> float:
 
 
 def _height_table(case: Case, offset_m: float) -> pd.DataFrame:
-    rows = []
-    for name, (time_us, alt_m, _) in _height_lines(case, offset_m).items():
-        error = alt_m - _height_reference(case, time_us)
-        error = error[np.isfinite(error)]
-        rows.append(
-            {
-                "source": name,
-                "mean error, m": float(error.mean()),
-                "spread, m": float(error.std()),
-                "worst, m": float(np.abs(error).max()),
-            }
-        )
-    return pd.DataFrame(rows)
+    lines = _height_lines(case, offset_m).items()
+    errors = {name: alt - _height_reference(case, time_us) for name, (time_us, alt, _) in lines}
+    figures = {"mean error, m": np.nanmean, "spread, m": np.nanstd, "worst, m": worst}
+    return table_of_series("source", errors, figures)
 
 
 def _height_lines(case: Case, offset_m: float) -> dict[str, tuple[IntArray, FloatArray, str]]:

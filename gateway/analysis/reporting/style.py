@@ -111,6 +111,21 @@ def over_time(
     return figure, axes
 
 
+def ground_map(width_in: float, height_in: float, zero: str) -> tuple[Figure, Axes]:
+    """Create a map with its origin at a named point."""
+    figure = Figure(figsize=(width_in, height_in))
+    axes = figure.subplots()
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel=f"east of {zero} (m)", ylabel=f"north of {zero} (m)")
+    return figure, axes
+
+
+def mark_ends(axes: Axes, pos_m: FloatArray) -> None:
+    """Mark the start and the end of a track of north and east on a map."""
+    axes.plot(pos_m[0, 1], pos_m[0, 0], "^", color=GREEN, ms=7, label="start")
+    axes.plot(pos_m[-1, 1], pos_m[-1, 0], "s", color=RED, ms=6, label="end", mfc="none")
+
+
 def envelope(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Reduce a long line to the minimum and maximum of each interval."""
     stretch = -(-len(x) // (MAX_POINTS // 2))

@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from io import RawIOBase
 from pathlib import Path
 from shutil import rmtree
 from tempfile import mkdtemp
-from typing import Final
+from typing import Any, Final
 from weakref import finalize
 
 from gateway.recordings.autopilot_record import AutopilotLog, RecordTranslator
@@ -359,30 +360,26 @@ add_writer(".mcap", _packaged("mcap", "MCAP"), Lacks(of_tables=NOT_FUSED))
 add_writer(".parquet", _packaged("parquet", "Parquet"), Lacks(of_tlogs=NOT_IN_TABLE))
 
 
-class Pieces:
+class Pieces(RawIOBase):
     """A file in memory, without seek, from which the bytes written so far can be taken."""
 
     def __init__(self) -> None:
-        self.closed = False
         self._written: list[bytes] = []
         self._size = 0
 
-    def write(self, data: bytes) -> int:
+    def writable(self) -> bool:
+        """Return that it can be written."""
+        return True
+
+    def write(self, data: Any) -> int:
         """Write more of the file."""
         self._written.append(bytes(data))
-        self._size += len(data)
-        return len(data)
+        self._size += len(self._written[-1])
+        return len(self._written[-1])
 
     def tell(self) -> int:
         """Return the number of bytes written in total."""
         return self._size
-
-    def flush(self) -> None:
-        """Do nothing: there is no other buffer."""
-
-    def close(self) -> None:
-        """Close the stream."""
-        self.closed = True
 
     def take(self) -> bytes:
         """Return the bytes that were written since the last call."""

@@ -6,7 +6,7 @@ All functions take batches and return batches with fewer records; frames are not
 import difflib
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Final
@@ -103,7 +103,7 @@ class StateChoice:
     margin_s: float = 0.0
 
     def includes(self, beat: Any, mode: tuple[str, str]) -> bool:
-        """Return whether the time after this heartbeat, of a mode by `mode_of`, is selected."""
+        """Return whether the time after a heartbeat with a mode of this name and number is kept."""
         is_armed = bool(beat["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         is_in_mode = not self.modes or not self.modes.isdisjoint(mode)
         return (is_armed or not self.armed) and is_in_mode
@@ -147,7 +147,9 @@ class ChosenState:
                 continue
             found[at:row] = batch.time_us[at:row] <= self._end_us
             at = row
-            mode = mode_of(beat, vehicle.modes)
+            number = int(beat["custom_mode"])
+            name = mode_name(int(beat["autopilot"]), int(beat["type"]), number)
+            mode = (name or vehicle.modes.get(number, ""), str(number))
             self.modes.add(" ".join(mode).strip())
             if self.choice.includes(beat, mode):
                 self._until_us[origin] = int(batch.time_us[row]) + HEARTBEAT_TIMEOUT_US
@@ -159,16 +161,6 @@ class ChosenState:
     @property
     def _end_us(self) -> int:
         return max(self._until_us.values(), default=_LONG_AGO_US)
-
-
-def mode_of(beat: Any, names: Mapping[int, str]) -> tuple[str, str]:
-    """Return the mode in a heartbeat by name, empty if it has none, and as a number.
-
-    `names` are those of AVAILABLE_MODES.
-    """
-    number = int(beat["custom_mode"])
-    known = mode_name(int(beat["autopilot"]), int(beat["type"]), number)
-    return known or names.get(number, ""), str(number)
 
 
 def while_in_state(batches: Iterable[Batch], state: ChosenState) -> Iterator[Batch]:

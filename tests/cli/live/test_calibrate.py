@@ -13,7 +13,7 @@ from gateway.records import GpsFix, ImuFlags, ImuRaw, NodeId, Vec3
 from gateway.sensing.calibrating import NodeSamples
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.batch.season_flights import line_of
+from tests.batch.flights import line_of
 from tests.estimation.samples import fix
 from tests.kit.cli import invoke
 from tests.kit.records import raw_at

@@ -47,7 +47,7 @@ def test_page_of_flights_too_short_to_be_judged_has_no_picture(tmp_path: Path) -
     assert "Share of the flights" not in page
 
 
-def season_of(eskf_m: float, paper_m: float, drifts_m: dict[str, float]) -> list[FlightResult]:
+def flights_with(eskf_m: float, paper_m: float, drifts_m: dict[str, float]) -> list[FlightResult]:
     """Ten flights of ten days with these errors at withheld fixes and without GPS."""
     figures = {"held_m": {"eskf": eskf_m, "paper": paper_m}, "drift_m": drifts_m}
     return [
@@ -57,13 +57,13 @@ def season_of(eskf_m: float, paper_m: float, drifts_m: dict[str, float]) -> list
 
 
 def test_lead_of_an_estimator_is_explained() -> None:
-    text = why_leads(season_of(1.0, 2.0, {"eskf": 4.0, "paper": 31.0}))
+    text = why_leads(flights_with(1.0, 2.0, {"eskf": 4.0, "paper": 31.0}))
     assert text.startswith("eskf leads paper: median errors of 1.00 and 2.00 m over 10 flights.")
     assert "drifts less: after 10 s without GPS it is 4.0 m off, paper 31.0 m; it dist" in text
-    text = why_leads(season_of(2.0, 1.0, {"eskf": 4.0, "paper": 31.0}))
+    text = why_leads(flights_with(2.0, 1.0, {"eskf": 4.0, "paper": 31.0}))
     assert text.startswith("paper leads eskf: median errors of 1.00 and 2.00 m")
     assert "not in drifting less: after 10 s without GPS it is 31.0 m off, eskf 4.0 m." in text
-    assert "drift" not in why_leads(season_of(1.0, 2.0, {}))
+    assert "drift" not in why_leads(flights_with(1.0, 2.0, {}))
     assert why_leads([flight("a", 1, eskf=1.0)]) == ""
 
 
@@ -76,9 +76,9 @@ def test_degraded_flights_are_listed_worst_first() -> None:
 
 
 @pytest.mark.io
-def test_sweep_of_a_folder_finds_one_set_of_settings(season: Path, tmp_path: Path) -> None:
+def test_sweep_of_a_folder_finds_one_set_of_settings(recordings: Path, tmp_path: Path) -> None:
     best, table = tmp_path / "best.toml", tmp_path / "trials.csv"
-    words = ("sweep", season, "--vary", "beta=0.1,0.5,0.9", "-o", best, "--table", table)
+    words = ("sweep", recordings, "--vary", "beta=0.1,0.5,0.9", "-o", best, "--table", table)
     text = run(*words, "--jobs", 2, code=1)
     assert "3 points on 4 flights; mean with the recorded settings" in text
     assert "1 of 5 recordings failed" in text
@@ -89,5 +89,13 @@ def test_sweep_of_a_folder_finds_one_set_of_settings(season: Path, tmp_path: Pat
     assert (estimation.estimator, estimation.paper.beta_velocity) == ("paper", winner)
     rows = pd.read_csv(table)
     assert np.exp(np.log(rows["best settings"]).mean()) == pytest.approx(means[0], rel=1e-3)
-    words = ("sweep", season / "alpha_01_v1.csv", season, "--optimise", 3, "--vary", "beta=0:1")
+    words = (
+        "sweep",
+        recordings / "alpha_01_v1.csv",
+        recordings,
+        "--optimise",
+        3,
+        "--vary",
+        "beta=0:1",
+    )
     assert "give a grid" in run(*words, code=2)
