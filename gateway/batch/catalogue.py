@@ -359,9 +359,10 @@ def index_folder(
         try:
             for number, outcome in executor.run(partial(read_file, folder, options), wanted):
                 name, digest = wanted[number]
-                file = outcome
                 if isinstance(outcome, WorkFailed):
                     file = _unread(folder, name, outcome)
+                else:
+                    file = outcome
                 read += 1
                 if file.digest and file.digest == digest:
                     catalogue.touch(file.path, file.modified_ns)

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import jinja2
 import pandas as pd
@@ -26,6 +26,8 @@ from gateway.output import write_new, written_together
 from gateway.printable import figure
 
 PAGE_NAME: Final = "index.html"
+Figures = Mapping[str, Callable[[FloatArray], Any]]
+"""Figures of a series of values, by title."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +69,7 @@ class ReportTable:
 def table_of_series(
     head: str,
     series: Mapping[str, FloatArray],
-    figures: Mapping[str, Callable[[FloatArray], float]],
+    figures: Figures,
 ) -> pd.DataFrame:
     """Return a table with a row of figures for each of some series of values."""
     return pd.DataFrame(

@@ -11,7 +11,7 @@ from gateway.analysis.case import Case
 from gateway.analysis.flight import Flight, FloatArray, IntArray
 from gateway.analysis.metrics import rms, worst
 from gateway.analysis.reporting import style
-from gateway.analysis.reporting.page import Picture, ReportTable, Section, table_of_series
+from gateway.analysis.reporting.page import Figures, Picture, ReportTable, Section, table_of_series
 from gateway.analysis.signals import (
     KINDS,
     PAPER_RATE_HZ,
@@ -222,7 +222,7 @@ def magnetometer(case: Case) -> Section | None:
         return None
     before, after = before[np.isfinite(before[:, 0])], after[np.isfinite(after[:, 0])]
     strengths = {"before": np.linalg.norm(before, axis=1), "after": np.linalg.norm(after, axis=1)}
-    figures = {
+    figures: Figures = {
         "mean field, uT": np.mean,
         "spread, uT": np.std,
         "spread, %": lambda strength: 100.0 * np.std(strength) / np.mean(strength),
@@ -283,7 +283,11 @@ def baro_offset_m(case: Case) -> float:
 def _height_table(case: Case, offset_m: float) -> pd.DataFrame:
     lines = _height_lines(case, offset_m).items()
     errors = {name: alt - _height_reference(case, time_us) for name, (time_us, alt, _) in lines}
-    figures = {"mean error, m": np.nanmean, "spread, m": np.nanstd, "worst, m": worst}
+    figures: Figures = {
+        "mean error, m": np.nanmean,
+        "spread, m": np.nanstd,
+        "worst, m": worst,
+    }
     return table_of_series("source", errors, figures)
 
 
