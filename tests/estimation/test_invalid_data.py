@@ -197,16 +197,6 @@ def test_impossible_jump_of_fixes_gives_no_velocity(flight: Flight) -> None:
     check_sane(flight, log)
 
 
-def test_zero_velocity_contradicted_by_positions_is_not_used(flight: Flight) -> None:
-    """As from a receiver that measures no velocity, or a log without one."""
-    log = part(flight, 0.0, 120.0)
-    log.gps[:, GPS_VELS] = 0.0
-    out, late = run(flight, log), log.imu_time_us > 60_000_000
-    counted = replace(flight, counts=late, log=log, q_nb=flight.q_nb[: len(out)])
-    scores = attitude_scores(counted, out[:, :4])
-    assert max(scores["heading"], scores["inclination"]) < 3.5
-
-
 @pytest.mark.parametrize("has_velocity", [True, False])
 def test_repeated_fix_is_used_once(flight: Flight, has_velocity: bool) -> None:
     """As in a log that holds each fix until the next one."""

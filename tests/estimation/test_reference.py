@@ -8,24 +8,21 @@ from gateway.records import GpsFixType
 from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, fix
 
 
-def test_good_fix_and_unknown_accuracy_are_usable() -> None:
-    assert is_usable(fix(0), ReferenceSettings())
-    assert is_usable(replace(fix(0), h_acc_m=math.nan), ReferenceSettings())
-
-
 @pytest.mark.parametrize(
-    "change",
+    ("change", "usable"),
     [
-        {"fix_ok": False},
-        {"fix_type": GpsFixType.NONE},
-        {"fix_type": GpsFixType.TIME_ONLY},
-        {"h_acc_m": 100.0},
-        {"lat_dege7": 0, "lon_dege7": 0},
+        ({}, True),
+        ({"h_acc_m": math.nan}, True),
+        ({"fix_ok": False}, False),
+        ({"fix_type": GpsFixType.NONE}, False),
+        ({"fix_type": GpsFixType.TIME_ONLY}, False),
+        ({"h_acc_m": 100.0}, False),
+        ({"lat_dege7": 0, "lon_dege7": 0}, False),
     ],
     ids=str,
 )
-def test_invalid_fix_is_unusable(change: dict[str, object]) -> None:
-    assert not is_usable(replace(fix(0), **change), ReferenceSettings())
+def test_fix_is_usable_unless_invalid(change: dict[str, object], usable: bool) -> None:
+    assert is_usable(replace(fix(0), **change), ReferenceSettings()) == usable
 
 
 def test_field_is_looked_up_once_and_again_far_away() -> None:

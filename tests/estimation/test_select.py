@@ -9,11 +9,8 @@ from gateway.estimation.select import EstimationSettings, make_estimator
 from tests.estimation.samples import imu, times
 
 
-def test_default_estimator_is_kalman_filter() -> None:
-    assert EstimationSettings().estimator == "eskf"
-
-
 def test_unknown_estimator_is_refused() -> None:
+    assert EstimationSettings().estimator == "eskf"
     with pytest.raises(ValueError, match="choose eskf, paper"):
         EstimationSettings(estimator="kalman")
 

@@ -9,7 +9,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.records import Incoming
 from gateway.vehicle.recorded_vehicle import RecordedVehicle
 from tests.conftest import ManualClock
-from tests.kit.ground_station import FtpClient, GroundStation, command, kinds, results, texts
+from tests.kit.conversation import converse
+from tests.kit.ground_station import FtpClient, GroundStation, command, kinds, texts, to_vehicle
 from tests.kit.mavlink import packed
 
 SYSTEM = 3
@@ -18,7 +19,6 @@ MISSION, FENCE = mavlink.MAV_MISSION_TYPE_MISSION, mavlink.MAV_MISSION_TYPE_FENC
 HOME = mavlink.MAVLINK_MSG_ID_HOME_POSITION
 VERSION = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
 ATTITUDE = mavlink.MAVLINK_MSG_ID_ATTITUDE
-ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 LIST = mavlink.MAVLink_param_request_list_message(*ME)
 
 
@@ -60,55 +60,90 @@ def test_recorded_parameters_are_sent_to_the_requesting_client_only(asking: Grou
     found = asking.send(LIST) + asking.wait(1.0)
     assert [m.param_id for m in found] == [f"P{i}" for i in range(26)]
     assert {frame.client_id for frame in asking.frames} == {asking.client_id}
-    assert asking.vehicle.next_due_us() is None
-
-
-def test_parameter_list_ends_when_its_client_is_removed(asking: GroundStation) -> None:
     asking.send(LIST)
     asking.vehicle.remove_client(asking.client_id)
     assert asking.vehicle.next_due_us() is None
     assert asking.vehicle.poll(1_000_000) == []
 
 
-def test_parameter_is_read_by_index_or_name(asking: GroundStation) -> None:
-    read = mavlink.MAVLink_param_request_read_message
-    by_index, by_name, missing = (read(*ME, b"", 4), read(*ME, b"P5", -1), read(*ME, b"", 26))
-    expected = ["PARAM_VALUE", "PARAM_VALUE", "PARAM_ERROR"]
-    assert [kinds(asking.send(m)) for m in (by_index, by_name, missing)] == [[k] for k in expected]
-    assert asking.send(by_name)[0].param_value == 5.0
+def me(name: str, *fields: Any) -> Any:
+    return to_vehicle(name, *fields, target=ME)
 
 
-def test_set_parameter_is_refused_with_its_recorded_value(asking: GroundStation) -> None:
-    found = asking.set_parameter("P5", 9.0)
-    assert kinds(found) == ["PARAM_ERROR", "PARAM_VALUE", "STATUSTEXT"]
-    assert found[1].param_value == 5.0
+def interval(message_id: int, interval_us: float) -> Any:
+    return command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us, target=ME)
 
 
-CHANGES = {
-    "arm": (command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1, target=ME), "COMMAND_ACK"),
-    "home": (command(mavlink.MAV_CMD_DO_SET_HOME, 1, target=ME), "COMMAND_ACK"),
-    "calibration": (command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 1, target=ME), "COMMAND_ACK"),
-    "take-off": (command(mavlink.MAV_CMD_NAV_TAKEOFF, 1, target=ME), "COMMAND_ACK"),
-    "mode": (mavlink.MAVLink_set_mode_message(SYSTEM, 1, 0), "COMMAND_ACK"),
-    "upload": (mavlink.MAVLink_mission_count_message(*ME, 3, MISSION), "MISSION_ACK"),
-    "clear": (mavlink.MAVLink_mission_clear_all_message(*ME, MISSION), "MISSION_ACK"),
-    "erase": (mavlink.MAVLink_log_erase_message(*ME), ""),
-    "home message": (
-        mavlink.MAVLink_set_home_position_message(SYSTEM, *[0] * 6, [1, 0, 0, 0], 0, 0, 0), "",
+NOTHING_CHANGES = {"texts": ["This is a recording: nothing can be changed in it"]}
+ACCEPTED, DENIED, UNSUPPORTED = ({"COMMAND_ACK": {"result": n}} for n in (0, 2, 3))
+NOT_STORED = {"MISSION_ACK": {"type": mavlink.MAV_MISSION_DENIED}}
+HOME_ANSWER = ACCEPTED | {"HOME_POSITION": {"latitude": 470_000_000}}
+SET_HOME_POSITION = mavlink.MAVLink_set_home_position_message(3, *[0] * 6, [1, 0, 0, 0], 0, 0, 0)
+READ_P5 = me("PARAM_REQUEST_READ", b"P5", -1)
+REQUESTS: dict[str, tuple[Any, dict[str, Any]]] = {
+    # Parameters by index or name, and unchanged.
+    "parameter by index": (me("PARAM_REQUEST_READ", b"", 4), {"PARAM_VALUE": {"param_value": 4}}),
+    "parameter by name": (READ_P5, {"PARAM_VALUE": {"param_value": 5}}),
+    "missing parameter": (me("PARAM_REQUEST_READ", b"", 26), {"kinds": ["PARAM_ERROR"]}),
+    "set a parameter": (
+        me("PARAM_SET", b"P5", 9.0, 9),
+        {"kinds": ["PARAM_ERROR", "PARAM_VALUE", "STATUSTEXT"], "PARAM_VALUE": {"param_value": 5}},
     ),
+    # Every change is denied with a text.
+    **{
+        name: (command(number, 1, target=ME), DENIED | NOTHING_CHANGES)
+        for name, number in {
+            "arm": mavlink.MAV_CMD_COMPONENT_ARM_DISARM,
+            "home": mavlink.MAV_CMD_DO_SET_HOME,
+            "calibration": mavlink.MAV_CMD_PREFLIGHT_CALIBRATION,
+            "take-off": mavlink.MAV_CMD_NAV_TAKEOFF,
+        }.items()
+    },
+    "mode": (mavlink.MAVLink_set_mode_message(SYSTEM, 1, 0), DENIED | NOTHING_CHANGES),
+    "upload": (me("MISSION_COUNT", 3, MISSION), NOT_STORED | NOTHING_CHANGES),
+    "clear": (me("MISSION_CLEAR_ALL", MISSION), NOT_STORED | NOTHING_CHANGES),
+    "erase": (me("LOG_ERASE"), NOTHING_CHANGES | {"kinds": ["STATUSTEXT"]}),
+    "home message": (SET_HOME_POSITION, NOTHING_CHANGES | {"kinds": ["STATUSTEXT"]}),
+    # What does not exist is answered without a text.
+    "logs": (me("LOG_REQUEST_LIST", 0, 0xFFFF), {"kinds": ["LOG_ENTRY"]}),
+    "log data": (me("LOG_REQUEST_DATA", 0, 0, 90), {"kinds": ["LOG_DATA"]}),
+    "end of logs": (me("LOG_REQUEST_END"), {}),
+    "extended parameters": (me("PARAM_EXT_REQUEST_LIST"), {"kinds": ["PARAM_EXT_VALUE"]}),
+    "joystick": (mavlink.MAVLink_manual_control_message(SYSTEM, 0, 0, 0, 0, 0), {}),
+    "remote control": (me("RC_CHANNELS_OVERRIDE", *[1500] * 8), {}),
+    "answer": (mavlink.MAVLink_command_ack_message(400, 0, 0, 0, *ME), {}),
+    # The contents of the log; a plan that it lacks is empty.
+    "mission": (me("MISSION_REQUEST_LIST", MISSION), {"MISSION_COUNT": {"count": 1}}),
+    "fence": (me("MISSION_REQUEST_LIST", FENCE), {"MISSION_COUNT": {"count": 0}}),
+    "item": (
+        me("MISSION_REQUEST_INT", 0, MISSION),
+        {"MISSION_ITEM_INT": {"x": 470_000_000, "target_system": 255}},
+    ),
+    "ping": (mavlink.MAVLink_ping_message(1, 2, 0, 0), {"PING": {"seq": 2}}),
+    "timesync": (mavlink.MAVLink_timesync_message(0, 5), {"TIMESYNC": {"ts1": 5}}),
+    "recorded home": (command(512, HOME, target=ME), HOME_ANSWER),
+    "recorded home by its command": (command(410, target=ME), HOME_ANSWER),
+    "unrecorded message": (command(512, VERSION, target=ME), UNSUPPORTED),
+    # A client may reduce the rate of a played message.
+    "slower message": (interval(ATTITUDE, 1_000_000), ACCEPTED),
+    "message off": (interval(HOME, -1), ACCEPTED),
+    "rate of an unrecorded message": (interval(VERSION, 1e6), UNSUPPORTED),
+    "heartbeats off": (interval(0, -1), DENIED),
+    "usual heartbeats": (interval(0, 0), ACCEPTED),
+    "other system": (mavlink.MAVLink_param_request_list_message(9, 1), {}),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", CHANGES)
-def test_request_of_a_change_is_denied_with_a_text(asking: GroundStation, name: str) -> None:
-    message, kind = CHANGES[name]
-    *acks, text = asking.send(message)
-    assert kinds(acks) == ([kind] if kind else [])
-    denied = mavlink.MAV_MISSION_DENIED if kind == "MISSION_ACK" else DENIED
-    for ack in acks:
-        assert (ack.type if kind == "MISSION_ACK" else ack.result) == denied
-    assert texts([text]) == ["This is a recording: nothing can be changed in it"]
-    assert asking.frames[-1].client_id == asking.client_id
+@pytest.mark.parametrize("name", REQUESTS)
+def test_recorded_vehicle_answers_from_its_log(clock: ManualClock, name: str) -> None:
+    message, expected = REQUESTS[name]
+    vehicle = RecordedVehicle(SYSTEM, LogContents(26))
+    stations = converse(vehicle, clock, [("A", message, expected)])
+    assert {frame.client_id for frame in stations["A"].frames} <= {7}
+    is_interval = getattr(message, "command", 0) == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+    requested = [(w.message_id, w.interval_us) for w in stations["A"].requested_intervals]
+    granted = is_interval and expected is ACCEPTED
+    assert requested == ([(message.param1, message.param2)] if granted else [])
 
 
 def test_texts_about_denied_requests_are_limited(asking: GroundStation) -> None:
@@ -116,82 +151,8 @@ def test_texts_about_denied_requests_are_limited(asking: GroundStation) -> None:
     assert len(found) == 3
 
 
-@pytest.mark.parametrize(
-    ("message", "expected"),
-    [
-        (mavlink.MAVLink_log_request_list_message(*ME, 0, 0xFFFF), ["LOG_ENTRY"]),
-        (mavlink.MAVLink_log_request_data_message(*ME, 0, 0, 90), ["LOG_DATA"]),
-        (mavlink.MAVLink_log_request_end_message(*ME), []),
-        (mavlink.MAVLink_param_ext_request_list_message(*ME), ["PARAM_EXT_VALUE"]),
-        (mavlink.MAVLink_manual_control_message(SYSTEM, 0, 0, 0, 0, 0), []),
-        (mavlink.MAVLink_rc_channels_override_message(*ME, *[1500] * 8), []),
-        (mavlink.MAVLink_command_ack_message(400, 0, 0, 0, *ME), []),
-    ],
-)
-def test_request_of_what_does_not_exist_is_answered_without_a_text(
-    asking: GroundStation, message: Any, expected: list[str]
-) -> None:
-    assert kinds(asking.send(message)) == expected
-
-
-def test_parameter_list_of_a_log_without_parameters_is_an_error(clock: ManualClock) -> None:
+def test_log_without_parameters_or_metadata_has_neither(clock: ManualClock) -> None:
     asking = GroundStation(RecordedVehicle(SYSTEM, LogContents()), clock)
     assert kinds(asking.send(LIST)) == ["PARAM_ERROR"]
-
-
-@pytest.mark.parametrize(
-    ("message", "kind", "fields"),
-    [
-        (mavlink.MAVLink_mission_request_list_message(*ME, MISSION), "MISSION_COUNT", {"count": 1}),
-        # One that the log lacks is empty.
-        (mavlink.MAVLink_mission_request_list_message(*ME, FENCE), "MISSION_COUNT", {"count": 0}),
-        (
-            mavlink.MAVLink_mission_request_int_message(*ME, 0, MISSION),
-            "MISSION_ITEM_INT",
-            {"x": 470_000_000, "target_system": 255},
-        ),
-        (mavlink.MAVLink_ping_message(1, 2, 0, 0), "PING", {"seq": 2}),
-        (mavlink.MAVLink_timesync_message(0, 5), "TIMESYNC", {"ts1": 5}),
-    ],
-)
-def test_request_is_answered_with_the_contents_of_the_log(
-    asking: GroundStation, message: Any, kind: str, fields: dict[str, Any]
-) -> None:
-    answer = asking.send(message)[0]
-    assert answer.get_type() == kind
-    assert {name: getattr(answer, name) for name in fields} == fields
-
-
-def test_recorded_home_is_sent_on_request(asking: GroundStation) -> None:
-    for found in (asking.request(HOME), asking.command(mavlink.MAV_CMD_GET_HOME_POSITION)):
-        ack, home = found
-        assert (ack.result, home.latitude) == (ACCEPTED, 470_000_000)
-
-
-def test_unrecorded_message_is_unsupported(asking: GroundStation) -> None:
-    assert results(asking.request(VERSION)) == [UNSUPPORTED]
-
-
-@pytest.mark.parametrize(
-    ("message_id", "interval_us", "result"),
-    [
-        *((ATTITUDE, 1_000_000, ACCEPTED), (HOME, -1, ACCEPTED), (VERSION, 1e6, UNSUPPORTED)),
-        *((0, -1, DENIED), (0, 0, ACCEPTED)),
-    ],
-)
-def test_client_may_reduce_the_rate_of_a_played_message(
-    asking: GroundStation, message_id: int, interval_us: float, result: int
-) -> None:
-    found = asking.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, message_id, interval_us)
-    assert results(found) == [result]
-    requested = [(w.message_id, w.interval_us) for w in asking.requested_intervals]
-    assert requested == ([(message_id, interval_us)] if result == ACCEPTED else [])
-
-
-def test_file_of_a_log_without_metadata_is_refused(asking: GroundStation) -> None:
     assert FtpClient(asking).open(b"@PARAM/param.pck").opcode == 129
-
-
-def test_requests_for_other_systems_and_garbage_are_ignored(asking: GroundStation) -> None:
-    assert asking.send(mavlink.MAVLink_param_request_list_message(9, 1)) == []
     assert asking.vehicle.handle(Incoming(7, b"\xfd\x00\x00", trusted=True), 0) == []

@@ -16,6 +16,7 @@ from gateway.vehicle.service import RecordingRequest
 from gateway.vehicle.services.commands import MAX_WAITING, RECORDER_TIMEOUT_US
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
+from tests.kit.conversation import Step, converse
 from tests.kit.ground_station import (
     GroundStation,
     command,
@@ -122,46 +123,46 @@ def acks(messages: list[Any]) -> list[tuple[int, int]]:
     return [(m.command, m.result) for m in of_kind(messages, "COMMAND_ACK")]
 
 
-def recorder(station: GroundStation, trouble: str = "", *, recording: bool = False) -> list[Any]:
-    now_us = station.clock.now_us
-    return station.receive(station.vehicle.on_recorder(trouble, now_us, recording=recording))
+def recorder(trouble: str = "", *, recording: bool = False) -> Any:
+    return lambda vehicle, now_us: vehicle.on_recorder(trouble, now_us, recording=recording)
 
 
-def test_start_of_a_recording_is_accepted_once_the_files_are_open(station: GroundStation) -> None:
-    for _ in range(3):
-        assert acks(station.command(START)) == [(START, IN_PROGRESS)]
-    assert station.of(RecordingRequest) == [RecordingRequest(start=True)] * 3
-    assert recorder(station) == []
-    assert acks(recorder(station, recording=True)) == [(START, ACCEPTED)]
-    assert recorder(station, recording=True) == []
-    assert acks(station.wait(20.0)) == []
-    assert acks(station.command(START)) == [(START, ACCEPTED)], "it records already"
-    assert station.of(RecordingRequest)[3:] == [RecordingRequest(start=True)]
+def ended(result: int, *reported: str) -> dict[str, Any]:
+    return {"COMMAND_ACK": {"command": START, "result": result}, "texts": list(reported)}
 
 
-def test_failed_start_of_a_recording_is_reported_with_the_reason(station: GroundStation) -> None:
-    assert recorder(station, "Read-only file system") == [], "not requested"
-    station.command(START)
-    found = recorder(station, "Read-only file system")
-    assert acks(found) == [(START, FAILED)]
-    assert texts(found) == ["Cannot record: Read-only file system"]
-    assert recorder(station, "Read-only file system") == []
+START_IT = ("A", command(START), ended(IN_PROGRESS))
+BROKEN = "Read-only file system"
+RECORDINGS: dict[str, list[Step]] = {
+    "is accepted once the files are open": [
+        *[START_IT] * 3, ("A", recorder(), {}), ("A", recorder(recording=True), ended(ACCEPTED)),
+        ("A", recorder(recording=True), {}), ("A", 20.0, {"COMMAND_ACK": 0}),
+        # It records already.
+        ("A", command(START), ended(ACCEPTED)),
+    ],
+    "fails with the reason": [
+        ("A", recorder(BROKEN), {}), START_IT,
+        ("A", recorder(BROKEN), ended(FAILED, f"Cannot record: {BROKEN}")),
+        ("A", recorder(BROKEN), {}),
+    ],
+    "fails if the disk does not answer": [
+        START_IT, ("A", 5.0, {}), START_IT,
+        ("A", RECORDER_TIMEOUT_US / 1e6 - 5.001, {"COMMAND_ACK": 0}),
+        ("A", 0.002, ended(FAILED, "Cannot record: no answer from the disk")),
+    ],
+    "fails if it is stopped": [
+        START_IT, ("A", command(STOP), {"kinds": ["COMMAND_ACK"] * 2} | ended(FAILED)),
+        ("A", recorder(recording=True), {}),
+    ],
+}  # fmt: skip
 
 
-def test_start_of_a_recording_fails_if_the_disk_does_not_answer(station: GroundStation) -> None:
-    station.command(START)
-    assert acks(station.wait(RECORDER_TIMEOUT_US / 1e6 - 0.001)) == []
-    found = station.wait(0.002)
-    assert acks(found) == [(START, FAILED)]
-    assert texts(found) == ["Cannot record: no answer from the disk"]
-
-
-def test_stop_of_a_recording_is_accepted_and_fails_a_pending_start(station: GroundStation) -> None:
-    assert acks(station.command(STOP)) == [(STOP, ACCEPTED)]
-    station.command(START)
-    assert acks(station.command(STOP)) == [(STOP, ACCEPTED), (START, FAILED)]
-    assert station.of(RecordingRequest)[-1] == RecordingRequest(start=False)
-    assert recorder(station, recording=True) == []
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_start_of_a_recording(vehicle: Vehicle, clock: ManualClock, name: str) -> None:
+    stations = converse(vehicle, clock, RECORDINGS[name])
+    sent = [action.command for _, action, _ in RECORDINGS[name] if hasattr(action, "command")]
+    requested = [RecordingRequest(start=number == START) for number in sent]
+    assert stations["A"].of(RecordingRequest) == requested
 
 
 def test_each_station_that_starts_a_recording_gets_its_own_answer(station: GroundStation) -> None:

@@ -71,20 +71,17 @@ POSITION = (471_234_567, -87_654_321, 520_250)
 Case = tuple[messages.Builder, dict[str, Any], dict[str, Any]]
 VALUES: dict[str, Case] = {
     "attitude-quaternion": (
-        messages.attitude_quaternion,
-        {"state": STATE},
+        messages.attitude_quaternion, {"state": STATE},
         named("q1 q2 q3 q4 rollspeed pitchspeed yawspeed", (*STATE.q_nb, *STATE.rate_b_radps))
         | {"time_boot_ms": 1000, "repr_offset_q": [0.0] * 4},
     ),
     # In radians, nose up positive.
     "attitude": (
-        messages.attitude,
-        {"state": STATE},
+        messages.attitude, {"state": STATE},
         named("roll pitch yaw yawspeed", (0.1, -0.2, math.radians(-88.5), -0.03)),
     ),
     "global-position": (
-        messages.global_position_int,
-        {"state": STATE, "reference_alt_m": 500.0},
+        messages.global_position_int, {"state": STATE, "reference_alt_m": 500.0},
         named("lat lon alt relative_alt", (471_234_567, -87_654_321, 523_456, 23_456))
         | named("vx vy vz hdg", (300, -400, -125, 27_150)),
     ),
@@ -103,13 +100,11 @@ VALUES: dict[str, Case] = {
     ),
     # Without a sensor the airspeed is the ground speed, as ArduPilot sends it.
     "vfr-hud": (
-        messages.vfr_hud,
-        {"state": STATE},
+        messages.vfr_hud, {"state": STATE},
         named("groundspeed airspeed climb alt throttle", (5.0, 5.0, 1.25, 523.456, 0)),
     ),
     "vfr-hud-unknown": (
-        messages.vfr_hud,
-        {"state": NOTHING},
+        messages.vfr_hud, {"state": NOTHING},
         named("airspeed groundspeed alt climb", (NAN,) * 4),
     ),
     "highres-imu": (
@@ -122,39 +117,33 @@ VALUES: dict[str, Case] = {
         | {"time_usec": 1_000_000, "diff_pressure": NAN, "fields_updated": 0b1_1111_1111},
     ),
     "highres-imu-alone": (
-        messages.highres_imu,
-        {"sample": SAMPLE},
+        messages.highres_imu, {"sample": SAMPLE},
         named("xmag ymag zmag abs_pressure pressure_alt", (NAN,) * 5),
     ),
     "scaled-pressure": (
-        messages.scaled_pressure,
-        {"baro": BARO},
+        messages.scaled_pressure, {"baro": BARO},
         named("press_abs press_diff temperature", (951.23, NAN, -1234)),
     ),
     # A PDOP of 1.6, parted as 1.25 m to 2.5 m.
     "gps-raw": (
-        messages.gps_raw_int,
-        {"fix": FIX},
+        messages.gps_raw_int, {"fix": FIX},
         named("lat lon alt alt_ellipsoid", (*POSITION, 567_750))
         | named("fix_type satellites_visible eph epv vel yaw", (3, 11, 72, 143, 500, 0))
         | {"cog": round(math.degrees(math.atan2(-4.0, 3.0)) * 100) % 36000}
         | named("h_acc v_acc vel_acc hdg_acc", (1250, 2500, 125, 150_000)),
     ),
     "gps-raw-at-rest": (
-        messages.gps_raw_int,
-        {"fix": replace(FIX, vel_n_mps=(0.1, 0.1, 0.0))},
+        messages.gps_raw_int, {"fix": replace(FIX, vel_n_mps=(0.1, 0.1, 0.0))},
         {"vel": 14, "cog": 65535},
     ),
     "gps-raw-without-accuracies": (
-        messages.gps_raw_int,
-        {"fix": replace(NO_FIX, **NOT_MEASURED)},
+        messages.gps_raw_int, {"fix": replace(NO_FIX, **NOT_MEASURED)},
         named("h_acc v_acc vel_acc hdg_acc alt_ellipsoid vel cog", (*(0,) * 5, 65535, 65535)),
     ),
     # The dilutions are unknown without a fix or its accuracy.
     **{
         f"gps-raw-dilution-{name}": (
-            messages.gps_raw_int,
-            {"fix": replace(FIX, **change)},
+            messages.gps_raw_int, {"fix": replace(FIX, **change)},
             {"eph": 65535, "epv": 65535},
         )
         for name, change in {
@@ -167,8 +156,7 @@ VALUES: dict[str, Case] = {
     # The type of an invalid fix is not reported.
     **{
         f"fix-type-{kind.name}-{fix_ok}": (
-            messages.gps_raw_int,
-            {"fix": replace(FIX, fix_type=kind, fix_ok=fix_ok)},
+            messages.gps_raw_int, {"fix": replace(FIX, fix_type=kind, fix_ok=fix_ok)},
             {"fix_type": getattr(mavlink, f"GPS_FIX_TYPE_{reported}")},
         )
         for kind, fix_ok, reported in (
@@ -188,24 +176,20 @@ VALUES: dict[str, Case] = {
         named("fix_type lat lon alt", (1, *POSITION)),
     ),
     "gps-raw-with-fix": (
-        messages.gps_raw_int,
-        {"fix": replace(FIX, lat_dege7=5), "located_fix": FIX},
+        messages.gps_raw_int, {"fix": replace(FIX, lat_dege7=5), "located_fix": FIX},
         {"lat": 5},
     ),
     "gps-absent": (
-        messages.gps_raw_int,
-        {"located_fix": FIX},
+        messages.gps_raw_int, {"located_fix": FIX},
         named("fix_type lat lon alt", (0, *POSITION)),
     ),
     "gps-never": (
-        messages.gps_raw_int,
-        {},
+        messages.gps_raw_int, {},
         named("fix_type satellites_visible eph vel cog", (0, 255, 65535, 65535, 65535)),
     ),
     **{
         f"imu-in-thousandths-{build.__name__}": (
-            build,
-            {"sample": SAMPLE, "mag_b_ut": FIELD},
+            build, {"sample": SAMPLE, "mag_b_ut": FIELD},
             named("xacc yacc zacc xgyro ygyro zgyro", (51, -25, -994, 500, 250, -125))
             | named("xmag ymag zmag temperature", (200, -50, 430, 3150)),
         )
@@ -213,8 +197,7 @@ VALUES: dict[str, Case] = {
     },
     # A temperature of 0 means unknown.
     "imu-at-0-degrees": (
-        messages.raw_imu,
-        {"sample": replace(SAMPLE, temperature_degc=0.0)},
+        messages.raw_imu, {"sample": replace(SAMPLE, temperature_degc=0.0)},
         {"temperature": 1, "xmag": 0},
     ),
     "altitude": (
@@ -224,13 +207,11 @@ VALUES: dict[str, Case] = {
         | named("altitude_monotonic altitude_terrain bottom_clearance", (529.5, -10_000.0, -1.0)),
     ),
     "local-position": (
-        messages.local_position_ned,
-        {"state": STATE, "origin": ORIGIN},
+        messages.local_position_ned, {"state": STATE, "origin": ORIGIN},
         named("vx vy vz z", (*STATE.vel_n_mps, -23.456)),
     ),
     "estimator-status": (
-        messages.estimator_status,
-        {"state": STATE, "sample": SAMPLE},
+        messages.estimator_status, {"state": STATE, "sample": SAMPLE},
         named("pos_horiz_accuracy pos_vert_accuracy vel_ratio", (1.0, 2.0, NAN))
         | {
             "flags": mavlink.ESTIMATOR_ATTITUDE
@@ -244,8 +225,7 @@ VALUES: dict[str, Case] = {
         },
     ),
     "estimator-status-unknown": (
-        messages.estimator_status,
-        {"state": NOTHING, "sample": SAMPLE},
+        messages.estimator_status, {"state": NOTHING, "sample": SAMPLE},
         {"flags": mavlink.ESTIMATOR_CONST_POS_MODE},
     ),
     "estimator-status-rejected": (
@@ -257,30 +237,26 @@ VALUES: dict[str, Case] = {
         {"flags": mavlink.ESTIMATOR_GPS_GLITCH},
     ),
     "home-position": (
-        messages.home_position,
-        {"home": Home(Location(47.5, -8.25, 432.1), 7_000_000)},
+        messages.home_position, {"home": Home(Location(47.5, -8.25, 432.1), 7_000_000)},
         named("latitude longitude altitude", (475_000_000, -82_500_000, 432_100))
         | named("x y z approach_x approach_z", (0.0, 0.0, 0.0, NAN, NAN))
         | {"q": [NAN] * 4, "time_usec": 7_000_000},
     ),
     "system-time-unknown": (messages.system_time, {}, {"time_unix_usec": 0, "time_boot_ms": 1500}),
     "system-time": (
-        messages.system_time,
-        {"unix_offset_us": 1_790_000_000_123_456},
+        messages.system_time, {"unix_offset_us": 1_790_000_000_123_456},
         {"time_unix_usec": 1_790_000_001_623_456},
     ),
     # In steps of 0.2 m/s for the speed, and 0.1 m or m/s for the others.
     "high-latency": (
-        messages.high_latency2,
-        {"state": STATE, "fix": FIX, "sample": SAMPLE},
+        messages.high_latency2, {"state": STATE, "fix": FIX, "sample": SAMPLE},
         named("latitude longitude altitude heading", (471_234_567, -87_654_321, 523, 272 // 2))
         | named("groundspeed climb_rate eph epv", (25, 12, 12, 25))
         | named("timestamp battery failure_flags", (1500, -1, 0)),
     ),
     **{
         f"high-latency-before-a-fix-{state is None}-{number}": (
-            messages.high_latency2,
-            {"state": state, "fix": fix},
+            messages.high_latency2, {"state": state, "fix": fix},
             named("latitude longitude groundspeed eph epv", (0, 0, 0, 255, 255))
             | {"failure_flags": SENSOR_FAILURES},
         )
@@ -289,8 +265,7 @@ VALUES: dict[str, Case] = {
         )
     },
     "high-latency-by-barometer": (
-        messages.high_latency2,
-        {"state": replace(NOTHING, alt_amsl_m=523.456), "fix": SEARCHING},
+        messages.high_latency2, {"state": replace(NOTHING, alt_amsl_m=523.456), "fix": SEARCHING},
         named("latitude longitude altitude", (0, 0, 523)),
     ),
     **{
@@ -307,7 +282,7 @@ VALUES: dict[str, Case] = {
         )
         for value in (math.inf, -math.inf, 1e30, -1e30)
     },
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", VALUES)
