@@ -65,17 +65,6 @@ def vehicle() -> Sender:
     return Sender()
 
 
-def test_clients_get_frames_from_add_to_remove(fanout: Fanout, vehicle: Sender) -> None:
-    first = Peer(fanout, 1)
-    publish(fanout, vehicle.attitude(), 0)
-    second = Peer(fanout, 2)
-    publish(fanout, vehicle.attitude(), 0)
-    fanout.remove(1)
-    fanout.remove(99)
-    publish(fanout, vehicle.attitude(), 0)
-    assert (len(first.frames), len(second.frames)) == (2, 2)
-
-
 def test_clients_with_the_same_number_share_one_signed_copy(vehicle: Sender) -> None:
     fanout = Fanout(signer())
     peers = [Peer(fanout, client_id, "?deny=0") for client_id in range(1, 4)]
@@ -178,26 +167,6 @@ class TestRates:
 
     def test_request_of_an_unknown_client_is_ignored(self, fanout: Fanout) -> None:
         fanout.set_interval(ClientInterval(5, 1, ATTITUDE_ID, -1))
-
-
-class TestForeignFrames:
-    def test_foreign_frames_reach_all_but_their_source_unchanged(self, fanout: Fanout) -> None:
-        source, plain = Peer(fanout, 1), Peer(fanout, 2)
-        picky = Peer(fanout, 3, "?deny=HEARTBEAT&rate=ATTITUDE:1")
-        foreign = Sender(9)
-        frames = [foreign.heartbeat(), foreign.attitude(), foreign.attitude()]
-        for frame in frames:
-            forward(fanout, frame, source, 0)
-        assert source.frames == []
-        assert plain.frames == frames
-        assert picky.frames == [frames[1]]
-
-    def test_addressed_frames_are_delivered_to_the_named_clients(
-        self, fanout: Fanout, vehicle: Sender
-    ) -> None:
-        peers = [Peer(fanout, client_id) for client_id in range(1, 4)]
-        fanout.deliver(frame_of(vehicle.attitude()), [1, 3, 99], 9)
-        assert [len(peer.frames) for peer in peers] == [1, 0, 1]
 
 
 def test_monitor_gets_every_frame_without_a_gap(fanout: Fanout, vehicle: Sender) -> None:

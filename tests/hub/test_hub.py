@@ -50,11 +50,6 @@ async def test_text_of_a_router_is_sent_as_a_component_of_each_vehicle(world: An
     assert len(world.foreign) == foreign + 2
 
 
-async def test_router_without_vehicles_sends_no_text(rig: Any) -> None:
-    hub = rig.hub("udp-listen:127.0.0.1:0")
-    assert not hub.say([dialect.MAVLink_statustext_message(6, b"Note: here")])
-
-
 async def test_request_goes_to_the_system_that_it_addresses(world: Any) -> None:
     count = len(world.incoming)
     request = world.first.sender.command(42, 1)

@@ -2,12 +2,8 @@
 
 import asyncio
 import contextlib
-import json
+import errno
 import logging
-import os
-import shutil
-import subprocess
-import sys
 from typing import Any
 
 import pytest
@@ -17,7 +13,6 @@ from gateway.hub.hub import CONNECTIONS_IN_FULL
 from gateway.hub.stats import WINDOW_US
 from gateway.hub.transports.registry import LISTENERS
 from gateway.wire.mavlink_messages import CRC_EXTRA
-from tests.conftest import ROOT
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io
@@ -64,31 +59,30 @@ async def test_garbage_of_a_tcp_client_costs_others_no_frame(rig: Any, garbage: 
         await fly(1)
 
 
-@pytest.mark.skipif(
-    os.geteuid() != 0 or not all(map(shutil.which, ("unshare", "ip", "nsenter"))),
-    reason="only root can make network namespaces, with iproute2 and util-linux",
-)
-@pytest.mark.slow
-async def test_interface_outage_loses_no_frame_of_other_clients(tmp_path: Any) -> None:
-    """Run in a network namespace of its own: see `interface_world.py`."""
-    run = await asyncio.to_thread(
-        subprocess.run,
-        ["unshare", "--net", sys.executable, "-m", "tests.hub.interface_world"],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        cwd=ROOT,
-        check=False,
-    )
-    if "not permitted" in run.stderr:
-        pytest.skip("this machine forbids network namespaces")
-    assert run.returncode == 0, run.stderr
-    seen = json.loads(run.stdout)
-    assert seen["state while down"] == "unreachable"
-    assert seen["loopback lost"] == 0
-    before_and_after = seen["far end could hear"]
-    assert before_and_after - 50 <= seen["far end received"] <= before_and_after
-    assert seen["far end received"] >= seen["sent after"] - 5
+async def test_interface_outage_loses_no_frame_of_other_clients(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near, far = rig.station(), rig.station()
+    hub = await rig.open(*(f"udp:127.0.0.1:{each.port}" for each in (near, far)))
+    rig.publish(hub, sent := rig.vehicle.attitude())
+    client = hub._clients[2]
+
+    def unreachable(_: bytes) -> int:
+        raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    frames = [sent]
+    with monkeypatch.context() as down:
+        down.setattr(client, "write", unreachable)
+        down.setattr(type(client), "_connect", lambda _: None)
+        for _ in range(100):
+            frames.append(rig.vehicle.attitude())
+            rig.publish(hub, frames[-1])
+        assert (hub.clients()[1].state, hub.clients()[1].dropped) == ("unreachable", 100)
+    rig.tick(hub, 1)
+    await rig.until_open(hub)
+    rig.publish(hub, last := rig.vehicle.attitude())
+    assert [await near.receive() for _ in (*frames, last)] == [*frames, last]
+    assert [await far.receive() for _ in range(2)] == [sent, last]
 
 
 class TestLinkThatRaises:

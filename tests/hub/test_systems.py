@@ -192,6 +192,50 @@ def test_one_vehicle_is_found_by_the_heartbeat_of_its_autopilot() -> None:
     assert replaced.origin == (11, 1)
 
 
+A, B, C = "first", "second", "seat"
+"""Three endpoints; the options of each are the first row of a conversation."""
+ACK = mavlink.MAVLink_command_ack_message(400, 0)
+ACK_TO_254 = mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 254, 0)
+POSE = [
+    (A, heartbeat(18, 8), 3, 191), (B, heartbeat(), 3, 1), (C, heartbeat(), 2, 1), {},
+    (A, ODOMETRY, 3, 191),
+]  # fmt: skip
+CONVERSATIONS: dict[str, list[Any]] = {
+    "two vehicles with id 1 become 1 and 2": [
+        ("", "as=2", ""), (A, heartbeat(), 1, 1), (B, heartbeat(), 1, 1), (A, attitude(), 1, 1),
+        (B, attitude(), 1, 1), {C: [(1, 0), (2, 0), (1, 30), (2, 30)], B: [(1, 0)]},
+        (C, GCS, 255, STATION), (C, command(2), 255, STATION),
+        {A: [(255, 0)], B: [(255, 0), (255, 76)]}, (B, ACK, 1, 1), {C: [(2, 77)]},
+    ],
+    "own frames stay away from a filter and from the new id of another": [
+        ("not-systems=1", "as=1:21", ""), (None, attitude(), 1, 1), {A: [], B: []},
+    ],
+    "answers reach a program that has asked a selected vehicle": [
+        ("systems=1", "", ""), (A, heartbeat(), 1, 1), (B, heartbeat(), 2, 1),
+        (C, attitude(), 254, 0), {}, (A, ACK_TO_254, 1, 1), {C: []}, (C, command(1), 254, 0), {},
+        (A, ACK_TO_254, 1, 1), {C: [(1, 77)]},
+        # Also a vehicle may have addressed it, and is excluded nevertheless.
+        (B, command(1), 2, 1), {}, (A, command(2), 1, 1), {B: []},
+    ],
+    "pose of a companion reaches the endpoint of its vehicle": [
+        ("systems=3", "systems=3", ""), *POSE, {B: [(3, 102)], C: []},
+    ],
+    "pose stays away from an endpoint of all": [("systems=3", "", ""), *POSE, {B: [], C: []}],
+    "pose reaches all without options": [("", "", ""), *POSE, {B: [(3, 102)], C: [(3, 102)]}],
+    "heartbeat of a station with the id of a vehicle changes nothing": [
+        ("systems=1", "", ""), (A, GCS, 2, 1), (B, heartbeat(), 2, 1), {}, (A, GCS, 2, 1),
+        (B, attitude(), 2, 1), {C: [(2, 30)], A: []},
+    ],
+    "station gets no corrections of another after its heartbeat": [
+        ("", "", ""), (A, heartbeat(), 1, 1), (B, GCS, 254, STATION),
+        (C, CORRECTIONS, 255, STATION), (C, GCS, 255, STATION), {}, (C, CORRECTIONS, 255, STATION),
+        {A: [(255, 233)], B: []},
+    ],
+}  # fmt: skip
+"""Frames with their senders, our own without a link, and what has been received since the last
+check: system and message."""
+
+
 @pytest.mark.io
 class TestHub:
     """Frames between sockets: two links with vehicles, and a station."""
@@ -221,35 +265,19 @@ class TestHub:
         frames = [frame_of(data) for data in station.received()]
         return [(frame.origin[0], frame.message_id) for frame in frames]
 
-    async def test_two_vehicles_with_id_1_become_1_and_2(self, rig: Any) -> None:
-        _, first, second, seat = await self.open(rig, "", "as=2")
-        await self.say(rig, (first, heartbeat(), 1, 1), (second, heartbeat(), 1, 1))
-        await self.say(rig, (first, attitude(), 1, 1), (second, attitude(), 1, 1))
-        assert self.origins(seat) == [(1, 0), (2, 0), (1, 30), (2, 30)]
-        assert self.origins(second) == [(1, 0)]  # Before its own id was known.
-        first.received()
-        await self.say(rig, (seat, GCS, 255, STATION), (seat, command(2), 255, STATION))
-        assert self.origins(first) == [(255, 0)]
-        assert self.origins(second) == [(255, 0), (255, 76)]
-        await self.say(rig, (second, mavlink.MAVLink_command_ack_message(400, 0), 1, 1))
-        assert self.origins(seat) == [(2, 77)]
-
-    async def test_station_behind_one_system_cannot_command_another(self, rig: Any) -> None:
-        hub, first, second, seat = await self.open(rig, "", "", station="systems=1")
-        await self.say(rig, (first, heartbeat(), 1, 1), (second, heartbeat(), 2, 1))
-        await self.say(rig, (first, attitude(), 1, 1), (second, attitude(), 2, 1))
-        assert self.origins(seat) == [(1, 0), (1, 30)]
-        first.received(), second.received()
-        await self.say(rig, (seat, GCS, 255, STATION))
-        assert (self.origins(first), self.origins(second)) == ([(255, 0)], [(255, 0)])
-        # Directly, by a command to all, as the vehicle 1, and as a station with its id.
-        gcs_2 = (seat, GCS, 2, STATION)
-        for sender in ((255, STATION), (1, 1), (2, STATION), (9, 1)):
-            await self.say(rig, gcs_2, (seat, command(2), *sender), (seat, command(0, 0), *sender))
-        assert [each for each in self.origins(second) if each[1] == 76] == []
-        assert hub.counters().unroutable >= 4
-        await self.say(rig, (seat, command(1), 255, STATION))
-        assert (255, 76) in self.origins(first)
+    @pytest.mark.parametrize("rows", CONVERSATIONS.values(), ids=CONVERSATIONS)
+    async def test_conversation_passes_as_the_options_allow(self, rig: Any, rows: Any) -> None:
+        hub, *stations = await self.open(rig, *rows[0][:2], station=rows[0][2])
+        named = dict(zip((A, B, C), stations, strict=True))
+        for row in rows[1:]:
+            if isinstance(row, dict):
+                got = {name: self.origins(each) for name, each in named.items()}
+                assert {name: got[name] for name in row} == row
+            elif row[0] is None:
+                rig.publish(hub, packed(*row[1:]))
+                await rig.quiet()
+            else:
+                await self.say(rig, (named[row[0]], *row[1:]))
 
     async def test_command_to_all_does_not_reach_an_excluded_vehicle_of_ours(
         self, rig: Any
@@ -261,38 +289,6 @@ class TestHub:
         await self.say(rig, (seat, command(0, 0), 255, STATION), (seat, command(1), 255, STATION))
         assert len(rig.incoming) == before
         assert self.origins(seat) == []
-
-    async def test_answers_reach_a_program_that_has_asked_a_selected_vehicle(
-        self, rig: Any
-    ) -> None:
-        _, first, second, seat = await self.open(rig, "systems=1", "")
-        await self.say(rig, (first, heartbeat(), 1, 1), (second, heartbeat(), 2, 1))
-        accepted = mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 254, 0)
-        await self.say(rig, (seat, attitude(), 254, 0))
-        seat.received()
-        await self.say(rig, (first, accepted, 1, 1), (seat, command(1), 254, 0))
-        assert (1, 77) not in self.origins(seat)
-        await self.say(rig, (first, accepted, 1, 1))
-        assert self.origins(seat) == [(1, 77)]
-        # Also a vehicle may have addressed it, and is excluded nevertheless.
-        await self.say(rig, (second, command(1), 2, 1), (first, command(2), 1, 1))
-        assert (1, 76) not in self.origins(second)
-
-    @pytest.mark.parametrize(
-        ("companion", "drone", "passes"),
-        [("systems=3", "systems=3", True), ("systems=3", "", False), ("", "", True)],
-    )
-    async def test_pose_of_a_companion_reaches_the_endpoint_of_its_vehicle(
-        self, rig: Any, companion: str, drone: str, passes: bool
-    ) -> None:
-        _, first, second, seat = await self.open(rig, companion, drone)
-        await self.say(rig, (first, heartbeat(18, 8), 3, 191), (second, heartbeat(), 3, 1))
-        await self.say(rig, (seat, heartbeat(), 2, 1))
-        for each in (first, second, seat):
-            each.received()
-        await self.say(rig, (first, ODOMETRY, 3, 191))
-        assert self.origins(second) == ([(3, 102)] if passes else [])
-        assert self.origins(seat) == ([] if companion else [(3, 102)])
 
     @pytest.mark.parametrize("message", [ODOMETRY, attitude()], ids=["input", "telemetry"])
     async def test_compiled_route_ends_when_an_excluded_vehicle_is_received(
@@ -314,16 +310,6 @@ class TestHub:
         passes = message is not ODOMETRY and self.origins(seat)[-1] == (1, number)
         assert self.origins(second) == []
         assert passes == (message is not ODOMETRY)
-
-    async def test_heartbeat_of_a_station_with_the_id_of_a_vehicle_changes_nothing(
-        self, rig: Any
-    ) -> None:
-        _, first, second, seat = await self.open(rig, "systems=1", "")
-        await self.say(rig, (first, GCS, 2, 1), (second, heartbeat(), 2, 1))
-        seat.received()
-        await self.say(rig, (first, GCS, 2, 1), (second, attitude(), 2, 1))
-        assert self.origins(seat) == [(2, 30)]
-        assert self.origins(first) == []
 
     @pytest.mark.parametrize(
         ("options", "drone", "passing"),
@@ -370,25 +356,6 @@ class TestHub:
         expected = f"{url}{'&' if '?' in url else '?'}systems=3"
         assert hints[0].endswith(f"; write {expected}") == is_named
         assert [hint for hint in hints[0 if not is_named else 1 :] if hint] == []
-
-    async def test_station_gets_no_corrections_of_another_after_its_heartbeat(
-        self, rig: Any
-    ) -> None:
-        _, first, second, seat = await self.open(rig, "", "")
-        await self.say(rig, (first, heartbeat(), 1, 1), (second, GCS, 254, STATION))
-        await self.say(rig, (seat, CORRECTIONS, 255, STATION), (seat, GCS, 255, STATION))
-        first.received(), second.received()
-        await self.say(rig, (seat, CORRECTIONS, 255, STATION))
-        assert (self.origins(first), self.origins(second)) == ([(255, 233)], [])
-
-    async def test_own_frames_leave_no_gap_behind_a_filter_and_are_renumbered(
-        self, rig: Any
-    ) -> None:
-        hub, first, second, _ = await self.open(rig, "not-systems=1", "as=1:21")
-        rig.publish(hub, rig.vehicle.attitude(), rig.vehicle.attitude())
-        await rig.quiet()
-        # 21 is the vehicle of the link that has the id 1 there: ours would look like it.
-        assert self.origins(first) == self.origins(second) == []
 
     @pytest.mark.parametrize("kind", ["udp", "tcp"])
     async def test_own_signed_frames_are_renumbered_in_order(self, rig: Any, kind: str) -> None:

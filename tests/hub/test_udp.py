@@ -10,26 +10,10 @@ import pytest
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.forwarding_step import MAX_DATAGRAM
 from gateway.hub.transports.udp import UdpClient
-from gateway.records import Incoming
 from tests.conftest import LoopTime
 from tests.kit.hub import receive
 
 pytestmark = pytest.mark.io
-
-
-async def test_configured_client_gets_frames_and_answers_the_same_socket(rig: Any) -> None:
-    station = rig.station()
-    hub = await rig.open(f"udp:127.0.0.1:{station.port}?name=laptop")
-    sent, answer = [rig.vehicle.attitude(), rig.vehicle.heartbeat()], station.sender.heartbeat()
-    rig.publish(hub, *sent)
-    assert [await station.receive() for _ in sent] == sent
-    station.send(answer)
-    await rig.until(lambda: bool(rig.incoming))
-    (client,) = hub.clients()
-    assert rig.incoming == [Incoming(client.client_id, answer, trusted=True, forwarded=True)]
-    assert (client.name, client.sent, client.received) == ("laptop", 2, 1)
-    assert client.bytes_sent == sum(map(len, sent))
-    assert client.systems == ((255, 190),)
 
 
 async def test_new_client_of_a_port_is_greeted_without_a_gap(rig: Any) -> None:
@@ -150,17 +134,6 @@ async def test_client_that_returns_on_another_port_replaces_its_old_entry(rig: A
     await rig.until(lambda: len(rig.incoming) == 2)
     await rig.until(lambda: len(hub.clients()) == 1)
     assert hub.clients()[0].remote == f"127.0.0.1:{after.port}"
-
-
-async def test_station_that_starts_late_loses_nothing_after_its_start(rig: Any) -> None:
-    late = rig.station()
-    late.socket.close()
-    hub = await rig.open(f"udp:127.0.0.1:{late.port}")
-    rig.publish(hub, *(rig.vehicle.heartbeat() for _ in range(5)))
-    with listening_again(late) as started:
-        frame = rig.vehicle.attitude()
-        rig.publish(hub, frame)
-        assert await receive(started) == frame
 
 
 @pytest.fixture

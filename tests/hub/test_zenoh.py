@@ -16,7 +16,6 @@ import pytest
 import zenoh
 
 from gateway.hub.hub import Hub
-from gateway.hub.transports.base import READ_BYTES
 from gateway.hub.transports.zenoh import client as zenoh_client
 from gateway.hub.transports.zenoh import session as zenoh_session
 from gateway.hub.transports.zenoh.session import (
@@ -27,7 +26,6 @@ from gateway.hub.transports.zenoh.session import (
     LoopQueue,
     Subscription,
     open_session,
-    part_of_turn,
     session_config,
 )
 from gateway.wire.mavlink_json import template
@@ -361,10 +359,6 @@ class TestFlood:
         (fleet,) = hub.clients()
         assert (fleet.received, fleet.bytes_garbage) == (0, len(beats))
         assert before - hub.untrusted_reads.level == (MAX_MESSAGE if trusted == "no" else 0)
-
-    @pytest.mark.parametrize(("size", "part"), [(MAX_MESSAGE, 1.0), (1, 1 / AT_ONCE)])
-    def test_large_message_takes_a_whole_turn(self, size: int, part: float) -> None:
-        assert part_of_turn(size, READ_BYTES) == part
 
 
 class Flood:

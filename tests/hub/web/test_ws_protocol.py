@@ -5,18 +5,7 @@ import struct
 
 import pytest
 from wsproto import ConnectionType, WSConnection
-from wsproto.events import (
-    AcceptConnection,
-    BytesMessage,
-    CloseConnection,
-    Event,
-    Ping,
-    Pong,
-    RejectConnection,
-    Request,
-    TextMessage,
-)
-from wsproto.extensions import PerMessageDeflate
+from wsproto.events import Event, RejectConnection
 from wsproto.frame_protocol import CloseReason
 
 from gateway.hub.transports.ws_protocol import MAX_MESSAGE, WsCaller, WsInput, WsServer
@@ -214,41 +203,6 @@ class TestAgainstAnotherProgram:
     def talk(peer: WSConnection, data: bytes) -> list[Event]:
         peer.receive_data(data)
         return list(peer.events())
-
-    @pytest.mark.parametrize("size", [0, 1, 125, 126, 1100, 65535])
-    def test_hub_accepts_a_connection(self, size: int) -> None:
-        server = WsServer(lambda origin: origin == "http://localhost")
-        peer = WSConnection(ConnectionType.CLIENT)
-        origin = [(b"Origin", b"http://localhost")]
-        extensions = [PerMessageDeflate()]
-        request = Request(host="localhost", target="/", extra_headers=origin, extensions=extensions)
-        found = server.feed(peer.send(request))
-        assert isinstance(self.talk(peer, found.reply)[0], AcceptConnection)
-        (got,) = self.talk(peer, server.wrap(bytes(size)))
-        assert isinstance(got, BytesMessage)
-        assert bytes(got.data) == bytes(size)
-        assert server.feed(peer.send(BytesMessage(data=bytes(size)))).payload == bytes(size)
-        (asked,) = self.talk(peer, server.ping())
-        assert isinstance(asked, Ping)
-        assert server.feed(peer.send(asked.response())).ponged
-        (bye,) = self.talk(peer, server.close(CloseReason.GOING_AWAY))
-        assert isinstance(bye, CloseConnection)
-
-    def test_hub_connects_to_a_server(self) -> None:
-        caller = WsCaller("localhost:56781", "/raw")
-        peer = WSConnection(ConnectionType.SERVER)
-        (request,) = self.talk(peer, caller.hello)
-        assert isinstance(request, Request)
-        assert (request.host, request.target) == ("localhost:56781", "/raw")
-        assert caller.feed(peer.send(AcceptConnection())).opened
-        (got,) = self.talk(peer, caller.wrap(b"frame"))
-        assert isinstance(got, BytesMessage)
-        assert bytes(got.data) == b"frame"
-        assert caller.feed(peer.send(BytesMessage(data=b"answer"))).payload == b"answer"
-        assert caller.feed(peer.send(TextMessage(data="hello"))).text_size == 5
-        found = caller.feed(peer.send(Ping(payload=b"?")))
-        (pong,) = self.talk(peer, found.reply)
-        assert isinstance(pong, Pong)
 
     def test_refusal_of_a_server_is_reported(self) -> None:
         caller = WsCaller("localhost:56781", "/")
