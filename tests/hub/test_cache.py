@@ -106,17 +106,6 @@ async def test_request_is_passed_on_without_the_option_or_past_it(
     assert await one.asked() == [(mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_LIST, 1)]
 
 
-async def test_written_value_replaces_the_kept_one(rig: Rig) -> None:
-    one = await scene(rig, "&cache=yes")
-    one.ask(0, mavlink.MAVLink_param_set_message(1, 1, b"P3", 8.0, 9))
-    assert await one.asked() == [(mavlink.MAVLINK_MSG_ID_PARAM_SET, 1)]
-    one.report(parameter(3, 8.0))
-    await one.values(1, COUNT + 1)
-    one.ask(1, mavlink.MAVLink_param_request_read_message(1, 1, b"P3", -1))
-    assert [m.param_value for m in await one.values(1, 1)] == [8.0]
-    assert await one.asked() == []
-
-
 async def test_renumbered_vehicle_is_answered_for_by_its_id_here(rig: Rig) -> None:
     one = await scene(rig, "&cache=yes&as=11")
     one.ask(1, listing(11))

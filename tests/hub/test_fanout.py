@@ -165,9 +165,6 @@ class TestRates:
         publish(fanout, Sender(2).attitude(), 0)
         assert [frame[5] for frame in peer.frames] == [2]
 
-    def test_request_of_an_unknown_client_is_ignored(self, fanout: Fanout) -> None:
-        fanout.set_interval(ClientInterval(5, 1, ATTITUDE_ID, -1))
-
 
 def test_monitor_gets_every_frame_without_a_gap(fanout: Fanout, vehicle: Sender) -> None:
     monitor, other = Peer(fanout, 1, "?monitor=yes&deny=ATTITUDE"), Peer(fanout, 2)

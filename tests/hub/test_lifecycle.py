@@ -17,7 +17,7 @@ from wsproto import ConnectionType, WSConnection
 from wsproto.events import AcceptConnection, BytesMessage, Request
 
 from gateway.hub.hub import Hub
-from gateway.hub.transports.base import Client
+from gateway.hub.transports.base import STALE_AFTER_US, Client
 from gateway.hub.transports.serial_line import SerialClient
 from gateway.hub.transports.tcp import TcpClient
 from gateway.hub.transports.udp import UdpClient
@@ -383,6 +383,26 @@ async def test_taken_port_is_reported_once_and_opens_when_it_is_free(
     rig.tick(hub, 2)
     (port,) = hub.listeners()
     assert (port.state, port.reason, port.port) == ("open", "", taken.port)
+
+
+@pytest.mark.parametrize("kind", LISTENING)
+async def test_full_port_turns_clients_away_until_one_is_stale(rig: Rig, kind: str) -> None:
+    link = Link(rig, kind, max_clients=2)
+    await link.until_open()
+    others = [type(link.far)(rig) for _ in range(3)]
+    others[0].arrive(link.hub)
+    await link.until(lambda: len(link.hub.clients()) == 2)
+    await rig.quiet()
+    others[0].poll()
+    others[1].arrive(link.hub)
+    await link.until(lambda: link.hub.listeners()[0].turned_away == 1)
+    first, second = (client.client_id for client in link.hub.clients())
+    rig.clock.now_us += STALE_AFTER_US
+    others[0].write(rig.sender(255, 190).heartbeat())
+    await rig.until(lambda: link.hub.clients()[1].heard_us == rig.clock())
+    others[2].arrive(link.hub)
+    await link.until(lambda: first not in [each.client_id for each in link.hub.clients()])
+    assert link.hub.clients()[0].client_id == second
 
 
 async def test_removed_endpoint_closes_and_nothing_is_sent(link: Link) -> None:

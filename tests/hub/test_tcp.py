@@ -14,10 +14,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.transports.base import STALE_AFTER_US
 from gateway.hub.transports.stream import UNSENT_BYTES
 from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
-from tests.kit.hub import receive
 from tests.kit.mavlink import frames_of
 from tests.ports import free_port
 
@@ -34,15 +32,6 @@ class TestTcpListen:
         client = await rig.connect(hub.listening_ports()[0], room_bytes=1)
         await rig.until(lambda: len(hub.clients()) == 1)
         return client
-
-    async def test_frames_wait_in_the_queue_and_not_in_the_kernel(self, rig: Any) -> None:
-        hub = rig.hub("tcp-listen:127.0.0.1:0")
-        await self.narrow_client(rig, hub)
-        for _ in range(5000):
-            rig.publish(hub, rig.vehicle.raw_imu())
-            await asyncio.sleep(0)
-        assert hub.clients()[0].queued > 1000
-        assert hub.clients()[0].bytes_sent < 10_000
 
     async def test_kernel_holds_few_unsent_bytes_of_joined_writes(self, rig: Any) -> None:
         """With a wide window it may join 40 kB: 20 s of a link of 2 kB/s."""
@@ -153,22 +142,3 @@ class TestSerial:
         ids = [message_id_of(frame) for frame in frames]
         assert ids.index(30) <= 17 - waiting + 1
         assert [frame[4] for frame in frames] == list(range(17))
-
-
-async def test_stale_readers_make_room_for_new_clients(rig: Any) -> None:
-    hub = rig.hub("tcp-listen:127.0.0.1:0", max_clients=2)
-    (port,) = hub.listening_ports()
-    readers = [rig.station(port, socket.SOCK_STREAM) for _ in range(2)]
-    for count, reader in enumerate(readers, start=1):
-        reader.socket.connect_ex(reader.target)
-        await rig.until(lambda count=count: len(hub.clients()) == count)
-    assert await receive(await rig.connect(port)) == b"", "while all are alive"
-    assert hub.listeners()[0].turned_away == 1
-    rig.clock.now_us += STALE_AFTER_US
-    readers[1].socket.send(readers[1].sender.heartbeat())
-    await rig.until(lambda: hub.clients()[1].received == 1)
-    late = rig.station(port, socket.SOCK_STREAM)
-    late.socket.connect_ex(late.target)
-    await rig.until(lambda: hub.clients()[-1].remote == f"127.0.0.1:{late.port}")
-    remotes = [client.remote for client in hub.clients()]
-    assert remotes == [f"127.0.0.1:{each.port}" for each in (readers[1], late)]

@@ -326,15 +326,6 @@ class TestLoopQueue:
         await asyncio.sleep(0)
         assert len(taken) == MAX_WAITING
 
-    async def test_costly_items_are_handled_in_more_turns(self) -> None:
-        taken: list[int] = []
-        queue = LoopQueue(taken.append, lambda _: 0.5)
-        for n in range(8):
-            queue.put(n)
-        for turn in range(1, 5):
-            await asyncio.sleep(0)
-            assert taken == list(range(2 * turn))
-
     async def test_pause_delays_items_without_loss(self) -> None:
         pauses_s, done = [1e-6, 1e-6, 0.0], asyncio.Event()
         queue = LoopQueue(lambda _: done.set(), pause_s=lambda: pauses_s.pop(0))
