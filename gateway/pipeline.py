@@ -11,7 +11,7 @@ record of it is received again. Live operation, demo and playback differ only in
 `feed` (bytes) or `feed_record` (raw records of a recording).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -32,7 +32,8 @@ from gateway.sources.source import SourceInput
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location, StoredPlan
 from gateway.vehicle.request_reader import BAD_SIGNATURE
-from gateway.vehicle.service import StatusText
+from gateway.vehicle.service import Action, StatusText
+from gateway.vehicle.vehicle import Vehicle
 from gateway.wire.link import Link
 from gateway.wire.mavlink_signing import (
     FrameSigner,
@@ -43,6 +44,7 @@ from gateway.wire.mavlink_signing import (
 )
 from gateway.wire.timesync import GpsTime
 
+FedRecord = RawRecord | ImuCalibrated | VehicleReport
 REPORT_INTERVAL_US: Final = US_PER_S
 RADIOHEAD_HEADER: Final = 4
 """Size in bytes: to, from, id and flags."""
@@ -76,6 +78,9 @@ class Pipeline:
         self._settings = settings
         self._link = Link()
         self.sources = settings.sources
+        self._of_receiver = [each for each in self.sources if each.url.transport == "receiver"]
+        self.ported = [each for each in self.sources if each not in self._of_receiver]
+        """The sources with a transport of their own."""
         self._signing_clock = SigningClock(settings.unix_us_at_zero)
         self.signer = FrameSigner(self._signing_clock)
         """Signs the frames of all aircraft that have a passphrase, when they are sent."""
@@ -102,22 +107,14 @@ class Pipeline:
             self._feed_packets(now_us, out)
         return out
 
-    @property
-    def ported(self) -> list[SourceInput]:
-        """The sources with a transport of their own."""
-        return [source for source in self.sources if source.url.transport != "receiver"]
-
     def _feed_packets(self, now_us: int, out: Outputs) -> None:
         """Pass packets of other programs, without their RadioHead header, to their sources."""
-        taken = [*self._link.packets]
-        self._link.packets.clear()
-        for source in self.sources:
-            if source.url.transport != "receiver":
-                continue
-            for packet in taken:
+        for source in self._of_receiver:
+            for packet in self._link.packets:
                 content = packet.packet[RADIOHEAD_HEADER:]
                 for record in source.feed(content, now_us, packet.signal):
                     self._feed(record, now_us, out)
+        self._link.packets.clear()
 
     def feed_source(self, source: SourceInput, data: bytes, now_us: int) -> Outputs:
         """Process bytes of a source other than the receiver."""
@@ -126,17 +123,13 @@ class Pipeline:
             self._feed(record, now_us, out)
         return out
 
-    def feed_record(
-        self, record: RawRecord | ImuCalibrated | VehicleReport, now_us: int
-    ) -> Outputs:
+    def feed_record(self, record: FedRecord, now_us: int) -> Outputs:
         """Process one raw record of a recording."""
         out = Outputs()
         self._feed(record, now_us, out)
         return out
 
-    def _feed(
-        self, record: RawRecord | ImuCalibrated | VehicleReport, now_us: int, out: Outputs
-    ) -> None:
+    def _feed(self, record: FedRecord, now_us: int, out: Outputs) -> None:
         vehicle_id = record.node.vehicle_id
         if isinstance(record, GpsFix) and record.utc_us is not None:
             at_zero_us = self._gps_time.update(vehicle_id, record.utc_us, record.time_us)
@@ -234,24 +227,26 @@ class Pipeline:
         """Set the state to connected; partly received data is dropped."""
         self._link.reopened()
         self._connected, self._port = True, port
-        for source in self.sources:
-            if source.url.transport == "receiver":
-                source.opened()
+        for source in self._of_receiver:
+            source.opened()
         self._report_due_us = 0
 
     def disconnect(self, port: str) -> None:
         """Set the state to disconnected."""
         self._connected, self._port = False, port
-        for source in self.sources:
-            if source.url.transport == "receiver":
-                source.lost("the receiver is not connected")
+        for source in self._of_receiver:
+            source.lost("the receiver is not connected")
         self._report_due_us = 0
 
     def handle(self, incoming: Incoming, now_us: int) -> Outputs:
         """Pass a client's frame to all aircraft; the addressed one answers."""
+        return self._each(now_us, lambda vehicle: vehicle.handle(incoming, now_us))
+
+    def _each(self, now_us: int, do: Callable[[Vehicle], list[Action]]) -> Outputs:
+        """Perform the actions of all present vehicles."""
         out = Outputs()
         for aircraft in self.aircraft.values():
-            aircraft.perform(aircraft.vehicle.handle(incoming, now_us), now_us, out)
+            aircraft.perform(do(aircraft.vehicle), now_us, out)
         return out
 
     def remove_client(self, client_id: int) -> None:
@@ -261,10 +256,7 @@ class Pipeline:
 
     def say(self, status: StatusText, now_us: int) -> Outputs:
         """Send a text from all aircraft."""
-        out = Outputs()
-        for aircraft in self.aircraft.values():
-            aircraft.perform(aircraft.vehicle.say(status, now_us), now_us, out)
-        return out
+        return self._each(now_us, lambda vehicle: vehicle.say(status, now_us))
 
     def mark(self, location: Location | None, vehicle_id: int | None, now_us: int) -> Outputs:
         """Mark a location for one aircraft, or for all, or clear the mark.
@@ -314,13 +306,8 @@ class Pipeline:
         self, trouble: str, now_us: int, *, recording: bool, expected: bool = True
     ) -> Outputs:
         """Announce whether a recording runs and should run, or why not."""
-        out = Outputs()
-        for each in self.aircraft.values():
-            found = each.vehicle.on_recorder(
-                trouble, now_us, recording=recording, expected=expected
-            )
-            each.perform(found, now_us, out)
-        return out
+        state = {"recording": recording, "expected": expected}
+        return self._each(now_us, lambda vehicle: vehicle.on_recorder(trouble, now_us, **state))
 
     def poll(self, now_us: int) -> Outputs:
         """Return what is due by time."""
@@ -328,7 +315,9 @@ class Pipeline:
         reporting = now_us >= self._report_due_us
         if reporting:
             self._report_due_us = now_us + REPORT_INTERVAL_US
-            self.report = self._whole_report(now_us)
+            report = self._link.report(now_us, connected=self._connected, port=self._port)
+            sources = tuple(source.report(now_us) for source in self.sources)
+            self.report = msgspec.structs.replace(report, sources=sources)
             self._remove_gone(now_us)
         for aircraft in self.aircraft.values():
             if reporting:
@@ -337,18 +326,11 @@ class Pipeline:
             aircraft.perform(aircraft.vehicle.poll(now_us), now_us, out)
         return out
 
-    def _whole_report(self, now_us: int) -> LinkReport:
-        """Return the report with the receiver's line and all other sources."""
-        report = self._link.report(now_us, connected=self._connected, port=self._port)
-        sources = tuple(source.report(now_us) for source in self.sources)
-        return msgspec.structs.replace(report, sources=sources) if sources else report
-
     def _report_for(self, vehicle_id: int) -> LinkReport:
         """Return the report with the state of the source of a vehicle's records, as of nodes."""
         report = self.report
         links = tuple(each for source in self.sources for each in source.links(report.time_us))
-        if links:
-            report = msgspec.structs.replace(report, nodes=report.nodes + links)
+        report = msgspec.structs.replace(report, nodes=report.nodes + links)
         for source in self.sources:
             if vehicle_id in source.vehicles:
                 known = {"connected": source.connected, "port": source.url.name, "name": "Source"}

@@ -29,14 +29,16 @@ from numpy.typing import NDArray
 from gateway.geometry.geomagnetism import MagneticField
 from gateway.geometry.quaternion import body_axes, from_euler, rotate_inverse
 from gateway.geometry.rotation import Matrix3
-from gateway.records import ImuFlags, ImuRaw, Vec3
+from gateway.records import ImuRaw, Vec3
 from gateway.sensing.calibration import (
     IDENTITY3,
     Correction,
     NodeCalibration,
-    accel_from_counts,
-    gyro_from_counts,
-    mag_from_counts,
+    accel_scale,
+    gyro_scale,
+    imu_counts,
+    new_field_ut,
+    vectors_from_counts,
 )
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2, counted
 
@@ -146,19 +148,15 @@ class NodeSamples:
 
 def node_samples(records: Sequence[ImuRaw], moving: Sequence[bool] | None = None) -> NodeSamples:
     """Scale raw records without correcting them."""
-    fields = [
-        (r.time_us * 1e-6, field)
-        for r in records
-        if ImuFlags.MAG_NEW in r.flags
-        and ImuFlags.MAG_ABSENT not in r.flags
-        and (field := mag_from_counts(r.mag_raw, r.mag_lsb_per_gauss)) is not None
-    ]
+    time_s, counts = np.array([r.time_us * 1e-6 for r in records]), imu_counts(records)
+    field = new_field_ut(counts, np.array([int(r.flags) for r in records], np.int64))
+    is_new = np.isfinite(field[:, 0])
     return NodeSamples(
-        time_s=np.array([r.time_us * 1e-6 for r in records]),
-        accel=_rows([accel_from_counts(r.accel_raw, r.accel_range_g) for r in records]),
-        gyro=_rows([gyro_from_counts(r.gyro_raw, r.gyro_range_dps) for r in records]),
-        mag_time_s=np.array([time_s for time_s, _ in fields]),
-        mag=_rows([field for _, field in fields]),
+        time_s=time_s,
+        accel=vectors_from_counts(accel_scale, counts[:, 0:3], counts[:, 10]),
+        gyro=vectors_from_counts(gyro_scale, counts[:, 3:6], counts[:, 11]),
+        mag_time_s=time_s[is_new],
+        mag=field[is_new],
         moving=np.zeros(len(records), np.bool_) if moving is None else np.array(moving, np.bool_),
     )
 
@@ -186,7 +184,7 @@ def solve_accelerometer(poses: FloatArray) -> SphereFit:
     fit = _fit_sphere(poses, STANDARD_GRAVITY_MPS2, skew=len(poses) >= POSES_FOR_SKEW)
     scale_off = float(np.abs(np.linalg.eigvalsh(np.array(fit.matrix)) - 1.0).max())
     advice = "hold every side still; a sensor that always does this is broken"
-    _check_bound("bias", _length(fit.bias), MAX_ACCEL_BIAS_MPS2, " m/s2", advice)
+    _check_bound("bias", math.hypot(*fit.bias), MAX_ACCEL_BIAS_MPS2, " m/s2", advice)
     _check_bound("scale error", scale_off, MAX_ACCEL_SCALE_OFF, "", advice)
     _check_bound("residual", fit.residual, MAX_ACCEL_RESIDUAL_MPS2, " m/s2", advice)
     return fit
@@ -221,7 +219,7 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
         raise CalibrationError(f"{text}: {advice}")
     fit = _fit_sphere(field, strength_ut or radius, skew=True, start=centre)
     axes = np.abs(np.linalg.eigvalsh(np.array(fit.matrix)))
-    _check_bound("hard iron", _length(fit.bias), MAX_HARD_IRON_UT, " uT", advice)
+    _check_bound("hard iron", math.hypot(*fit.bias), MAX_HARD_IRON_UT, " uT", advice)
     _check_bound("soft iron", float(axes.max() / axes.min()), MAX_SOFT_IRON, "", advice)
     _check_bound("residual", fit.residual, MAX_MAG_RESIDUAL * radius, " uT", advice)
     return fit
@@ -302,14 +300,6 @@ def _check_spread(points: FloatArray, radius: float, advice: str) -> None:
 def _check_bound(what: str, found: float, bound: float, unit: str, advice: str) -> None:
     if not found <= bound:
         raise CalibrationError(f"{what} {found:.2f}{unit} is above {bound:.2f}: {advice}")
-
-
-def _length(v: Vec3) -> float:
-    return float(np.linalg.norm(v))
-
-
-def _rows(vectors: list[Vec3]) -> FloatArray:
-    return np.array(vectors, float).reshape(-1, 3)
 
 
 def _angle_deg(a: FloatArray, b: FloatArray) -> float:
@@ -426,14 +416,10 @@ def calibrate_accelerometer(
 
 
 def calibrate_magnetometer(
-    samples: NodeSamples, calibration: NodeCalibration, strength_ut: float | None = None
+    field: FloatArray, calibration: NodeCalibration, strength_ut: float | None = None
 ) -> NodeCalibration:
-    """Fit hard and soft iron to a field that was measured in all directions."""
-    return with_magnetometer(calibration, solve_magnetometer(samples.mag, strength_ut))
-
-
-def with_magnetometer(calibration: NodeCalibration, fit: SphereFit) -> NodeCalibration:
-    """Return a calibration with the hard and soft iron of a fit."""
+    """Fit hard and soft iron to a field that was measured in all directions, shape (n, 3)."""
+    fit = solve_magnetometer(field, strength_ut)
     return msgspec.structs.replace(
         calibration,
         mag_hard_iron_ut=fit.bias,

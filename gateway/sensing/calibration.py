@@ -1,9 +1,8 @@
 """A node's calibration: counts in sensor axes to SI in body FRD."""
 
 import math
-import operator
-from collections.abc import Callable
-from functools import cache, reduce
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Annotated, Final, TypeVar
 
 import msgspec
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.geometry.rotation import Matrix3, determinant, is_rotation
-from gateway.records import ImuFlags, Int3, Vec3
+from gateway.records import ImuFlags, ImuRaw, Int3, Vec3
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
 
@@ -113,13 +112,9 @@ class NodeCalibration(Settings, frozen=True):
     @property
     def missing(self) -> ImuFlags:
         """Flags of the sensors that were never calibrated, those with a bias of zero."""
-        offsets = {
-            ImuFlags.MAG_UNCALIBRATED: self.mag_hard_iron_ut,
-            ImuFlags.GYRO_UNCALIBRATED: self.gyro_bias_radps,
-            ImuFlags.ACCEL_UNCALIBRATED: self.accel_bias_mps2,
-        }
-        missing = (flag for flag, offset in offsets.items() if offset == _NO_OFFSET)
-        return reduce(operator.or_, missing, ImuFlags(0))
+        missing = ImuFlags.MAG_UNCALIBRATED if self.mag_hard_iron_ut == _NO_OFFSET else ImuFlags(0)
+        missing |= ImuFlags.GYRO_UNCALIBRATED if self.gyro_bias_radps == _NO_OFFSET else 0
+        return missing | (ImuFlags.ACCEL_UNCALIBRATED if self.accel_bias_mps2 == _NO_OFFSET else 0)
 
     def __post_init__(self) -> None:
         """Refuse matrices that are not rotations, or have no inverse."""
@@ -131,18 +126,14 @@ class NodeCalibration(Settings, frozen=True):
                 raise ValueError(f"{name} must have an inverse: no row made of the others")
 
 
-def transform(matrix: Matrix3, v: Vec3) -> Vec3:
-    """Multiply a matrix and a vector."""
-    x, y, z = v
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
-    return (xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z)
-
-
 def compose(left: Matrix3, right: Matrix3) -> Matrix3:
     """Multiply two matrices: first `right`, then `left`."""
-    columns = [transform(left, column) for column in zip(*right, strict=True)]
-    a, b, c = (tuple(row) for row in zip(*columns, strict=True))
-    return ((a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2]))
+    (a, b, c), (d, e, f), (g, h, i) = right
+
+    def row(x: float, y: float, z: float) -> Vec3:
+        return (x * a + y * d + z * g, x * b + y * e + z * h, x * c + y * f + z * i)
+
+    return (row(*left[0]), row(*left[1]), row(*left[2]))
 
 
 @cache
@@ -164,18 +155,6 @@ def mag_scale(lsb_per_gauss: int) -> float:
     return UT_PER_GAUSS / lsb_per_gauss if lsb_per_gauss > 0 else math.nan
 
 
-def accel_from_counts(raw: Int3, range_g: int) -> Vec3:
-    """Scale accelerometer counts to m/s2 in sensor axes."""
-    scale = accel_scale(range_g)
-    return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
-
-
-def gyro_from_counts(raw: Int3, range_dps: int) -> Vec3:
-    """Scale gyroscope counts to rad/s in sensor axes."""
-    scale = gyro_scale(range_dps)
-    return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
-
-
 def mag_from_counts(raw: Int3, lsb_per_gauss: int) -> Vec3 | None:
     """Scale magnetometer counts to uT in sensor axes; None on an overflow, or if all are zero."""
     if lsb_per_gauss <= 0 or MAG_OVERFLOW in raw or not any(raw):
@@ -187,6 +166,18 @@ def mag_from_counts(raw: Int3, lsb_per_gauss: int) -> Vec3 | None:
 def temperature_from_counts(raw: Number) -> Number:
     """Convert the IMU's temperature word, or many of them, to deg C."""
     return raw / 340.0 + 36.53
+
+
+def imu_counts(records: Sequence[ImuRaw]) -> FloatArray:
+    """Return the counts of IMU payloads as columns; see `SensorChain.calibrated`."""
+    rows = [
+        (*r.accel_raw, *r.gyro_raw, *r.mag_raw, r.temperature_raw, *_ranges(r)) for r in records
+    ]
+    return np.array(rows, np.float64).reshape(-1, 13)
+
+
+def _ranges(r: ImuRaw) -> Int3:
+    return (r.accel_range_g, r.gyro_range_dps, r.mag_lsb_per_gauss)
 
 
 def vectors_from_counts(

@@ -255,7 +255,7 @@ def test_magnetometer_is_calibrated_from_raw_records() -> None:
     np.testing.assert_allclose(read.mag_time_s[:3], [0.0, 0.02, 0.04])
     assert not read.moving.any()
     assert read.accel[0] == pytest.approx((0, 0, G))
-    after = solver.calibrate_magnetometer(read, NodeCalibration())
+    after = solver.calibrate_magnetometer(read.mag, NodeCalibration())
     assert after.mag_hard_iron_ut == pytest.approx((8.0, -4.0, 2.0), abs=0.05)
     assert after.mag_residual_ut < 0.1
 

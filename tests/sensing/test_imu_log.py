@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gateway.records import ImuFlags, ImuRaw
-from gateway.sensing.calibration import MAG_OVERFLOW, NodeCalibration
+from gateway.sensing.calibration import MAG_OVERFLOW, NodeCalibration, imu_counts
 from gateway.sensing.chain import ImuLog, SensorChain
 from tests.kit.records import raw_at
 
@@ -46,14 +46,7 @@ def test_calibrated_log_equals_its_single_samples_to_the_bit(seed: int) -> None:
     raws = payloads(seed)
     chain = SensorChain(CALIBRATION)
     expected = [chain.imu(raw) for raw in raws]
-    counts = np.array(
-        [
-            (*r.accel_raw, *r.gyro_raw, *r.mag_raw, r.temperature_raw, r.accel_range_g,
-             r.gyro_range_dps, r.mag_lsb_per_gauss)
-            for r in raws
-        ],
-        np.float64,
-    )  # fmt: skip
+    counts = imu_counts(raws)
     flags = np.array([int(raw.flags) for raw in raws])
     found = []
     for part in (slice(0, 7), slice(7, 8), slice(8, 8), slice(8, None)):

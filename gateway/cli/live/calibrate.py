@@ -209,7 +209,7 @@ def _solve(
         case Step.ACCEL:
             return calibrating.calibrate_accelerometer(poses, calibration)
         case Step.MAG:
-            return calibrating.calibrate_magnetometer(poses[0], calibration, field_ut)
+            return calibrating.calibrate_magnetometer(poses[0].mag, calibration, field_ut)
         case Step.MOUNTING:
             return calibrating.calibrate_mounting(poses[0], poses[1], calibration)
         case Step.LEVEL:

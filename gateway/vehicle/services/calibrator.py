@@ -33,11 +33,10 @@ from gateway.sensing.calibrating import (
     calibrate_accelerometer_level,
     calibrate_gyro,
     calibrate_level,
+    calibrate_magnetometer,
     calibrate_magnetometer_by_yaw,
     sides_of,
-    solve_magnetometer,
     still_windows,
-    with_magnetometer,
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S
@@ -233,8 +232,8 @@ class Calibrator(Service):
         if passed_us < MAG_MIN_US or len(run.mag) % FIT_EVERY:
             return self._announce(run, min(90, 100 * passed_us // TIMEOUT_US))
         try:
-            fit = solve_magnetometer(np.array([sample.mag_b_ut for sample in run.mag]))
-            return self._done(run, with_magnetometer(IN_BODY_AXES, fit))
+            field = np.array([sample.mag_b_ut for sample in run.mag])
+            return self._done(run, calibrate_magnetometer(field, IN_BODY_AXES))
         except MoreNeeded:
             is_full = len(run.mag) >= MAG_SAMPLES
             return self._fail("turn it about all axes") if is_full else []
