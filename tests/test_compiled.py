@@ -194,7 +194,7 @@ def test_library_records_versions_of_its_sources(scaling: Scaling, tmp_path: Pat
     assert changed_source(stamp_in(open_library(path))) == "gateway/units.py"
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no library"])
+@pytest.mark.parametrize("content", [None, b"", b"x"], ids=["missing", "empty", "no library"])
 def test_error_for_missing_library_names_build_command(
     tmp_path: Path, content: bytes | None
 ) -> None:

@@ -250,25 +250,20 @@ def test_sources_besides_the_receiver_are_found() -> None:
     assert not HubSettings(endpoints=(*usual, "udp:192.168.1.20:14550")).has_other_sources
 
 
-@pytest.mark.parametrize(
-    ("text", "mode", "is_exposed"),
-    [
-        ('[vehicle]\nsigning_passphrase = "x"', 0o644, True),
-        ('[vehicle]\nsigning_passphrase = "x"', 0o640, False),
+def test_passphrase_that_others_can_read_is_named(tmp_path: Path) -> None:
+    file, aircraft = tmp_path / "gateway.toml", tmp_path / "1.toml"
+    own = '[vehicle]\nsigning_passphrase = "x"'
+    aircraft.write_text(own)
+    aircraft.chmod(0o644)
+    for text, mode, is_exposed in (
+        (own, 0o644, True),
+        (own, 0o640, False),
         ('[[fleet.site]]\nname = "a"\npassphrase = "x"', 0o604, True),
         ("", 0o644, False),
-    ],
-)
-def test_passphrase_that_others_can_read_is_named(
-    tmp_path: Path, text: str, mode: int, is_exposed: bool
-) -> None:
-    file = tmp_path / "gateway.toml"
-    file.write_text(f'aircraft_folder = "{tmp_path}"\n{text}')
-    file.chmod(mode)
-    settings = load(file)
-    assert bool(exposed_secrets(file, settings, {})) is is_exposed
-    aircraft = tmp_path / "1.toml"
-    aircraft.write_text('[vehicle]\nsigning_passphrase = "x"')
-    aircraft.chmod(0o644)
-    own = exposed_secrets(file, settings, load_aircraft(settings))
-    assert f"{aircraft} has a passphrase" in own[-1]
+    ):
+        file.write_text(f'aircraft_folder = "{tmp_path}"\n{text}')
+        file.chmod(mode)
+        settings = load(file)
+        assert bool(exposed_secrets(file, settings, {})) is is_exposed, (text, mode)
+        *_, warning = exposed_secrets(file, settings, load_aircraft(settings))
+        assert f"{aircraft} has a passphrase" in warning

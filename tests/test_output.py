@@ -77,7 +77,11 @@ def test_output_that_is_an_input_is_rejected(tmp_path: Path, way: str) -> None:
 
 
 @pytest.mark.parametrize("before", [{}, {"a": b"old"}], ids=["new", "replaced"])
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.EIO, "broken", "input.csv")])
+@pytest.mark.parametrize(
+    "error",
+    [KeyboardInterrupt(), OSError(errno.EIO, "broken", "input.csv")],
+    ids=["interrupted", "broken input"],
+)
 def test_interrupted_write_leaves_previous_content(
     tmp_path: Path, before: dict[str, bytes], error: BaseException
 ) -> None:

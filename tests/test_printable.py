@@ -30,20 +30,17 @@ def log_line(text: str) -> str:
     return PrintableFormatter("%(message)s").format(record)
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("\x1b[2J\r", r"\x1b[2J\x0d"),
-        ("\x9b2J", r"\x9b2J"),
-        (f"a{RIGHT_TO_LEFT}gnp.exe", r"a\u202egnp.exe"),
-        ("\u2028\ufeff", r"\u2028\ufeff"),
-        ("\U000e0041", r"\U000e0041"),
-        ("tab\tline\nÄ µ 高度 \u0645\u06cc\u200c\u062e\u0648", "tab\tline\nÄ µ 高度 می\u200cخو"),
-    ],
-)
-def test_control_and_direction_characters_are_escaped(text: str, shown: str) -> None:
-    assert printable(text) == shown
-    assert printable(shown) == shown
+def test_control_and_direction_characters_are_escaped() -> None:
+    for text, shown in {
+        "\x1b[2J\r": r"\x1b[2J\x0d",
+        "\x9b2J": r"\x9b2J",
+        f"a{RIGHT_TO_LEFT}gnp.exe": r"a\u202egnp.exe",
+        "\u2028\ufeff": r"\u2028\ufeff",
+        "\U000e0041": r"\U000e0041",
+        "tab\tline\nÄ µ 高度 \u0645\u06cc\u200c\u062e\u0648": "tab\tline\nÄ µ 高度 می\u200cخو",
+    }.items():
+        assert printable(text) == shown
+        assert printable(shown) == shown
 
 
 def test_every_control_and_direction_character_of_unicode_is_escaped() -> None:
@@ -94,18 +91,15 @@ def test_port_without_frames_is_described() -> None:
         assert receiver_state("auto", connected, received, 0).startswith(text)
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("radio: /dev/ttyUSB0: No such device", "radio: ttyUSB0: No such device"),
-        ("to install it: /opt/x.y/bin/python -m pip install 'a>=2'",
-         "to install it: python -m pip install 'a>=2'"),
-        ("see '/home/jo/.config/a b' and ~/x/y.toml", "see 'a b' and y.toml"),
-        ("tcp://host:1/path is 3 m/s, 1/2 of -/- or a/b; tls:HOST:8883", None),
-    ],
-)  # fmt: skip
-def test_text_for_other_machines_has_no_folder_of_this_one(text: str, shown: str | None) -> None:
-    assert without_folders(text) == (shown or text)
+def test_text_for_other_machines_has_no_folder_of_this_one() -> None:
+    for text, shown in {
+        "radio: /dev/ttyUSB0: No such device": "radio: ttyUSB0: No such device",
+        "to install it: /opt/x.y/bin/python -m pip install 'a>=2'":
+            "to install it: python -m pip install 'a>=2'",
+        "see '/home/jo/.config/a b' and ~/x/y.toml": "see 'a b' and y.toml",
+        "tcp://host:1/path is 3 m/s, 1/2 of -/- or a/b; tls:HOST:8883": None,
+    }.items():  # fmt: skip
+        assert without_folders(text) == (shown or text)
 
 
 def test_known_number_is_followed_by_its_unit_and_an_unknown_one_is_a_dash() -> None:

@@ -70,21 +70,16 @@ async def test_request_is_answered(server: ControlServer) -> None:
     assert await ask(server, "verbs") == ["refuse", "seek", "verbs"]
 
 
-@pytest.mark.parametrize(
-    ("verb", "params", "text"),
-    [
+async def test_refused_requests_get_a_reason(server: ControlServer) -> None:
+    for verb, params, text in (
         ("refuse", {}, "not now"),
         ("fly", {}, "no such verb: fly; there are refuse, seek, verbs"),
         ("seek", {}, "missing required field `offset_s`"),
         ("seek", {"offset_s": "x"}, "Expected `float`"),
         ("seek", {"offset_s": 1, "far": 2}, "unknown field `far`"),
-    ],
-)
-async def test_refused_requests_get_a_reason(
-    server: ControlServer, verb: str, params: dict[str, Any], text: str
-) -> None:
-    with pytest.raises(ControlError, match=text):
-        await ask(server, verb, params)
+    ):
+        with pytest.raises(ControlError, match=text):
+            await ask(server, verb, params)
 
 
 async def test_invalid_requests_are_answered_with_an_error(server: ControlServer) -> None:
@@ -154,15 +149,14 @@ async def test_path_too_long_for_a_socket_is_reported(tmp_path: Path) -> None:
 
 
 async def test_gateways_of_one_user_have_a_socket_each(server: ControlServer) -> None:
-    second, third = ControlServer(server.path), ControlServer(server.path)
-    await second.start()
-    await third.start()
-    names = [made.path.name for made in (server, second, third)]
+    others = [ControlServer(server.path) for _ in range(2)]
+    for other in others:
+        await other.start()
+    names = [made.path.name for made in (server, *others)]
     assert names == ["run.sock", "run-2.sock", "run-3.sock"]
-    assert await ask(server, "verbs")
-    assert await ask(second, "verbs") == ["verbs"]
-    second.close()
-    third.close()
+    assert await ask(others[0], "verbs") == ["verbs"]
+    for other in others:
+        other.close()
     assert await ask(server, "verbs"), "closing another's socket leaves this one"
 
 

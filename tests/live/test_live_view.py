@@ -187,7 +187,7 @@ FIGURES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("width", [200, 150, 100, 80, 60, 40])
+@pytest.mark.parametrize("width", [200, 150, 100, 80, 60, 40], ids=lambda w: f"{w} columns")
 def test_figures_are_below_their_headings_at_any_width(width: int) -> None:
     text = text_of(WELL_KNOWN, width=width)
     lines = text.splitlines()

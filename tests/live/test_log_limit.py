@@ -69,7 +69,7 @@ def test_errors_of_different_code_positions_are_limited_separately(limit: LogLim
     assert limit.filter(line("Exception in callback", error=fail(1)))
 
 
-@pytest.mark.parametrize("step_s", [-7200.0, 7200.0])
+@pytest.mark.parametrize("step_s", [-7200.0, 7200.0], ids=["backwards", "forwards"])
 def test_step_of_the_wall_clock_suppresses_no_line(
     limit: LogLimit, clock: ManualClock, step_s: float
 ) -> None:

@@ -169,6 +169,7 @@ class TestServer:
         await until(lambda: server.listeners()[0].clients == metrics_server.MAX_CONNECTIONS)
         reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
         assert await asyncio.wait_for(reader.read(), LIMIT_S) == b"", "closed without a word"
+        assert server.listeners()[0].clients == metrics_server.MAX_CONNECTIONS
         writer.close()
         idle[0][1].close()
         await until(lambda: server.listeners()[0].clients < metrics_server.MAX_CONNECTIONS)

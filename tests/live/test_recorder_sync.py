@@ -91,7 +91,7 @@ async def test_recording_ends_after_the_running_sync(
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-@pytest.mark.parametrize("failures", [2, 3])
+@pytest.mark.parametrize("failures", [2, 3], ids=["sync before the last", "last sync"])
 @pytest.mark.parametrize("is_stopped", [True, False], ids=["stopped", "closed"])
 async def test_failed_last_sync_is_reported(
     bench: RecorderBench,

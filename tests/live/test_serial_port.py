@@ -35,20 +35,15 @@ MODEM = Port("/dev/ttyACM0", "2cb7:0a05", "", "modem", known=False)
 BUILT_IN = Port("/dev/ttyS0", "", "", "n/a", known=False)
 
 
-@pytest.mark.parametrize(
-    ("wanted", "ports", "found"),
-    [
+def test_port_is_found_by_device_adapter_or_usb_id() -> None:
+    for wanted, ports, found in (
         ("/dev/ttyAMA0", [], "/dev/ttyAMA0"),
         ("auto", [MODEM, CH340, BUILT_IN], "/dev/ttyUSB0"),
         ("usb:2cb7:0a05", [CH340, MODEM], "/dev/ttyACM0"),
         ("usb:1A86:7523", [FTDI, CH340], "/dev/ttyUSB0"),
         ("usb:0403:6001:a50285bi", [FTDI_2, FTDI], "/dev/ttyUSB1"),
-    ],
-)
-def test_port_is_found_by_device_adapter_or_usb_id(
-    wanted: str, ports: list[Port], found: str
-) -> None:
-    assert find_port(wanted, ports) == found
+    ):
+        assert find_port(wanted, ports) == found, wanted
 
 
 def test_error_of_find_port_lists_the_ports() -> None:

@@ -116,16 +116,17 @@ def test_events_cause_actions(name: str) -> None:
     assert (session.state is SessionState.IDLE) == name.startswith("stop")
 
 
-@pytest.mark.parametrize(
-    ("mode", "in_flight", "expected"),
-    [("manual", False, False), ("manual", True, False), ("in_flight", False, False),
-     ("in_flight", True, True), ("always", False, True)],
-)  # fmt: skip
-def test_mode_decides_without_a_command(mode: str, in_flight: bool, expected: bool) -> None:
-    session = Session(RecordingSettings(mode=mode))
-    session.set_in_flight(in_flight)
-    assert session.wanted is expected
-    assert bool(polled()(session)) is expected
+def test_mode_decides_without_a_command() -> None:
+    for mode, states in {
+        "manual": {False: False, True: False},
+        "in_flight": {False: False, True: True},
+        "always": {False: True},
+    }.items():
+        for in_flight, expected in states.items():
+            session = Session(RecordingSettings(mode=mode))
+            session.set_in_flight(in_flight)
+            assert session.wanted is expected, mode
+            assert bool(polled()(session)) is expected, mode
 
 
 def test_commands_override_the_mode_until_the_next_flight() -> None:

@@ -147,6 +147,7 @@ async def test_newest_client_of_a_listening_source_is_used(
         ("crsf:tcp-listen", bytes(20_000), source_port.PART),
         ("lines:file", b"x\n" * 10_000, source_port.PART),
     ],
+    ids=["frames", "lines", "long line", "stream", "file"],
 )
 async def test_large_input_is_processed_in_parts(
     url: str, data: bytes, most: int, tmp_path: Path
@@ -179,6 +180,7 @@ async def test_large_input_is_processed_in_parts(
         (b"x", b""),
         (b"", b""),
     ],
+    ids=["answer", "not found", "too large", "not HTTP", "closed"],
 )
 async def test_server_is_polled_with_the_requests_of_the_decoder(
     answer: bytes, data: bytes, monkeypatch: pytest.MonkeyPatch
