@@ -156,27 +156,20 @@ async def test_table_contains_the_flight_and_its_header(
 
 
 async def test_changed_settings_write_a_new_header_after_the_samples_before(
-    bench: RecorderBench, rng: np.random.Generator
-) -> None:
-    bench.recorder.settings_changed(3)
-    bench.fly([make_fused(rng, 1000), make_baro(rng, 1500)])
-    bench.recorder.settings_changed(3)
-    bench.fly([make_fused(rng, 2000)])
-    bench.recorder.close()
-    _, events = read_table(bench.recorder.folder / f"{NAME}_01_v3.csv")
-    assert [type(event) for event in events] == [TableRow, TableRow, TableHeader, TableRow]
-
-
-async def test_header_of_a_recording_begun_in_flight_reports_no_cold_start(
     make_bench: MakeBench, rng: np.random.Generator
 ) -> None:
-    bench, (first, second, *_) = make_bench(), make_flight(rng, 10)
-    bench.fly([first])
+    """In a recording that began in flight, so that its fusion had no cold start."""
+    bench = make_bench()
+    bench.fly([make_fused(rng, 0)])
     await bench.turn()
-    bench.fly([second])
+    bench.fly([make_fused(rng, 1000), make_baro(rng, 1500)])
+    bench.recorder.settings_changed(3)
+    bench.recorder.settings_changed(4)
+    bench.fly([make_fused(rng, 2000)])
     bench.recorder.close()
-    header, _ = read_table(bench.recorder.folder / f"{NAME}_01_v3.csv")
+    header, events = read_table(bench.recorder.folder / f"{NAME}_01_v3.csv")
     assert not header.cold_start
+    assert [type(event) for event in events] == [TableRow, TableRow, TableHeader, TableRow]
 
 
 async def test_part_begins_with_the_state_of_the_fusion(
@@ -198,18 +191,6 @@ async def test_part_begins_with_the_state_of_the_fusion(
     assert second[0] == FusionState(3, "2", b"")
     assert [type(event) for event in second[1:]] == [TableHeader, TableRow]
     assert second[2].baro is None
-
-
-async def test_stop_and_start_make_two_recordings(bench: RecorderBench) -> None:
-    bench.send(FRAMES[:5])
-    bench.recorder.stop()
-    await bench.turn()
-    bench.send(FRAMES[5:10])
-    bench.recorder.record()
-    await bench.turn()
-    await bench.record(FRAMES[10:])
-    assert len(list_recordings(bench.recorder.folder)) == 2
-    assert sorted(frames_of(bench.recorder.folder)) == sorted(FRAMES[:5] + FRAMES[10:])
 
 
 FAULTS = {"disk is full": errno.ENOSPC, "disk is read-only": errno.EROFS, "folder has vanished": 0}
@@ -355,19 +336,24 @@ async def test_failed_start_is_reported_and_retried(make_bench: MakeBench) -> No
     assert bench.recorder.status().state == "recording"
 
 
-async def test_recording_begins_and_frames_are_taken_on_request(make_bench: MakeBench) -> None:
+async def test_recordings_begin_and_frames_are_taken_on_request(make_bench: MakeBench) -> None:
     bench = make_bench(mode="manual")
-    bench.recorder.start()
-    await bench.recorder.settle()
-    assert (bench.recorder.recording, bench.recorder.takes_frames) == (False, False)
-    bench.recorder.record()
-    await bench.recorder.settle()
-    assert bench.recorder.status().state == "recording"
-    bench.send(FRAMES)
-    bench.recorder.stop()
-    await bench.recorder.settle()
+    recorder = bench.recorder
+    recorder.start()
+    await recorder.settle()
+    assert (recorder.recording, recorder.takes_frames) == (False, False)
+    for begin in (0, 20):
+        recorder.record()
+        await recorder.settle()
+        assert recorder.status().state == "recording"
+        bench.send(FRAMES[begin : begin + 10])
+        recorder.stop()
+        await recorder.settle()
+        bench.send(FRAMES[begin + 10 : begin + 20])
+        bench.clock.advance(1.0)
     assert (bench.takes_frames[0], bench.takes_frames[-1]) == (True, False)
-    assert frames_of(bench.recorder.folder) == FRAMES
+    assert len(list_recordings(recorder.folder)) == 2
+    assert frames_of(recorder.folder) == FRAMES[:10] + FRAMES[20:30]
 
 
 def test_file_without_content_is_removed_and_another_one_is_not_overwritten(

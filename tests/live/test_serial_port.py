@@ -365,14 +365,7 @@ async def test_serial_port_is_changed_closed_and_opened_again(
     assert "No such file or directory" in waiting["reason"]
     assert (await ask(server, "serial.connect", port="auto"))["result"]["device"] == second
     assert (await ask(server, "serial.disconnect"))["result"]["state"] == "closed"
-
-
-@pytest.mark.io
-async def test_port_of_a_simulated_receiver_is_not_changed(
-    listener: Listener, tmp_path: Path
-) -> None:
-    verbs = serial_verbs(listener.port(), is_simulated=True)
-    server = ControlServer(tmp_path / "s", verbs)
-    assert (await ask(server, "serial.status"))["result"]["is_fixed"]
+    simulated = ControlServer(tmp_path / "s", serial_verbs(port, is_simulated=True))
+    assert (await ask(simulated, "serial.status"))["result"]["is_fixed"]
     for verb, params in (("serial.connect", {"port": "auto"}), ("serial.disconnect", {})):
-        assert "simulated" in (await ask(server, verb, **params))["error"]
+        assert "simulated" in (await ask(simulated, verb, **params))["error"]

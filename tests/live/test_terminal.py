@@ -204,5 +204,5 @@ async def test_keyboard_leaves_a_pipe_and_the_terminal_of_a_background_job_uncha
     for descriptor in (terminal[1], pipe[0].fileno()):
         board = Keyboard(lambda _: None, descriptor)
         board.start()
+        assert termios.tcgetattr(terminal[1]) == before
         board.close()
-    assert termios.tcgetattr(terminal[1]) == before
