@@ -25,7 +25,7 @@ from gateway.hub.forwarding import Forwarding
 from gateway.live.kept_files import begin_worker, done_by
 from gateway.live.part import PENDING_LIMIT, Part
 from gateway.live.part_files import DiskState, PartFiles, close_behind, free_bytes_near, reason_of
-from gateway.live.restamper import Restamper, clear_copies
+from gateway.live.restamper import clear_copies, shift_times
 from gateway.live.session import (
     Announce,
     ClosePart,
@@ -108,8 +108,9 @@ class Recorder:
         self._task: asyncio.Task[None] | None = None
         self._offsets: dict[int, int] = {}
         """Civil time of gateway time zero used in each part of the session."""
-        self._restamper = Restamper(round(settings.free_floor_mb * 1e6))
-        self._restamping: asyncio.Task[None] | None = None
+        self._restamper = begin_worker("restamper")
+        self._restamping: list[Future[None]] = []
+        self._closing: Future[None] | None = None
         self.folder = Path(settings.folder).expanduser()
         """Folder of the recordings."""
 
@@ -126,9 +127,8 @@ class Recorder:
 
     def close(self) -> None:
         """Write the pending data and end; waits for the disk."""
-        for task in (self._task, self._restamping):
-            if task is not None:
-                task.cancel()
+        if self._task is not None:
+            self._task.cancel()
         self._writer.shutdown(wait=True)
         self._syncer.shutdown(wait=True)
         files, self._files = self._files, None
@@ -139,7 +139,7 @@ class Recorder:
             self._check_sync()
         except OSError as error:
             log.warning("Recording: the last bytes are lost: %s", reason_of(error))
-        self._restamper.finish()
+        self._restamper.shutdown(wait=True)
 
     async def settle(self) -> None:
         """Wait until all requests so far have been carried out."""
@@ -459,9 +459,9 @@ class Recorder:
         if part is None or files is None:
             return
         written = self._writer.submit(files.write, part.take())
-        closing = self._syncer.submit(close_behind, files, written, syncing)
+        self._closing = self._syncer.submit(close_behind, files, written, syncing)
         if is_last:
-            await asyncio.shield(asyncio.wrap_future(closing))
+            await asyncio.shield(asyncio.wrap_future(self._closing))
 
     async def _correct_times(self) -> None:
         """Queue the finished parts of the session to be shifted to the true time."""
@@ -473,13 +473,17 @@ class Recorder:
             log.warning("Recording %s keeps its times: %s", self._session.name, error)
             return
         true_us = self._civil.offset_us or 0
+        if self._closing is not None:
+            # A file may be replaced once it is closed.
+            self._restamper.submit(self._closing.result)
+        floor = round(self._settings.free_floor_mb * 1e6)
         for path in found.files:
-            self._restamper.add(path, true_us - self._offsets.get(part_of(path), true_us))
+            if shift_us := true_us - self._offsets.get(part_of(path), true_us):
+                job = self._restamper.submit(shift_times, path, shift_us, floor)
+                self._restamping.append(job)
         self._offsets = dict.fromkeys(self._offsets, true_us)
-        run = self._restamper.run(lambda step: done_by(self._syncer, step))
-        self._restamping = asyncio.get_running_loop().create_task(run)
 
     async def _restamped(self) -> None:
         """Wait until no file is being copied, so that its name may change."""
-        if self._restamping is not None:
-            await self._restamping
+        while self._restamping:
+            await asyncio.shield(asyncio.wrap_future(self._restamping.pop()))

@@ -1,16 +1,13 @@
 """Finished files get their true times once GPS has provided them.
 
-A part may be larger than the memory and the disk slow, so a file is copied in small steps, between
-which the present recording is synced. The copy replaces the file atomically: a power cut leaves one
-of the two.
+A part may be larger than the memory, so a file is copied in pieces. The copy replaces the file
+atomically: a power cut leaves one of the two.
 """
 
 import contextlib
-import errno
 import logging
 import os
-from collections import deque
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -27,64 +24,30 @@ from gateway.wire.recorded_frames import Batch
 log = logging.getLogger(__name__)
 
 STEP: Final = 1 << 16
-"""Bytes copied in one step: a millisecond's work."""
+"""Bytes copied at once."""
 NEW: Final = ".new"
 
 
-class Restamper:
-    """Shift the times of files, one after the other."""
-
-    def __init__(self, free_floor: int) -> None:
-        self._free_floor = free_floor
-        self._waiting: deque[tuple[Path, Iterator[None]]] = deque()
-
-    def add(self, path: Path, shift_us: int) -> None:
-        """Queue a file whose times are to be shifted."""
-        if shift_us:
-            self._waiting.append((path, self._steps(path, shift_us)))
-
-    async def run(self, on_disk: Callable[[Callable[[], bool]], Awaitable[bool]]) -> None:
-        """Process the queue, running each step in the thread that syncs."""
-        while await on_disk(self.step):
-            pass
-
-    def finish(self) -> None:
-        """Process the queue at once."""
-        while self.step():
-            pass
-
-    def step(self) -> bool:
-        """Do one step; return whether there is more to do."""
-        if not self._waiting:
-            return False
-        path, steps = self._waiting[0]
-        try:
-            next(steps)
-        except StopIteration:
-            self._waiting.popleft()
-        except OSError as error:
-            log.warning("%s keeps the times it was written with: %s", path, error.strerror)
-            self._waiting.popleft()
-        return True
-
-    def _steps(self, path: Path, shift_us: int) -> Iterator[None]:
-        temporary = path.with_name(path.name + NEW)
-        if free_bytes_near(path.parent) < path.stat().st_size + self._free_floor:
-            raise OSError(errno.ENOSPC, "the disk is too full for a copy")
-        shifted = _shifted_tlog if path.suffix == TLOG else _shifted_table
-        try:
-            with path.open("rb") as file, temporary.open("wb") as copy:
-                for data in shifted(file, shift_us):
-                    copy.write(data)
-                    yield
-                copy.flush()
-                os.fsync(copy.fileno())
-            # If the file was deleted during the copy, it must not reappear.
-            if path.exists():
-                temporary.replace(path)
-                sync_folder(path.parent)
-        finally:
-            temporary.unlink(missing_ok=True)
+def shift_times(path: Path, shift_us: int, free_floor: int) -> None:
+    """Shift the times of a file, which keeps them if the disk fails or would be too full."""
+    temporary = path.with_name(path.name + NEW)
+    shifted = _shifted_tlog if path.suffix == TLOG else _shifted_table
+    try:
+        if free_bytes_near(path.parent) < path.stat().st_size + free_floor:
+            log.warning("%s keeps the times it was written with: %s", path, "no room for a copy")
+            return
+        with path.open("rb") as file, temporary.open("wb") as copy:
+            copy.writelines(shifted(file, shift_us))
+            copy.flush()
+            os.fsync(copy.fileno())
+        # If the file was deleted during the copy, it must not reappear.
+        if path.exists():
+            temporary.replace(path)
+            sync_folder(path.parent)
+    except OSError as error:
+        log.warning("%s keeps the times it was written with: %s", path, error.strerror)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def clear_copies(folder: Path) -> None:

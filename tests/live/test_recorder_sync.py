@@ -138,7 +138,7 @@ async def test_next_part_does_not_wait_for_the_sync_of_the_last(
     assert names == [f"{NAME}_0{number}.tlog" for number in (1, 2)]
     disk.may_end.set()
     bench.recorder.close()
-    assert disk.most == 1
+    assert disk.most <= 1 + is_corrected, "a corrected file is synced next to the present one"
 
 
 async def test_recording_is_renamed_during_a_slow_sync(
