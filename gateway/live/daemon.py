@@ -304,12 +304,11 @@ class Daemon:
         if port:
             # Imported here, since most gateways serve no metrics; not at the first request, because
             # loading the library then would stop the telemetry for 0.3 s.
-            import_module("gateway.live.system_metrics")
+            import_module("gateway.live.metrics")
         self._metrics.listen(port)
 
     def _metrics_text(self) -> Iterator[str]:
-        from gateway.live.metrics import prometheus_text, text_of
-        from gateway.live.system_metrics import system_families
+        from gateway.live.metrics import prometheus_text, system_families, text_of
 
         yield from prometheus_text(self.snapshot())
         yield from text_of(system_families(self._watch_vehicles(), self.now_us()))

@@ -11,8 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.frame_stream import FrameStream
-from gateway.live.metrics import prometheus_text, text_of
-from gateway.live.system_metrics import system_families
+from gateway.live.metrics import prometheus_text, system_families, text_of
 from gateway.live.vehicle_watch import DECODED_US, MAX_SYSTEMS, VehicleWatch
 from gateway.units import US_PER_S
 from gateway.vehicle_state.newest import HEARD_US
