@@ -58,6 +58,8 @@ class AircraftStatus:
     """The newest report of each node."""
     origins: dict[str, str] = field(default_factory=dict)
     """Origin of attitude and position: the samples, the vehicle's own autopilot, its fixes."""
+    troubles: dict[str, str] = field(default_factory=dict)
+    """Texts of the severe states that it has announced and that last, by topic."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +106,7 @@ def status_of(aircraft: Aircraft, now_us: int) -> AircraftStatus:
         _seen_from(here, vehicle.plan.mark.location),
         vehicle.health.statuses,
         vehicle.telemetry.origins(now_us),
+        vehicle.troubles,
     )
 
 

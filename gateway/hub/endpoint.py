@@ -104,12 +104,17 @@ def admits_page(origin: str, local_host: str, named: Collection[str]) -> bool:
     return address is not None and (address.is_loopback or address == _address(local_host))
 
 
+def host_of(host_header: str) -> str:
+    """Return the host of a request's `Host`, without its port; empty if it is malformed."""
+    try:
+        return urlsplit(f"//{host_header.strip()}").hostname or ""
+    except ValueError:
+        return ""
+
+
 def names_loopback(host_header: str) -> bool:
     """Return whether a request's `Host` is loopback; that of a page after DNS rebinding is not."""
-    try:
-        return is_loopback(urlsplit(f"//{host_header.strip()}").hostname or "")
-    except ValueError:
-        return False
+    return is_loopback(host_of(host_header))
 
 
 def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

@@ -6,26 +6,27 @@ page can forge distinguish them: `Host`, which must be a name of ours (against D
 """
 
 import asyncio
-import ipaddress
 import re
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager, nullcontext, suppress
 from http import HTTPStatus
 from typing import Final
-from urllib.parse import SplitResult, parse_qs, urlsplit
+from urllib.parse import parse_qs
 from weakref import WeakValueDictionary
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
-from starlette.requests import ClientDisconnect, cookie_parser
+from starlette.middleware.cors import CORSMiddleware
+from starlette.requests import ClientDisconnect, Request, cookie_parser
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.status import WS_1008_POLICY_VIOLATION
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from gateway.hub.endpoint import host_of, is_loopback, is_numeric
 from gateway.panel.admission import Holder, address_group
 from gateway.panel.connections import Client
 from gateway.panel.logins import BusyError, Logins
-from gateway.panel.panel_settings import LOOPBACK, PanelSettings
+from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.response_headers import with_headers
 
 COOKIE: Final = "mavgate_panel"
@@ -46,17 +47,6 @@ PUSH: Final = "/push/"
 PUSH_HELP: Final = "A device posts its readings to this address: paste it into the device's app.\n"
 API_PATHS: Final = ("/v1/", "/mavlink", "/helper/", "/ws/mavlink", "/info")
 """Paths of the REST and WebSocket API, which pages of `panel.origins` may use."""
-CORS_HEADERS: Final = {
-    "access-control-allow-credentials": "true",
-    "access-control-allow-headers": "content-type",
-    "access-control-allow-methods": "GET, POST",
-    "access-control-allow-private-network": "true",
-    "access-control-expose-headers": "x-error-detail",
-    "access-control-max-age": "600",
-    "cross-origin-resource-policy": "cross-origin",
-    "vary": "Origin",
-}
-"""Answer to an allowed page of another origin, its preflight request included."""
 MAX_DIGITS: Final = 18
 """Maximum digits of a length; Python refuses numbers of some thousand digits."""
 LARGE_ANSWERS: Final = re.compile(r"(/mavlink2rest)?(/v1)?/mavlink(/|$)|/path/|/history/")
@@ -101,11 +91,20 @@ class AccessControl:
         self._on_session_end = on_session_end
         self._large: WeakValueDictionary[object, asyncio.Lock] = WeakValueDictionary()
         logins.on_close = self._end_session
-        self._is_local = settings.address in LOOPBACK
-        self._names = {*LOOPBACK, settings.address, *settings.hosts}
+        self._is_local = is_loopback(settings.address)
+        self._names = {settings.address, *settings.hosts}
         self._secure = bool(settings.certificate)
         self._upload_limit = settings.upload_limit_mb * 1_000_000
         self._origins = frozenset(settings.origins)
+        self._for_origins = CORSMiddleware(
+            self._serve,
+            settings.origins,
+            allow_methods=("GET", "POST"),
+            allow_headers=("content-type",),
+            allow_credentials=True,
+            allow_private_network=True,
+            expose_headers=("x-error-detail",),
+        )
         self._sockets: dict[str, set[_SessionSocket]] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -114,18 +113,17 @@ class AccessControl:
             await self.app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        origin = headers.get("origin", "").lower()
-        is_allowed = origin in self._origins and scope["path"].startswith(API_PATHS)
+        is_allowed = headers.get("origin") in self._origins and scope["path"].startswith(API_PATHS)
         if refusal := self._refusal(headers, is_allowed=is_allowed):
             await _refuse(scope, receive, send, HTTPStatus.FORBIDDEN, refusal)
-            return
-        if is_allowed and scope["type"] == "http":
-            allowed = {"access-control-allow-origin": headers["origin"], **CORS_HEADERS}
-            send = with_headers(send, allowed)
-            if scope["method"] == "OPTIONS":
-                await Response(status_code=HTTPStatus.NO_CONTENT)(scope, receive, send)
-                return
-        token = _token(headers)
+        elif is_allowed and scope["type"] == "http":
+            shared = with_headers(send, {"cross-origin-resource-policy": "cross-origin"})
+            await self._for_origins(scope, receive, shared)
+        else:
+            await self._serve(scope, receive, send)
+
+    async def _serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        token = _token(Headers(scope=scope))
         role = self._logins.role_of(token)
         is_push = scope["type"] == "http" and scope["path"].startswith(PUSH)
         if is_push and (answered := _answer_to_push(scope)) is not None:
@@ -154,7 +152,7 @@ class AccessControl:
         if is_allowed:
             return ""
         origin = headers.get("origin")
-        if origin is not None and _split(origin).netloc.lower() != host.lower():
+        if origin is not None and origin.partition("//")[2].lower() != host.lower():
             return f"a page of {origin!r} may not use this panel"
         if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") not in (
             "navigate",
@@ -164,11 +162,11 @@ class AccessControl:
         return ""
 
     def _is_ours(self, host: str) -> bool:
-        name = _split(f"//{host}").hostname or ""
-        if name in self._names:
+        name = host_of(host)
+        if name in self._names or is_loopback(name):
             return True
         # An IP address, unlike a name, cannot be rebound.
-        return not self._is_local and _is_number(name)
+        return not self._is_local and is_numeric(name)
 
     async def _pass_on(self, scope: Scope, receive: Receive, send: Send, token: str) -> None:
         if scope["type"] == "websocket":
@@ -184,15 +182,7 @@ class AccessControl:
         if len(length) > MAX_DIGITS or int(length or 0) > limit:
             await answer(scope, receive, with_headers(send))
             return
-        began, received = False, 0
-
-        async def counted() -> Message:
-            nonlocal received
-            message = await receive()
-            received += len(message.get("body", b""))
-            if received > limit:
-                raise _TooLargeError(limit)
-            return message
+        began = False
 
         async def noted(message: Message) -> None:
             nonlocal began
@@ -205,7 +195,7 @@ class AccessControl:
 
         try:
             async with self._turn(scope):
-                await _answer(self.app, scope, counted, with_headers(noted))
+                await _answer(self.app, scope, _limited(receive, limit), with_headers(noted))
         except _TooLargeError:
             if not began:
                 await answer(scope, receive, with_headers(send))
@@ -250,7 +240,7 @@ class AccessControl:
         peer = str((scope.get("client") or ("",))[0])
         try:
             async with asyncio.timeout(LOGIN_S):
-                body = await _small_body(receive)
+                body = await Request(scope, _limited(receive, MAX_LOGIN_BODY)).body()
         except (TimeoutError, _TooLargeError, ClientDisconnect):
             return PlainTextResponse("the request is too large or too slow", HTTPStatus.BAD_REQUEST)
         if not self._logins.may_attempt(peer):
@@ -365,17 +355,19 @@ def _answer_to_push(scope: Scope) -> Response | None:
     return Response(status_code=HTTPStatus.NOT_FOUND)
 
 
-async def _small_body(receive: Receive) -> bytes:
-    body = bytearray()
-    while True:
+def _limited(receive: Receive, limit: int) -> Receive:
+    """Return a `receive` that raises `_TooLargeError` beyond a limit of bytes."""
+    received = 0
+
+    async def counted() -> Message:
+        nonlocal received
         message = await receive()
-        if message["type"] == "http.disconnect":
-            raise ClientDisconnect
-        body += message.get("body", b"")
-        if len(body) > MAX_LOGIN_BODY:
-            raise _TooLargeError(MAX_LOGIN_BODY)
-        if not message.get("more_body"):
-            return bytes(body)
+        received += len(message.get("body", b""))
+        if received > limit:
+            raise _TooLargeError(limit)
+        return message
+
+    return counted
 
 
 async def _refuse(
@@ -398,21 +390,3 @@ def _token(headers: Headers) -> str:
         if (token := cookie_parser(value).get(COOKIE)) is not None:
             return token
     return ""
-
-
-def _split(url: str) -> SplitResult:
-    """Return the parts of a URL; none if it is not valid."""
-    try:
-        parts = urlsplit(url)
-        _ = parts.hostname
-    except ValueError:
-        return urlsplit("")
-    return parts
-
-
-def _is_number(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True

@@ -12,8 +12,8 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
+from gateway.hub.endpoint import is_loopback
 from gateway.panel.admission import Holder, Places, Role, address_group
-from gateway.panel.panel_settings import LOOPBACK
 
 COST: Final = 1 << 15
 """scrypt's N, with r = 8 and p = 1: 32 MB and some 0.1 s for each login."""
@@ -159,7 +159,7 @@ class Logins:
         BusyError if too many wait.
         """
         address = address_group(host)
-        is_known = address in self._known or host in LOOPBACK
+        is_known = address in self._known or is_loopback(host)
         async with self._hashing.turn(address if is_known else _network(host), is_known=is_known):
             role = await asyncio.to_thread(self._role_of_password, password)
         if role is not None:

@@ -4,9 +4,9 @@ import base64
 import re
 from typing import Annotated, Final, Literal
 
+from gateway.hub.endpoint import is_loopback
 from gateway.settings import Settings, setting
 
-LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
 ORIGIN: Final = re.compile(r"https?://[a-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
 """Origin of a page as a browser writes it; the port only if it is not the default one."""
 LEAST_COST: Final = 1 << 14
@@ -151,7 +151,7 @@ class PanelSettings(Settings, frozen=True):
                 )
         if self.certificate_key and not self.certificate:
             raise ValueError("certificate_key is set: it needs a certificate")
-        if self.address in LOOPBACK:
+        if is_loopback(self.address):
             return
         if not self.password:
             raise ValueError(f"address {self.address!r} is not loopback: it needs a password")

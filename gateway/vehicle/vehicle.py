@@ -235,6 +235,11 @@ class Vehicle:
                 return []
         return [telemetry.set_home(Home(home, time_us))]
 
+    @property
+    def troubles(self) -> dict[str, str]:
+        """See `Announcer.troubles`."""
+        return self._announcements.troubles
+
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Action]:
         """Process the GPS latency that the estimator uses, and that of the settings, s."""
         return self._finish(self._announcements.on_latency(used_s, set_s, now_us))

@@ -403,7 +403,7 @@ def status(**changed: Any) -> dict[str, Any]:
     boards = [{"node": node, "sensors_present": 8, "chips": ["NEO-7M"]}]
     return {
         "time_us": 9_000_000, "report": report | changed, "simulated": False, "clients": [client],
-        "aircraft": [{"vehicle_id": 1, "boards": boards}], "recorder": None,
+        "aircraft": [{"vehicle_id": 1, "boards": boards, "troubles": {}}], "recorder": None,
         "listeners": [{"name": "udp-listen:14550", "reason": "", "state": "open", "clients": 1,
                        "turned_away": 2}],
     }  # fmt: skip
@@ -645,9 +645,10 @@ class TestEvents:
         build_banner(bench.context)
         [timer] = ElementFilter(kind=ui.timer)
         bench.fly()
-        bench.parts.watch.status = status(connected=False, sources=[])
+        bench.parts.watch.status = status()
+        bench.parts.watch.status["aircraft"][0]["troubles"] = {"link": "Receiver lost: /dev/ttyS0"}
         timer.callback()
-        assert texts() == ["Receiver lost", "/dev/ttyUSB0"]
+        assert texts() == ["Receiver lost: /dev/ttyS0", ""]
         vehicle = bench.context.vehicle
         assert vehicle is not None
         vehicle.origin = "recorded"

@@ -209,13 +209,16 @@ def test_link_and_nodes_are_reported() -> None:
     both = link(), link(GPS_NODE)
     vehicle.on_node_status(status(GPS_NODE, sensors_present=0b1000), 0)
     alive = link(last_time_us=30 * ONE_S), link(GPS_NODE, last_time_us=30 * ONE_S)
-    for time_s, found, expected in (
-        (1, report(*both), ["Receiver connected: /dev/ttyUSB0"]),
-        (9, report(link(last_time_us=9 * ONE_S), link(GPS_NODE)), ["GPS node 1 silent"]),
-        (20, report(*both, connected=False), ["Receiver lost: /dev/ttyUSB0"]),
-        (30, report(*alive), ["Receiver connected: /dev/ttyUSB0", "GPS node 1 is back"]),
+    silent = {"node 1": "GPS node 1 silent"}
+    lost = {"link": "Receiver lost: /dev/ttyUSB0"}
+    for time_s, found, expected, troubles in (
+        (1, report(*both), ["Receiver connected: /dev/ttyUSB0"], {}),
+        (9, report(link(last_time_us=9 * ONE_S), link(GPS_NODE)), [*silent.values()], silent),
+        (20, report(*both, connected=False), [*lost.values()], lost | silent),
+        (30, report(*alive), ["Receiver connected: /dev/ttyUSB0", "GPS node 1 is back"], {}),
     ):
         assert texts(vehicle.on_link(found, time_s * ONE_S)) == expected
+        assert vehicle.troubles == troubles
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from typing import Any, Final
 from nicegui import ui
 
 from gateway.clock import unix_time_us
-from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of, with_status
+from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of
 from gateway.panel.state.texts import TimedText
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets import Cells, DataTable
@@ -35,8 +35,7 @@ def build_banner(context: ViewContext) -> None:
             # Alerts of a recording would look like present ones.
             alerts = []
         else:
-            alerts = alerts_of(vehicle, context.now_us)
-            alerts = with_status(alerts, context.parts.watch.status, vehicle.system_id)
+            alerts = alerts_of(vehicle, context.parts.watch.status, context.now_us)
         if alerts == shown:
             return
         shown = alerts

@@ -7,8 +7,8 @@ from typing import Any, Final
 import segno
 from nicegui import ui
 
+from gateway.hub.endpoint import is_loopback
 from gateway.live.control_socket import ControlError
-from gateway.panel.panel_settings import LOOPBACK
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets import (
     Cells,
@@ -121,9 +121,9 @@ class LinkView:
             heading("Posts of a phone")
             request = ui.context.client.request
             self._base = str(request.base_url)
-            if self._context.parts.settings.address in LOOPBACK:
+            if is_loopback(self._context.parts.settings.address):
                 ui.label(f"{LOOPBACK_ONLY}.").classes("soft")
-            elif request.url.hostname in LOOPBACK:
+            elif is_loopback(request.url.hostname or ""):
                 ui.label(f"{OPEN_BY_ADDRESS}.").classes("soft")
             self._push_urls = ui.element("div")
         self._push.set_visibility(False)

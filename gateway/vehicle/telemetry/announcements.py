@@ -103,6 +103,15 @@ class Announcer:
         self._bucket = TokenBucket(US_PER_S / refill_us, bucket)
         self._next_id = 0
 
+    @property
+    def troubles(self) -> dict[str, str]:
+        """The texts of the severe states that are announced and last, by topic."""
+        return {
+            name: topic.text.text
+            for name, topic in self._topics.items()
+            if topic.text.severity <= CRITICAL and topic.announced == topic.state
+        }
+
     def track(self, finding: Finding, now_us: int) -> list[Answer]:
         """Note the present state of a topic, and announce it if it changed."""
         topic, state, text, causes = finding
