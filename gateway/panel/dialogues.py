@@ -45,7 +45,6 @@ class Dialogue:
 
     def load(self, now_us: int) -> list[Any]:
         """Request the parameters and their metadata; return the messages to send."""
-        self.files.refused.clear()
         found = self.parameters.load(now_us)
         if not self.metas:
             self._reading = GENERAL_PATHS[0]
@@ -89,7 +88,7 @@ class Dialogue:
         path, following = self._reading, None
         if path is None or self.files.busy:
             return []
-        content = self.files.files.pop(path, None)
+        content = self.files.content
         if content is None:
             following = GENERAL_PATHS[1] if path == GENERAL_PATHS[0] else None
         elif path in GENERAL_PATHS:

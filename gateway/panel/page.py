@@ -5,7 +5,6 @@ A view is one entry of `VIEWS`; see `view_context.py` for the interface of its f
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, Final
 
 from nicegui import ui
@@ -122,7 +121,6 @@ class _Page:
             self._theme.props('flat round dense aria-label="Light or dark"')
 
     def _build_playback_bar(self) -> None:
-        """Build the bar that marks a playback above every view."""
         with ui.element("div").classes("playback-bar").props("role=status") as self._bar:
             ui.icon("smart_display")
             self._bar_text = ui.label().classes("figure banner-title")
@@ -137,10 +135,8 @@ class _Page:
             self._waiting, self._waiting_lines = card, ui.element("div")
             if self._context.may_change:
                 link = ui.button("Add a source by its URL, or a phone by its QR code")
-                link.on_click(partial(self._go, "link")).props("no-caps dense")
-
-    def _go(self, key: str) -> None:
-        self._rail.run_method("show", key)
+                link.on_click(lambda: self._rail.run_method("show", "link"))
+                link.props("no-caps dense")
 
     def _show_waiting(self) -> None:
         is_waiting = not self._context.vehicles
@@ -209,7 +205,6 @@ class _Page:
                     ui.label(text).classes("chip").classes(kind)
 
     def _show_playback(self) -> None:
-        """Mark the page while it shows a recording."""
         playback, status = self._context.playback, self._context.playback.status
         shown = self._context.is_playback
         if shown != self._bar.visible:
@@ -252,7 +247,6 @@ def waiting_lines(status: Mapping[str, Any] | None) -> list[str]:
 
 
 def _mode_of(context: ViewContext) -> str:
-    """Return the source of the data."""
     status = context.parts.watch.status
     if status is None:
         return "MAVLink"

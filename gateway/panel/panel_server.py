@@ -59,6 +59,10 @@ RECONNECT_S: Final = 30.0
 LEAFLET: Final = Path(inspect.getfile(ui.leaflet)).parent / "dist" / "leaflet"
 """The style sheet of NiceGUI's map library."""
 
+HEAD: Final = """<link rel="stylesheet" href="/web/panel.css">
+<link rel="stylesheet" href="/web/tools.css"><link rel="stylesheet" href="/leaflet/leaflet.css">
+<script src="/web/telemetry_bus.js"></script>"""
+
 
 class PanelError(Exception):
     """The panel cannot be opened; the text gives the reason."""
@@ -179,35 +183,24 @@ def make_parts(
     fleet.on_discard(samples.discard)
     dialogues = Dialogues(fleet, uplink.send, clock)
     watch = GatewayWatch(control, fleet)
-    return PanelParts(
-        settings,
-        recordings,
-        clock,
-        fleet,
-        control,
-        uplink,
-        history,
-        samples,
-        dialogues,
-        watch,
+    jobs, tiles, logins = (
         RecordingJobs(),
         MapTiles(settings),
-        OpenPages(),
         Logins(settings.password, settings.viewer_password),
     )
-
-
-def _add_routers(app: FastAPI, parts: PanelParts) -> None:
-    pointing = pointing_router(parts.fleet, parts.clock)
-    push = push_router(parts.control, parts.logins.may_attempt)
-    for router in (*RestApi(parts.uplink).routers(), pointing, push):
-        app.include_router(router)
+    return PanelParts(
+        settings, recordings, clock, fleet, control, uplink, history, samples, dialogues, watch,
+        RecordingJobs(), MapTiles(settings), OpenPages(), logins,
+    )  # fmt: skip
 
 
 def make_app(parts: PanelParts) -> FastAPI:
     """Build the web application."""
     app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
-    _add_routers(app, parts)
+    pointing = pointing_router(parts.fleet, parts.clock)
+    push = push_router(parts.control, parts.logins.may_attempt)
+    for router in (*RestApi(parts.uplink).routers(), pointing, push):
+        app.include_router(router)
     telemetry = TelemetryFeed(parts.fleet, parts.clock)
 
     @app.websocket(PATH)
@@ -220,7 +213,7 @@ def make_app(parts: PanelParts) -> FastAPI:
     parts.jobs.serve(app)
     app.mount("/web", _CheckedFiles(directory=WEB))
     app.mount("/leaflet", _CheckedFiles(directory=LEAFLET))
-    _add_head()
+    ui.add_head_html(HEAD, shared=True)
     parts.pages.guard_socket()
 
     @ui.page("/")
@@ -268,14 +261,6 @@ async def _serve(
         parts.watch.close()
         parts.jobs.close()
         parts.uplink.close()
-
-
-def _add_head() -> None:
-    """Load the style sheets and the telemetry of every page."""
-    ui.add_head_html('<link rel="stylesheet" href="/web/panel.css">', shared=True)
-    ui.add_head_html('<link rel="stylesheet" href="/web/tools.css">', shared=True)
-    ui.add_head_html('<link rel="stylesheet" href="/leaflet/leaflet.css">', shared=True)
-    ui.add_head_html('<script src="/web/telemetry_bus.js"></script>', shared=True)
 
 
 class _CheckedFiles(StaticFiles):

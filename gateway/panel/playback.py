@@ -188,15 +188,15 @@ class Playback:
         Raises PlaybackError if no player runs, or it refuses the request.
         """
         async with self._ordering:
-            await self._order(verb, **params)
+            await self._order(verb, params)
 
     async def toggle(self) -> None:
         """Pause or resume; raises as `order`."""
         async with self._ordering:
             playing = (self.status or {}).get("state") == "playing"
-            await self._order("play.pause" if playing else "play.resume")
+            await self._order("play.pause" if playing else "play.resume", {})
 
-    async def _order(self, verb: str, **params: Any) -> None:
+    async def _order(self, verb: str, params: dict[str, Any]) -> None:
         """Send one request, and store its answer as the player's present state.
 
         One request at a time: otherwise an earlier answer could arrive after a later one.

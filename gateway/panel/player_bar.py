@@ -8,7 +8,7 @@ from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
-from gateway.panel.playback import SPEEDS, Playback, Profile
+from gateway.panel.playback import SPEEDS
 from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.widgets import notify_failure, progress_shown
 
@@ -67,8 +67,10 @@ class PlayerBar:
         self._fused_again.set_value(playback.has_fused_again)
         self._speed.set_value(speed)
         self._is_showing = False
+        # The height of the selected aircraft first.
+        order = sorted(playback.aircraft, key=lambda key: (key != self._context.system_id, key))
         new = {
-            "curves": _curves_of(playback, self._context.system_id),
+            "curves": [playback.aircraft[key].profile for key in order],
             "duration": status["duration_s"],
             "position": round(status["position_s"], 2),
             "playing": playing,
@@ -99,9 +101,3 @@ class PlayerBar:
         if self._is_showing:
             return None
         return self._play(self._playback.order, "play.speed", speed=float(event.value))
-
-
-def _curves_of(playback: Playback, system_id: int | None) -> list[Profile]:
-    """Return the heights of all played aircraft, those of the selected one first."""
-    order = sorted(playback.aircraft, key=lambda key: (key != system_id, key))
-    return [playback.aircraft[key].profile for key in order]

@@ -16,7 +16,7 @@ import time
 from collections import defaultdict
 from collections.abc import Hashable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 from zipfile import ZIP_DEFLATED, ZipFile
@@ -98,7 +98,7 @@ class _Export:
     """An exported file, or a running export."""
 
     role: Role | None
-    task: "asyncio.Task[Path] | None" = None
+    task: "asyncio.Task[Path]" = field(init=False)
     users: int = 0
     """Number of requests that have not fetched the file yet."""
     token: str = ""
@@ -147,16 +147,14 @@ class RecordingJobs:
                 raise ExportError("other exports are being made; try again in a while")
             export = self._exports[key] = _Export(holder.role)
             export.task = asyncio.create_task(self._export(key, export, order))
-        task = export.task
-        assert task is not None
         export.users += 1
         try:
-            await asyncio.shield(task)
+            await asyncio.shield(export.task)
         except asyncio.CancelledError:
             export.users -= 1
             if not export.users:
-                task.cancel()
-                await asyncio.wait([task])
+                export.task.cancel()
+                await asyncio.wait([export.task])
             raise
         return f"{EXPORTS}{export.token}"
 
@@ -165,8 +163,7 @@ class RecordingJobs:
         if self._indexing is not None:
             self._indexing.cancel()
         for export in self._exports.values():
-            if export.task is not None:
-                export.task.cancel()
+            export.task.cancel()
         self._exports.clear()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
@@ -177,7 +174,7 @@ class RecordingJobs:
         @app.get(EXPORTS + "{token}")
         async def _fetch(token: str) -> Response:
             for key, export in self._exports.items():
-                if token and export.token == token and export.task is not None:
+                if token and export.token == token:
                     file = export.task.result()
                     fetched = BackgroundTask(self._note_fetched, key, export)
                     return FileResponse(file, filename=file.name, background=fetched)

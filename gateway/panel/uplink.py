@@ -135,16 +135,18 @@ class Uplink:
     def __init__(
         self, url: str | None, fleet: FleetState, control: ControlClient, clock: GatewayClock
     ) -> None:
-        endpoints = () if url is None else (_trusting(url),)
         self.is_local = url is None
+        if url is not None and "trusted=" not in url:
+            # The operator has given it.
+            url = f"{url}{'&' if '?' in url else '?'}trusted=yes"
         self._fleet = fleet
         self._control = control
         self._clock = clock
         self._mav: Any = mavlink.MAVLink(
             None, SYSTEM_ID, FIRST_COMPONENT + os.getpid() % USER_COMPONENTS
         )
-        self._hub = self._make_hub(endpoints, played=False)
-        self._player_hub = self._make_hub((PLAYBACK_URL,), played=True)
+        self._hub = self._make_hub(url, played=False)
+        self._player_hub = self._make_hub(PLAYBACK_URL, played=True)
         self._senders: dict[tuple[int, int], Any] = {}
         self._listeners: list[Callable[[Any], None]] = []
         self._received_us = -SILENT_US
@@ -223,7 +225,7 @@ class Uplink:
             self._senders[key] = mavlink.MAVLink(None, *key)
         return self._senders[key]
 
-    def _make_hub(self, endpoints: tuple[str, ...], *, played: bool) -> Hub:
+    def _make_hub(self, url: str | None, *, played: bool) -> Hub:
         def on_frame(incoming: Incoming) -> None:
             # A broadcast also arrives as a foreign frame.
             if not incoming.forwarded:
@@ -233,7 +235,7 @@ class Uplink:
             for frame in frames:
                 self._handle(frame, played=played)
 
-        settings = HubSettings(endpoints=endpoints, ping_interval_s=0.0)
+        settings = HubSettings(endpoints=(url,) if url else (), ping_interval_s=0.0)
         return Hub(settings, on_frame, self._clock, on_foreign=on_foreign)
 
     def _handle(self, frame: bytes, *, played: bool) -> None:
@@ -249,15 +251,12 @@ class Uplink:
         if not played and message.get_srcSystem() != SYSTEM_ID:
             self._received_us = now_us
         if message.get_type() == "COMMAND_ACK":
-            self._note_ack(message)
+            waiting = self._acks.get((message.get_srcSystem(), message.command))
+            if waiting is not None:
+                waiting.put_nowait(message.result)
         self._fleet.update(message, now_us)
         for listener in self._listeners:
             listener(message)
-
-    def _note_ack(self, message: Any) -> None:
-        waiting = self._acks.get((message.get_srcSystem(), message.command))
-        if waiting is not None:
-            waiting.put_nowait(message.result)
 
     async def _keep_alive(self) -> None:
         beat = mavlink.MAVLink_heartbeat_message(
@@ -304,10 +303,3 @@ async def _outcome(results: asyncio.Queue[int]) -> int:
         async with asyncio.timeout(PROGRESS_TIMEOUT_S):
             result = await results.get()
     return result
-
-
-def _trusting(url: str) -> str:
-    """Trust the peers of a URL, because the operator has given it."""
-    if "trusted=" in url:
-        return url
-    return f"{url}{'&' if '?' in url else '?'}trusted=yes"

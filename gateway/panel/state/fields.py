@@ -1,6 +1,8 @@
 """Received numeric fields over the last minutes, by aircraft and message; as CSV."""
 
 import math
+from array import array
+from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from functools import partial
 from operator import attrgetter
@@ -19,7 +21,6 @@ MAX_RATE_HZ: Final = 50
 """Maximum rate; faster messages are thinned, since no strip chart of minutes has more columns."""
 LEAST_GAP_US: Final = US_PER_S * 3 // (4 * MAX_RATE_HZ)
 """Least interval, shorter than that of the rate, so that jitter does not drop messages at it."""
-MAX_ROWS: Final = SPAN_US // LEAST_GAP_US
 ANGLES: Final = {"rad": (math.degrees(1.0), "°"), "rad/s": (math.degrees(1.0), "°/s")}
 SHOWN_UNITS: Final = ANGLES | {
     "degE7": (DEG_PER_DEGE7, "°"), "cdeg": (1e-2, "°"), "cm/s": (1e-2, "m/s"),
@@ -30,7 +31,6 @@ UNIT_TEXTS: Final = {
     "deg": "°", "deg/s": "°/s", "m/s/s": "m/s²", "m/s2": "m/s²", "m/s^2": "m/s²", "uT": "µT",
     "degC": "°C", "us": "µs", "m2": "m²",
 }  # fmt: skip
-FIRST_ROWS: Final = 256
 MAX_KINDS: Final = 200
 """Maximum messages of one aircraft, each instance counted; more are forged."""
 MAX_ARRAY: Final = 32
@@ -95,63 +95,38 @@ class FieldHistory:
 
 
 class _Columns:
-    """A ring of rows, which grows to hold `SPAN_US`, and never beyond `MAX_ROWS`."""
+    """Rows of the last `SPAN_US`, and up to a quarter more, so that they are seldom moved."""
 
     def __init__(self, message: Any) -> None:
         self._readers = _readers_of(message)
         self.names = tuple(sorted(self._readers))
         self._index = {name: n for n, name in enumerate(self._readers)}
         self._units: dict[str, str] = getattr(message, "fieldunits_by_name", {})
-        self._time_us = np.zeros(FIRST_ROWS, np.int64)
-        self._values = np.zeros((FIRST_ROWS, len(self._readers)))
-        self._count = 0
-        """The newest row is at `(count - 1) % capacity`, the oldest of a full ring after it."""
+        self._time_us = array("q")
+        self._values = array("d")
+        """Row after row."""
 
     def unit(self, field: str) -> str:
         return self._units.get(field.partition("[")[0], "")
 
-    @property
-    def capacity(self) -> int:
-        return len(self._time_us)
-
     def add(self, message: Any, now_us: int) -> None:
-        if self._count:
-            last_us = int(self._time_us[(self._count - 1) % self.capacity])
-            if now_us - last_us < LEAST_GAP_US:
-                return
-        oldest_us = int(self._time_us[self._count % self.capacity])
-        is_full = self._count >= self.capacity
-        if is_full and self.capacity < MAX_ROWS and now_us - oldest_us <= SPAN_US:
-            self._grow(min(2 * self.capacity, MAX_ROWS))
-        row = self._count % self.capacity
-        self._time_us[row] = now_us
-        self._values[row] = [read(message) for read in self._readers.values()]
-        self._count += 1
+        times_us = self._time_us
+        if times_us and now_us - times_us[-1] < LEAST_GAP_US:
+            return
+        times_us.append(now_us)
+        self._values.extend(read(message) for read in self._readers.values())
+        if now_us - times_us[0] > SPAN_US * 5 // 4:
+            old = bisect_left(times_us, now_us - SPAN_US)
+            del times_us[:old], self._values[: old * len(self._readers)]
 
     def column(
         self, field: str, after_us: int, until_us: int | None
     ) -> tuple[IntArray, FloatArray]:
-        order = self._order()
-        time_us = self._time_us[order]
-        newest_us = int(time_us[-1]) if len(time_us) else 0
-        begin = np.searchsorted(time_us, max(after_us, newest_us - SPAN_US), "right")
+        time_us = np.array(self._time_us)
+        begin = np.searchsorted(time_us, max(after_us, time_us[-1] - SPAN_US), "right")
         end = len(time_us) if until_us is None else np.searchsorted(time_us, until_us, "right")
-        values = self._values[order[begin:end], self._index[field]]
-        return time_us[begin:end], values
-
-    def _order(self) -> IntArray:
-        capacity = self.capacity
-        if self._count <= capacity:
-            return np.arange(self._count)
-        return np.arange(self._count - capacity, self._count) % capacity
-
-    def _grow(self, capacity: int) -> None:
-        order, more = self._order(), capacity - self.capacity
-        self._time_us = np.concatenate([self._time_us[order], np.zeros(more, np.int64)])
-        self._values = np.concatenate(
-            [self._values[order], np.zeros((more, self._values.shape[1]))]
-        )
-        self._count = len(order)
+        values = np.array(self._values[self._index[field] :: len(self._readers)])
+        return time_us[begin:end], values[begin:end]
 
 
 def _readers_of(message: Any) -> dict[str, Callable[[Any], float]]:

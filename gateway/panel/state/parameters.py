@@ -11,7 +11,7 @@ import math
 import struct
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final
 
@@ -55,24 +55,16 @@ ERRORS: Final = {
 }
 
 
-@dataclass(slots=True)
-class _Reading:
-    path: str
-    session: int | None = None
-    size: int = 0
-    content: bytearray = field(default_factory=bytearray)
-
-
 class FileClient:
-    """Read files of one vehicle; results are in `files` and `refused`."""
+    """Read a file of one vehicle, one at a time."""
 
     def __init__(self, system_id: int) -> None:
         self.system_id = system_id
-        self.files: dict[str, bytes] = {}
-        self.refused: set[str] = set()
-        """Files that do not exist, or could not be read."""
-        self._wanted: list[str] = []
-        self._reading: _Reading | None = None
+        self.content: bytes | None = None
+        """The last file; None while it is read, or if it cannot be read."""
+        self._read = bytearray()
+        self._session: int | None = None
+        self._size = 0
         self._sequence = 0
         self._request: Packet | None = None
         self._attempts = 0
@@ -81,25 +73,24 @@ class FileClient:
     @property
     def busy(self) -> bool:
         """Whether a file is being read."""
-        return self._reading is not None
+        return self._request is not None
 
     def read(self, path: str, now_us: int) -> list[Any]:
-        """Start reading a file, or queue it; return the messages to send."""
-        self._wanted.append(path)
-        return [] if self.busy else self._next(now_us)
+        """Start reading a file; return the messages to send."""
+        self.content, self._read, self._session = None, bytearray(), None
+        return self._ask(Opcode.OPEN_FILE_RO, 0, 0, path.encode(), now_us)
 
     def handle(self, message: Any, now_us: int) -> list[Any]:
         """Handle one message of the vehicle; return the messages to send."""
         if message.get_type() != "FILE_TRANSFER_PROTOCOL" or self._request is None:
             return []
         packet = decode_packet(bytes(message.payload))
-        if packet.sequence != (self._request.sequence + 1) & 0xFFFF:
-            return []
-        if packet.request_opcode != self._request.opcode or self._reading is None:
+        expected = (self._request.sequence + 1) & 0xFFFF, self._request.opcode
+        if (packet.sequence, packet.request_opcode) != expected:
             return []
         if packet.opcode == ACK:
-            return self._on_ack(self._reading, packet, now_us)
-        ended = packet.data[:1] == bytes([FtpError.EOF]) and self._reading.session is not None
+            return self._on_ack(packet, now_us)
+        ended = packet.data[:1] == bytes([FtpError.EOF]) and self._session is not None
         return self._end(now_us, read=ended) if packet.opcode == NAK else []
 
     def poll(self, now_us: int) -> list[Any]:
@@ -112,43 +103,31 @@ class FileClient:
         self._attempts += 1
         return [self._message(self._request)]
 
-    def _on_ack(self, reading: _Reading, packet: Packet, now_us: int) -> list[Any]:
+    def _on_ack(self, packet: Packet, now_us: int) -> list[Any]:
+        have = self._read
         if packet.request_opcode == Opcode.OPEN_FILE_RO:
-            reading.session = packet.session
-            reading.size = struct.unpack("<I", packet.data.ljust(4, b"\0")[:4])[0]
-            if reading.size > MAX_FILE:
+            self._session = packet.session
+            self._size = struct.unpack("<I", packet.data.ljust(4, b"\0")[:4])[0]
+            if self._size > MAX_FILE:
                 return self._end(now_us, read=False)
         elif packet.request_opcode == Opcode.READ_FILE:
-            if packet.offset == len(reading.content):
-                reading.content += packet.data
+            if packet.offset == len(have):
+                have += packet.data
             if not packet.data:
                 return self._end(now_us, read=False)
-        if len(reading.content) >= reading.size:
+        if len(have) >= self._size:
             return self._end(now_us, read=True)
-        offset, session = len(reading.content), reading.session or 0
-        size = min(MAX_DATA, reading.size - offset)
-        return self._ask(Opcode.READ_FILE, session, offset, b"", now_us, size=size)
+        size = min(MAX_DATA, self._size - len(have))
+        return self._ask(Opcode.READ_FILE, self._session or 0, len(have), b"", now_us, size=size)
 
     def _end(self, now_us: int, *, read: bool) -> list[Any]:
-        reading, self._reading, self._request = self._reading, None, None
-        found: list[Any] = []
-        if reading is not None:
-            if read:
-                self.files[reading.path] = bytes(reading.content)
-            else:
-                self.refused.add(reading.path)
-            if reading.session is not None:
-                found += self._ask(Opcode.TERMINATE_SESSION, reading.session, 0, b"", now_us)
-                # Not repeated if it is lost: the server closes old sessions by itself.
-                self._request = None
-        return found + self._next(now_us)
-
-    def _next(self, now_us: int) -> list[Any]:
-        if not self._wanted:
-            return []
-        path = self._wanted.pop(0)
-        self._reading = _Reading(path)
-        return self._ask(Opcode.OPEN_FILE_RO, 0, 0, path.encode(), now_us)
+        self.content = bytes(self._read) if read else None
+        found = []
+        if self._session is not None:
+            found = self._ask(Opcode.TERMINATE_SESSION, self._session, 0, b"", now_us)
+        # Not repeated if it is lost: the server closes old sessions by itself.
+        self._request = None
+        return found
 
     def _ask(
         self, opcode: Opcode, session: int, offset: int, data: bytes, now_us: int, *, size: int = 0

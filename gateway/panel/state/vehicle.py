@@ -87,12 +87,6 @@ class VehicleState:
         self.fixes.clear()
         self.generation += 1
 
-    @property
-    def _moved_us(self) -> int:
-        """When the newest attitude or position was received; 0 before the first."""
-        heard_us = (self.state.heard_us.get(name, 0) for name in ATTITUDES)
-        return max(*heard_us, self.state.position_us, 0)
-
     def silent_s(self, now_us: int) -> float:
         """Return the time since the newest heartbeat; infinite before the first."""
         return self.state.age_us(now_us, "HEARTBEAT") / US_PER_S
@@ -122,9 +116,10 @@ class VehicleState:
         state, gps = self.state, self.state.fix()
         (q_nb, rates), (battery_v, battery_percent) = state.attitude(), state.battery()
         at, hud = state.position or UNKNOWN_POSITION, state.fields.get("VFR_HUD")
+        attitudes_us = (state.heard_us.get(name, 0) for name in ATTITUDES)
         return Instant(
             system_id=self.system_id,
-            time_us=self._moved_us,
+            time_us=max(*attitudes_us, state.position_us, 0),
             title=self.title,
             model=self.model,
             origin=self.origin,

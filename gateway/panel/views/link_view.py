@@ -63,10 +63,8 @@ class LinkView:
                 self._receiver = ui.label(UNKNOWN).classes("figure").props("data-role=receiver")
                 if context.may_change:
                     self._build_serial()
-                self._nodes = DataTable(
-                    NODE_COLUMNS,
-                    "No node was received.",
-                ).props("data-role=nodes")
+                self._nodes = DataTable(NODE_COLUMNS, "No node was received.")
+                self._nodes.props("data-role=nodes")
             with ui.element("div").classes("card padded wide"):
                 heading("Sources")
                 self._sources = DataTable(
@@ -210,17 +208,16 @@ class LinkView:
         self._nodes.set_visibility(status["report"]["port"] != NO_RECEIVER)
         now_us = status["report"]["time_us"]
         boards = {_key_of(b): b for one in status["aircraft"] for b in one["boards"]}
+        nodes = {_key_of(node): node for node in status["report"]["nodes"]}
         self._nodes.show(
-            {
-                (key := _key_of(node)): _node_row(node, now_us, boards.get(key))
-                for node in status["report"]["nodes"]
-            }
+            {key: _node_row(node, now_us, boards.get(key)) for key, node in nodes.items()}
         )
         self._sources.show(
             {source["url"]: _source_row(source, now_us) for source in status["report"]["sources"]}
         )
-        before = {} if watch.before is None else _sent_by_client(watch.before)
-        span_s = (status["time_us"] - (watch.before or status)["time_us"]) / US_PER_S
+        former = watch.before or {"clients": (), "time_us": status["time_us"]}
+        before = {client["client_id"]: client["sent"] for client in former["clients"]}
+        span_s = (status["time_us"] - former["time_us"]) / US_PER_S
         self._clients.show(
             {
                 client["name"]: _client_row(client, status["time_us"], before, span_s)
@@ -321,10 +318,6 @@ def _source_row(source: Record, now_us: int) -> Cells:
         age,
         (faults or "none", "warn" if faults else ""),
     )
-
-
-def _sent_by_client(status: Record) -> dict[int, int]:
-    return {client["client_id"]: client["sent"] for client in status["clients"]}
 
 
 def _client_row(client: Record, now_us: int, before: dict[int, int], span_s: float) -> Cells:

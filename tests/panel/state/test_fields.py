@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.fields import MAX_KINDS, MAX_ROWS, SPAN_US, FieldHistory, fields_csv
+from gateway.panel.state.fields import LEAST_GAP_US, MAX_KINDS, SPAN_US, FieldHistory, fields_csv
 from gateway.units import US_PER_S
 from tests.kit.memory import size_of
 
@@ -59,7 +59,7 @@ def test_history_is_bounded_to_the_newest_minutes() -> None:
     for n in range(42_000):
         history.add(1, attitude(float(n)), n * 10_000)
     time_us, values = history.series(1, "ATTITUDE.roll")
-    assert len(time_us) <= MAX_ROWS
+    assert len(time_us) <= SPAN_US // LEAST_GAP_US
     assert time_us[-1] - time_us[0] == pytest.approx(SPAN_US, rel=0.01)
     assert values[-1] == pytest.approx(41_999, abs=2)
     assert np.all(np.diff(time_us) > 0)
