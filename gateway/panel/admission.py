@@ -87,10 +87,6 @@ class Places(Generic[Item]):
         """Return the holder of an item."""
         return self._held.get(item)
 
-    def items(self) -> list[Item]:
-        """Return all items, oldest first."""
-        return [*self._held]
-
 
 def address_group(host: str) -> str:
     """Return the key of the limit of an address: the address, or the network of an IPv6 one."""

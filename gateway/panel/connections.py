@@ -43,8 +43,6 @@ class ConnectionLimits:
         self._places: Places[Client] = Places(
             CONNECTIONS_OF_SESSION, CONNECTIONS_OF_ADDRESS, CONNECTIONS_OF_ROLE, self.shut
         )
-        self.refused = 0
-        """Connections that were closed to keep to the limits."""
 
     def admit(self, client: Client, sock: socket.socket) -> None:
         """Add a connection; an older one without a holder may be closed for it."""
@@ -61,7 +59,6 @@ class ConnectionLimits:
 
     def shut(self, client: Client) -> None:
         """Close a connection, and discard data that waits to be sent."""
-        self.refused += 1
         sock = self._sockets.pop(client, None)
         self._places.release(client)
         with suppress(OSError):

@@ -22,7 +22,7 @@ from gateway.panel.views.link_view import LinkView
 from gateway.panel.views.plots_view import PlotsView
 from gateway.panel.views.recordings_view import RecordingsView
 from gateway.panel.views.tuning_view import TuningView
-from gateway.panel.widgets import notify_failure
+from gateway.panel.widgets import icon_button, notify_failure
 from gateway.printable import NO_RECEIVER, printable, receiver_state
 from gateway.units import counted
 
@@ -117,8 +117,7 @@ class _Page:
                 on_change=self._on_units,
             ).classes("choice")
             units.props('dense options-dense borderless aria-label="Units"')
-            self._theme = ui.button(icon=THEMES[None], on_click=self._next_theme)
-            self._theme.props('flat round dense aria-label="Light or dark"')
+            self._theme = icon_button(THEMES[None], "Light or dark", self._next_theme)
 
     def _build_playback_bar(self) -> None:
         with ui.element("div").classes("playback-bar").props("role=status") as self._bar:

@@ -21,7 +21,6 @@ from nicegui import ui
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.staticfiles import StaticFiles
-from starlette.websockets import WebSocket
 
 from gateway.clock import GatewayClock
 from gateway.hub.stats import LogRateLimiter
@@ -183,11 +182,7 @@ def make_parts(
     fleet.on_discard(samples.discard)
     dialogues = Dialogues(fleet, uplink.send, clock)
     watch = GatewayWatch(control, fleet)
-    jobs, tiles, logins = (
-        RecordingJobs(),
-        MapTiles(settings),
-        Logins(settings.password, settings.viewer_password),
-    )
+    logins = Logins(settings.password, settings.viewer_password)
     return PanelParts(
         settings, recordings, clock, fleet, control, uplink, history, samples, dialogues, watch,
         RecordingJobs(), MapTiles(settings), OpenPages(), logins,
@@ -201,12 +196,7 @@ def make_app(parts: PanelParts) -> FastAPI:
     push = push_router(parts.control, parts.logins.may_attempt)
     for router in (*RestApi(parts.uplink).routers(), pointing, push):
         app.include_router(router)
-    telemetry = TelemetryFeed(parts.fleet, parts.clock)
-
-    @app.websocket(PATH)
-    async def _telemetry(websocket: WebSocket) -> None:
-        await telemetry.serve(websocket)
-
+    app.add_api_websocket_route(PATH, TelemetryFeed(parts.fleet, parts.clock).serve)
     add_tracks(app, parts.fleet)
     parts.tiles.serve(app)
     add_recording_files(app, lambda: parts.recordings_folder)

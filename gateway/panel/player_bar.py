@@ -10,7 +10,7 @@ from nicegui.events import GenericEventArguments
 
 from gateway.panel.playback import SPEEDS
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.widgets import notify_failure, progress_shown
+from gateway.panel.widgets import icon_button, notify_failure, progress_shown
 
 POSITION_S: Final = 0.25
 
@@ -39,8 +39,7 @@ class PlayerBar:
             self._toggle.props('round dense aria-label="Play or pause" title="Space"')
             for icon, to, title in (("replay_10", "-10", "Back"), ("forward_10", "+10", "Ahead")):
                 seek = partial(self._play, self._playback.order, "seek", to=to)
-                button = ui.button(icon=icon, on_click=seek)
-                button.props("flat round dense").props["aria-label"] = f"{title} ten seconds"
+                icon_button(icon, f"{title} ten seconds", seek)
             self._slider = TimeSlider()
             self._slider.on("seek", self._on_seek)
             self._speed = ui.select(
@@ -48,8 +47,7 @@ class PlayerBar:
             )
             self._speed.props('dense borderless options-dense aria-label="Speed"')
             self._fused_again = ui.switch("fused again next to it", on_change=self._on_fused_again)
-            close = ui.button(icon="close", on_click=partial(self._play, self._playback.close))
-            close.props('flat round dense aria-label="Close the playback"')
+            icon_button("close", "Close the playback", partial(self._play, self._playback.close))
         self._bar.set_visibility(False)
         self._is_showing = False
         """Whether the controls are being set from the player's state, not by the user."""

@@ -105,8 +105,6 @@ class MessageBook:
         self._received: set[tuple[int, int]] = set()
         self._kinds: Counter[int] = Counter()
         """Entries by system."""
-        self.dropped = 0
-        """Number of entries that were dropped to make room for others."""
 
     def add(self, message: Any, *, is_sent: bool = False) -> None:
         """Add one message, received or sent from here."""
@@ -134,7 +132,6 @@ class MessageBook:
         for key in keys[: max(1, len(keys) // DROPPED_SHARE)]:
             del self._entries[key]
             self._kinds[key[0]] -= 1
-            self.dropped += 1
 
     def has_heard(self, system_id: int, component_id: int) -> bool:
         """Return whether a message was received from a component."""
@@ -189,7 +186,6 @@ class Subscriber:
     def __init__(self, names: Set[str], systems: SystemFilter) -> None:
         self.names = names
         self.systems = systems
-        self.dropped = 0
         self._waiting: deque[str | bytes] = deque()
         self._bytes = 0
         self._has_waiting = asyncio.Event()
@@ -200,7 +196,6 @@ class Subscriber:
         self._bytes += len(data)
         while self._bytes > MAX_WAITING_BYTES:
             self._bytes -= len(self._waiting.popleft())
-            self.dropped += 1
         self._has_waiting.set()
 
     async def next(self) -> str | bytes:
@@ -274,15 +269,14 @@ class RestApi:
         """Return the routers to include in an application."""
         service = APIRouter(tags=["service"])
         service.add_api_route("/info", self.info)
-        for path in ("/v1/info", f"{PREFIX}/info", f"{PREFIX}/v1/info"):
-            service.add_api_route(path, self.info, include_in_schema=False)
         service.add_api_route("/docs", _docs, include_in_schema=False)
-        prefixes = ("", f"{PREFIX}/v1", PREFIX)
-        return [
-            service,
-            self._router("/v1", shown=True),
-            *(self._router(prefix, shown=False) for prefix in prefixes),
-        ]
+        routers = [service]
+        for prefix in ("/v1", "", f"{PREFIX}/v1", PREFIX):
+            shown = prefix == "/v1"
+            routers.append(self._router(prefix, shown=shown))
+            if prefix:
+                service.add_api_route(f"{prefix}/info", self.info, include_in_schema=False)
+        return routers
 
     async def info(self) -> Response:
         """Return name and version of the program."""
@@ -494,15 +488,15 @@ async def encode_in_pieces(value: Any, turn: asyncio.Lock) -> AsyncIterator[byte
 
     Of all answers that share a lock, only one encodes a piece in a turn of the loop.
     """
-    parts, is_left = encode(value), True
-    while is_left:
+    parts = encode(value)
+    while True:
         piece = b""
         async with turn:
-            while is_left and len(piece) < PIECE:
-                part = next(parts, None)
-                is_left = part is not None
-                piece += part or b""
+            while len(piece) < PIECE and (part := next(parts, b"")):
+                piece += part
             await asyncio.sleep(0)
+        if not piece:
+            return
         yield piece
 
 

@@ -47,6 +47,22 @@ def heading(text: str) -> TextElement:
     return TextElement(tag="h2", text=text).classes("title")
 
 
+def icon_button(icon: str, title: str, act: Callable[..., Any]) -> ui.button:
+    """Add a round button with an icon; the title is its tooltip, and read by screen readers."""
+    button = ui.button(icon=icon, on_click=act).props("flat round dense")
+    button.props["aria-label"] = button.props["title"] = title
+    return button
+
+
+def choice(
+    label: str, options: Any, value: Any, on_change: Callable[..., Any] | None = None
+) -> ui.select:
+    """Add a choice with a label that screen readers read."""
+    select = ui.select(options, value=value, on_change=on_change)
+    select.props("dense outlined options-dense").props["aria-label"] = label
+    return select
+
+
 class UploadButton(Element, component=WEB / "upload_button.js"):
     """Upload a file; emits `uploaded` with the result, which is also shown on the page."""
 

@@ -90,7 +90,6 @@ def test_forged_ids_are_dropped_before_entries_that_are_updated(
     everything = book.look_up("")["vehicles"]
     kept = everything["1"]["components"] if of_system else everything
     assert len(kept) == 3
-    assert book.dropped >= 5
 
 
 async def test_pieces_of_a_tree_are_as_one(

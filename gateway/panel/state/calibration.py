@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mavlink
+from scipy.spatial import ConvexHull
 
 from gateway.panel.state.commands import command_long, result_text
 from gateway.records import NAN
@@ -19,13 +20,10 @@ from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S, UT_PER_GAUSS
 FloatArray = NDArray[np.float64]
 
 _GOLDEN: Final = (1.0 + math.sqrt(5.0)) / 2.0
-_FACES: Final = (
-    (0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11),
-    (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8),
-    (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9),
-    (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1),
-)  # fmt: skip
 MILLI: Final = 1e-3
+_MILLI: Final = (MILLI * STANDARD_GRAVITY_MPS2, MILLI, MILLI * UT_PER_GAUSS)
+SCALES: Final = {"HIGHRES_IMU": (1.0, 1.0, UT_PER_GAUSS), "SCALED_IMU": _MILLI, "RAW_IMU": _MILLI}
+"""Units of specific force, rate and field in a message, m/s2, rad/s and uT."""
 NO_ANSWER_US: Final = 4 * US_PER_S
 """Timeout of the answer to the command, from the last message of the vehicle."""
 GIVEN_UP_US: Final = 200 * US_PER_S
@@ -68,15 +66,11 @@ _Vector = tuple[float, float, float]
 
 
 def _make_cells() -> FloatArray:
-    a, b = 1.0, _GOLDEN
-    corners = np.array(
-        [
-            (-a, b, 0), (a, b, 0), (-a, -b, 0), (a, -b, 0), (0, -a, b), (0, a, b),
-            (0, -a, -b), (0, a, -b), (b, 0, -a), (b, 0, a), (-b, 0, -a), (-b, 0, a),
-        ]
-    )  # fmt: skip
+    edges = [(0.0, s, t * _GOLDEN) for s in (-1.0, 1.0) for t in (-1.0, 1.0)]
+    corners = np.array([np.roll(edge, n) for n in range(3) for edge in edges])
     cells = []
-    for face in _FACES:
+    # The faces of an icosahedron, each divided into four.
+    for face in ConvexHull(corners).simplices:
         p, q, r = (_unit(corners[n]) for n in face)
         pq, qr, rp = _unit(p + q), _unit(q + r), _unit(r + p)
         cells += [(p, pq, rp), (q, qr, pq), (r, rp, qr), (pq, qr, rp)]
@@ -97,12 +91,10 @@ def seen_cells(vectors: FloatArray) -> list[bool]:
 
     They may have any length but zero; rows that are not finite are ignored.
     """
-    seen = [False] * len(CELLS)
-    finite = vectors[np.isfinite(vectors).all(axis=1)] if len(vectors) else vectors
-    if len(finite):
-        for cell in np.unique((finite @ _MIDDLES.T).argmax(axis=1)).tolist():
-            seen[cell] = True
-    return seen
+    finite = vectors[np.isfinite(vectors).all(axis=1)]
+    nearest = (finite @ _MIDDLES.T).argmax(axis=1)
+    found: list[bool] = np.isin(np.arange(len(CELLS)), nearest).tolist()
+    return found
 
 
 class CalibrationStep(StrEnum):
@@ -153,9 +145,9 @@ class Residual:
 
 @dataclass(slots=True)
 class _Samples:
-    accel: list[_Vector] = field(default_factory=list)
-    gyro: list[_Vector] = field(default_factory=list)
-    mag: list[_Vector] = field(default_factory=list)
+    accel: list[FloatArray] = field(default_factory=list)
+    gyro: list[FloatArray] = field(default_factory=list)
+    mag: list[FloatArray] = field(default_factory=list)
 
 
 class CalibrationRun:
@@ -192,10 +184,8 @@ class CalibrationRun:
                 self._handle_ack(message, now_us)
             case "STATUSTEXT":
                 self._handle_text(message.text, now_us)
-            case "HIGHRES_IMU":
-                self._add_sample(_highres(message))
-            case "SCALED_IMU" | "RAW_IMU":
-                self._add_sample(_milli(message))
+            case kind if kind in SCALES:
+                self._add_sample(*_sample(message, *SCALES[kind]))
 
     def poll(self, now_us: int) -> None:
         """Fail if an answer is missing; end the evaluation after its time."""
@@ -228,8 +218,6 @@ class CalibrationRun:
 
     def cover(self) -> list[bool]:
         """Return, for each of `CELLS`, whether the magnetic field was measured in it."""
-        if not self._before.mag:
-            return [False] * len(CELLS)
         centre, _ = self.sphere()
         return seen_cells(self.field_points - centre)
 
@@ -294,12 +282,12 @@ class CalibrationRun:
         if self.state is not RunState.FAILED:
             self.state, self.trouble = RunState.FAILED, why
 
-    def _add_sample(self, sample: tuple[_Vector, _Vector, _Vector | None]) -> None:
+    def _add_sample(self, accel: FloatArray, gyro: FloatArray, mag: FloatArray) -> None:
         into = {RunState.RUNNING: self._before, RunState.CHECKING: self._after}.get(self.state)
         if into is None:
             return
-        accel, gyro, mag = sample
-        if mag is not None and len(into.mag) < MAX_SAMPLES:
+        # Zero is the field of a vehicle without a magnetometer.
+        if np.isfinite(mag).all() and mag.any() and len(into.mag) < MAX_SAMPLES:
             into.mag.append(mag)
         if len(into.accel) >= MAX_SAMPLES:
             del into.accel[0], into.gyro[0]
@@ -345,24 +333,10 @@ class CalibrationRun:
         return _rms(strength - strength.mean()), after
 
 
-def _highres(message: Any) -> tuple[_Vector, _Vector, _Vector | None]:
-    mag = (message.xmag, message.ymag, message.zmag)
-    known = all(math.isfinite(v) for v in mag) and any(mag)
-    return (
-        (message.xacc, message.yacc, message.zacc),
-        (message.xgyro, message.ygyro, message.zgyro),
-        (mag[0] * UT_PER_GAUSS, mag[1] * UT_PER_GAUSS, mag[2] * UT_PER_GAUSS) if known else None,
-    )
-
-
-def _milli(message: Any) -> tuple[_Vector, _Vector, _Vector | None]:
-    g, ut = STANDARD_GRAVITY_MPS2 * MILLI, UT_PER_GAUSS * MILLI
-    mag = (message.xmag, message.ymag, message.zmag)
-    return (
-        (message.xacc * g, message.yacc * g, message.zacc * g),
-        (message.xgyro * MILLI, message.ygyro * MILLI, message.zgyro * MILLI),
-        (mag[0] * ut, mag[1] * ut, mag[2] * ut) if any(mag) else None,
-    )
+def _sample(message: Any, *scales: float) -> Iterator[FloatArray]:
+    """Return specific force, angular rate and magnetic field of a message, in SI and uT."""
+    for name, scale in zip(("acc", "gyro", "mag"), scales, strict=True):
+        yield np.array([getattr(message, f"{axis}{name}") for axis in "xyz"]) * scale
 
 
 def _rate_degps(samples: _Samples) -> float:

@@ -20,7 +20,7 @@ from gateway.panel.state.calibration import (
 from gateway.panel.state.fields import FloatArray, parameter_unit
 from gateway.panel.state.parameters import ListState
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.widgets import DataTable, allow, heading, store_parameters
+from gateway.panel.widgets import DataTable, allow, choice, heading, store_parameters
 from gateway.printable import UNKNOWN, figure, printable
 
 REFRESH_S: Final = 0.2
@@ -111,10 +111,7 @@ class CalibrationView:
             self._outcomes[run.step] = ("done", "good") if done else ("failed", "bad")
         ready = dialogue is not None and dialogue.parameters.state is ListState.COMPLETE
         for step, (card, state) in self._steps.items():
-            if step is self._step:
-                card.props("aria-current=step")
-            else:
-                card.props(remove="aria-current")
+            card.props.set_optional("aria-current", "step" if step is self._step else None)
             outcome, look = self._outcomes.get(step, ("", ""))
             state.classes(look, replace="state").set_text(outcome)
         # Not for each state of a run, since replaced buttons would lose clicks and the focus.
@@ -208,8 +205,7 @@ class CalibrationView:
                     ui.label(angles).classes("soft")
                 card.on("click", partial(self._choose, name))
                 self._pictures[name] = card
-        self._choice = ui.select([*ORIENTATIONS, MEASURED])
-        self._choice.props('dense outlined options-dense aria-label="Orientation of the board"')
+        self._choice = choice("Orientation of the board", [*ORIENTATIONS, MEASURED], None)
         with ui.element("div").classes("buttons"):
             self._buttons = {
                 "use": _button("Use it", "check", self._mount),
@@ -355,28 +351,20 @@ class CalibrationView:
             self._sphere.show((points - (x, y, z)) / radius, seen)
         left = len(seen) - sum(seen)
         enough = "well covered" if sum(seen) >= MIN_CELLS else f"{left} directions uncovered"
-        texts = (
-            (UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN)
-            if not len(points)
-            else (
-                str(len(points)),
-                f"{sum(seen)} of {len(seen)}, {enough}",
-                f"{figure(x, '.1f')}, {figure(y, '.1f')}, {figure(z, '.1f')} µT",
-                figure(radius, ".1f", "µT"),
-            )
-        )
+        centre = ", ".join(figure(value, ".1f") for value in (x, y, z))
+        directions = f"{sum(seen)} of {len(seen)}, {enough}"
+        texts = [str(len(points)), directions, f"{centre} µT", figure(radius, ".1f", "µT")]
+        if not len(points):
+            texts = [UNKNOWN] * len(texts)
         for label, text in zip(self._figures.values(), texts, strict=True):
             label.set_text(text)
 
     async def _start(self) -> None:
         context, system_id = self._context, self._context.system_id
         context.check_may_change()
-        if system_id is None:
-            return
-        if self._has_other_unanswered():
-            return
-        context.parts.dialogues.calibrate(system_id, self._step)
-        self._refresh()
+        if system_id is not None and not self._has_other_unanswered():
+            context.parts.dialogues.calibrate(system_id, self._step)
+            self._refresh()
 
     def _has_other_unanswered(self) -> bool:
         """Return, and show, whether another calibration is neither stored nor undone."""

@@ -9,7 +9,7 @@ from gateway.clock import unix_time_us
 from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of
 from gateway.panel.state.texts import TimedText
 from gateway.panel.view_context import ViewContext
-from gateway.panel.widgets import Cells, DataTable
+from gateway.panel.widgets import Cells, DataTable, choice
 from gateway.printable import printable
 
 REFRESH_S: Final = 0.5
@@ -62,8 +62,7 @@ class EventsView:
         self._context = context
         self._drawn: object = None
         with ui.element("div").classes("tools"):
-            self._least = ui.select(SHOWN, value=7, on_change=self._refresh)
-            self._least.props('dense outlined options-dense aria-label="Severity"')
+            self._least = choice("Severity", SHOWN, 7, self._refresh)
             self._search = ui.input(placeholder="Search", on_change=self._refresh)
             self._search.props('dense outlined clearable aria-label="Search in the texts"')
             ui.element("div").classes("spring")
@@ -108,11 +107,11 @@ class EventsView:
 
 
 def _severity(text: TimedText) -> str:
-    return SEVERITIES[min(max(text.severity, 0), len(SEVERITIES) - 1)]
+    return SEVERITIES[min(text.severity, len(SEVERITIES) - 1)]
 
 
 def _row(text: TimedText, when: datetime) -> Cells:
-    look = LOOKS[min(max(text.severity, 0), len(LOOKS) - 1)]
+    look = LOOKS[min(text.severity, len(LOOKS) - 1)]
     return (
         (f"{when:%H:%M:%S}", "soft"),
         (_severity(text), look, ICONS[look]),

@@ -6,7 +6,7 @@ from typing import Any, Final
 from nicegui import ui
 
 from gateway.panel.view_context import ViewContext
-from gateway.panel.widgets import LiveChart
+from gateway.panel.widgets import LiveChart, icon_button
 from gateway.printable import printable
 
 REFRESH_S: Final = 0.25
@@ -32,7 +32,7 @@ class PlotsView:
         with ui.element("div").classes("tools"):
             self._pause = ui.button("Pause", icon="pause", on_click=self._toggle).props("no-caps")
             self._pause.props("unelevated dense").mark("plots-pause")
-            window = ui.toggle(WINDOWS, value=60, on_change=lambda e: self._on_window(e.value))
+            window = ui.toggle(WINDOWS, value=60, on_change=self._on_window)
             window.props('dense no-caps unelevated aria-label="Span of time"')
             ui.element("div").classes("spring")
             add = ui.button("Add a chart", icon="add", on_click=lambda: self._add(()))
@@ -73,10 +73,10 @@ class PlotsView:
         for strip in self._strips:
             strip.chart.element.pause(paused=paused)
 
-    def _on_window(self, seconds: int) -> None:
-        self._window_s = seconds
+    def _on_window(self, event: Any) -> None:
+        self._window_s = event.value
         for strip in self._strips:
-            strip.chart.element.set_window(seconds)
+            strip.chart.element.set_window(event.value)
 
     def _reload(self) -> None:
         self._offer()
@@ -113,9 +113,9 @@ class _Strip:
                 ).classes("strip-choice")
                 self._choice.props('use-chips dense borderless aria-label="Fields"')
                 self._choice.props('placeholder="Choose fields: ATTITUDE.roll, …"')
-                _icon_button("image", "Save as PNG", self._save_png)
-                _icon_button("table_view", "Save as CSV", self._save_csv)
-                _icon_button("close", "Remove this chart", lambda: view.remove(self))
+                icon_button("image", "Save as PNG", self._save_png)
+                icon_button("table_view", "Save as CSV", self._save_csv)
+                icon_button("close", "Remove this chart", lambda: view.remove(self))
             self.chart = LiveChart(context, fields)
             self.chart.element.on("paused", view.on_hand)
 
@@ -134,9 +134,3 @@ class _Strip:
 
     async def _save_csv(self) -> None:
         ui.download.content(await self.chart.table(), "plot.csv", "text/csv")
-
-
-def _icon_button(icon: str, title: str, on_click: Any) -> None:
-    button = ui.button(icon=icon, on_click=on_click).props("flat round dense")
-    button.props["aria-label"] = title
-    button.tooltip(title)

@@ -23,7 +23,16 @@ from gateway.panel.estimator_trial import (
 from gateway.panel.state.fields import FloatArray, IntArray, parameter_unit
 from gateway.panel.state.parameters import ListState, ParameterMeta, is_same_value
 from gateway.panel.view_context import NotAllowedError, ViewContext
-from gateway.panel.widgets import DataTable, LiveChart, StripChart, allow, heading, store_parameters
+from gateway.panel.widgets import (
+    DataTable,
+    LiveChart,
+    StripChart,
+    allow,
+    choice,
+    heading,
+    icon_button,
+    store_parameters,
+)
 from gateway.printable import figure, printable, reason_of
 from gateway.units import counted
 
@@ -285,13 +294,11 @@ class TuningView:
             self._search = ui.input(placeholder="Search: gps, cutoff, heading …")
             self._search.props('dense outlined clearable debounce=200 aria-label="Search"')
             self._search.classes("spring").on_value_change(self._draw)
-            self._group = ui.select([ALL], value=ALL, on_change=self._draw)
-            self._group.props('dense outlined options-dense aria-label="Group"')
+            self._group = choice("Group", [ALL], ALL, self._draw)
             self._state = ui.label().classes("soft")
             self._button = ui.button("Store all", icon="save", on_click=self._store)
             self._button.props("no-caps unelevated dense")
-            again = ui.button(icon="refresh", on_click=self._reload)
-            again.props('flat round dense aria-label="Read all parameters again"')
+            icon_button("refresh", "Read all parameters again", self._reload)
         with ui.element("div").classes("tuning"):
             self._list = ui.element("div").classes("card settings")
             with ui.element("div").classes("effect"):
@@ -306,10 +313,10 @@ class TuningView:
             with ui.element("div").classes("tools"):
                 heading("Effect")
                 ui.element("div").classes("spring")
-                choice = ui.select(list(EFFECTS), value="attitude")
-                choice.props('dense borderless options-dense aria-label="What is plotted"')
+                effect = ui.select(list(EFFECTS), value="attitude")
+                effect.props('dense borderless options-dense aria-label="What is plotted"')
             self._chart = LiveChart(self._context, EFFECTS["attitude"])
-            choice.on_value_change(lambda event: self._chart.choose(EFFECTS[event.value]))
+            effect.on_value_change(lambda event: self._chart.choose(EFFECTS[event.value]))
         ComparisonCard(self._context)
 
     def _on_select(self) -> None:
