@@ -6,7 +6,7 @@ import hashlib
 import hmac
 import secrets
 import time
-from collections import deque
+from collections import Counter, defaultdict, deque
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
@@ -59,44 +59,27 @@ class FairTurns:
     """A lock that waiting callers get in turn by group, one caller of each group after another."""
 
     def __init__(self) -> None:
-        self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
-        self._is_taken = False
+        self._callers: Counter[str] = Counter()
+        """Callers of each group that wait or have the lock."""
+        self._of_group: defaultdict[str, asyncio.Lock] = defaultdict(asyncio.Lock)
+        self._of_all = asyncio.Lock()
 
     @asynccontextmanager
     async def turn(self, group: str, *, is_known: bool) -> AsyncIterator[None]:
         """Wait for a turn; raises BusyError if too many of the group, or other groups, wait."""
-        if self._is_taken:
-            waiting = self._waiting.get(group, ())
-            if len(waiting) >= MAX_WAITING or (
-                not waiting and not is_known and len(self._waiting) >= MAX_NETWORKS
-            ):
-                raise BusyError
-            turn = asyncio.get_running_loop().create_future()
-            self._waiting.setdefault(group, deque()).append(turn)
-            try:
-                await turn
-            except asyncio.CancelledError:
-                # The turn was given to this caller, which was cancelled: pass it on.
-                if turn.done() and not turn.cancelled():
-                    self._pass_on()
-                raise
-        self._is_taken = True
+        is_new = group not in self._callers
+        is_crowded = is_new and not is_known and len(self._callers) > MAX_NETWORKS
+        if is_crowded or self._callers[group] > MAX_WAITING:
+            raise BusyError
+        self._callers[group] += 1
         try:
-            yield
+            # One caller of each group waits for the other groups, in the order of arrival.
+            async with self._of_group[group], self._of_all:
+                yield
         finally:
-            self._pass_on()
-
-    def _pass_on(self) -> None:
-        while self._waiting:
-            group = next(iter(self._waiting))
-            turns = self._waiting.pop(group)
-            turn = turns.popleft()
-            if turns:
-                self._waiting[group] = turns
-            if not turn.done():
-                turn.set_result(None)
-                return
-        self._is_taken = False
+            self._callers[group] -= 1
+            if not self._callers[group]:
+                del self._callers[group], self._of_group[group]
 
 
 @dataclass(slots=True)

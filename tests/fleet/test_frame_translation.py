@@ -251,42 +251,35 @@ def site() -> WindowVerifier:
     return WindowVerifier(KEY, EPOCH_2015_US)
 
 
-def test_unsigned_frame_is_rejected(site: WindowVerifier) -> None:
-    message: Any = mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0)
-    for version in (1, 2):
-        assert site.check(frame_of(kit.packed(message, version=version)), NOW_US) == "unsigned"
-
-
-def test_frame_of_another_passphrase_is_rejected_and_begins_no_stream(site: WindowVerifier) -> None:
-    assert site.check(signed(NOW_TICKS + 9, key=bytes(32)), NOW_US) == "forged"
-    assert site.check(signed(NOW_TICKS), NOW_US) == ""
-
-
-@pytest.mark.parametrize("age_s", [0, 1, 4, 60, 86_400])
-def test_recorded_frame_is_rejected_at_any_later_time(site: WindowVerifier, age_s: int) -> None:
-    frame = signed(NOW_TICKS)
-    assert site.check(frame, NOW_US) == ""
-    later_ticks = NOW_TICKS + age_s * TICKS_PER_S
-    assert site.check(signed(later_ticks + 1), later_ticks * TICK_US) == ""
-    assert site.check(frame, later_ticks * TICK_US) == "replayed"
+LATER_TICKS = NOW_TICKS + 86_400 * TICKS_PER_S
+RECORDED = signed(NOW_TICKS)
+UNSIGNED: Any = mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0)
 
 
 @pytest.mark.parametrize(
-    ("age_ticks", "rejection"), [(MINUTE_TICKS, ""), (MINUTE_TICKS + 1, "replayed"), (-(10**9), "")]
-)
-def test_older_beginning_of_a_stream_is_rejected(
-    site: WindowVerifier, age_ticks: int, rejection: str
+    "received",
+    [
+        [(frame_of(kit.packed(UNSIGNED, version=n)), NOW_TICKS, "unsigned") for n in (1, 2)],
+        [(signed(NOW_TICKS + 9, key=bytes(32)), NOW_TICKS, "forged"), (RECORDED, NOW_TICKS, "")],
+        [(RECORDED, NOW_TICKS, ""), (RECORDED, NOW_TICKS, "replayed")],
+        [(RECORDED, NOW_TICKS, ""), (signed(LATER_TICKS + 1), LATER_TICKS, ""),
+         (RECORDED, LATER_TICKS, "replayed")],
+        # A recorded frame is rejected after a restart of the fleet, too.
+        [(signed(NOW_TICKS - MINUTE_TICKS), NOW_TICKS, "")],
+        [(signed(NOW_TICKS - MINUTE_TICKS - 1), NOW_TICKS, "replayed")],
+        [(signed(NOW_TICKS + 10**9), NOW_TICKS, "")],
+        [(RECORDED, NOW_TICKS, ""),
+         *((signed(NOW_TICKS - WINDOW_TICKS + 1), NOW_TICKS, word) for word in ("", "replayed")),
+         (signed(NOW_TICKS - WINDOW_TICKS), NOW_TICKS, "replayed")],
+    ],
+    ids=["unsigned", "forged", "repeated at once", "repeated a day later", "a minute old",
+         "too old", "from the future", "overtaken"],
+)  # fmt: skip
+def test_frame_is_accepted_once_and_only_with_a_fresh_signature(
+    site: WindowVerifier, received: list[tuple[MavFrame, int, str]]
 ) -> None:
-    """A recorded frame is rejected after a restart of the fleet, too."""
-    assert site.check(signed(NOW_TICKS - age_ticks), NOW_US) == rejection
-
-
-def test_frame_overtaken_by_newer_ones_is_accepted_once_in_the_window(site: WindowVerifier) -> None:
-    assert site.check(signed(NOW_TICKS), NOW_US) == ""
-    late = signed(NOW_TICKS - WINDOW_TICKS + 1)
-    assert site.check(late, NOW_US) == ""
-    assert site.check(late, NOW_US) == "replayed"
-    assert site.check(signed(NOW_TICKS - WINDOW_TICKS), NOW_US) == "replayed"
+    for number, (frame, now_ticks, rejection) in enumerate(received):
+        assert site.check(frame, now_ticks * TICK_US) == rejection, number
 
 
 def test_streams_are_independent_and_bounded(site: WindowVerifier) -> None:

@@ -5,15 +5,13 @@ import math
 import os
 import sqlite3
 import struct
-import threading
 import zlib
-from collections.abc import Iterable, Iterator
-from contextlib import suppress
+from collections.abc import AsyncIterator, Iterable, Iterator
 from functools import cache
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
@@ -58,40 +56,31 @@ def tiles_around(lat_deg: float, lon_deg: float) -> Iterator[tuple[int, int, int
                 yield zoom, x, y
 
 
+async def sent(data: bytes) -> AsyncIterator[bytes]:
+    yield data
+
+
 class Owner:
     """A server of tiles: its answers by path, and the paths that were asked for."""
 
     def __init__(self) -> None:
-        self.answers: dict[str, Iterable[bytes]] = {}
+        self.answers: dict[str, AsyncIterator[bytes]] = {}
         self.asked: list[str] = []
-        owner = self
 
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                owner.asked.append(self.path)
-                body = owner.answers.get(self.path)
-                self.send_response(200 if body is not None else 404)
-                self.end_headers()
-                # The client closes while an endless tile is sent.
-                with suppress(OSError):
-                    self.wfile.writelines(body or ())
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        self.asked.append(request.url.path)
+        body = self.answers.get(request.url.path)
+        return httpx.Response(404) if body is None else httpx.Response(200, content=body)
 
-            def log_message(self, *_: object) -> None:
-                pass
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}/{{z}}/{{x}}/{{y}}.png"
+    def tiles(self, folder: Path) -> MapTiles:
+        made = tiles_in(folder, "http://owner.example/{z}/{x}/{y}.png")
+        made._client = httpx.AsyncClient(transport=httpx.MockTransport(self))
+        return made
 
 
 @pytest.fixture
-def owner() -> Iterator[Owner]:
-    made = Owner()
-    thread = threading.Thread(target=made.server.serve_forever, args=(0.01,))
-    thread.start()
-    yield made
-    made.server.shutdown()
-    thread.join()
-    made.server.server_close()
+def owner() -> Owner:
+    return Owner()
 
 
 def tiles_in(folder: Path, *urls: str) -> MapTiles:
@@ -103,32 +92,32 @@ def tiles_in(folder: Path, *urls: str) -> MapTiles:
 async def test_tile_is_cached_and_used_while_the_server_has_none(
     tmp_path: Path, owner: Owner
 ) -> None:
-    owner.answers["/3/1/2.png"] = [picture()]
-    assert await tiles_in(tmp_path, owner.url).tile(0, 3, 1, 2) == picture()
+    owner.answers["/3/1/2.png"] = sent(picture())
+    assert await owner.tiles(tmp_path).tile(0, 3, 1, 2) == picture()
     owner.answers.clear()
-    assert await tiles_in(tmp_path, owner.url).tile(0, 3, 1, 2) == picture()
+    assert await owner.tiles(tmp_path).tile(0, 3, 1, 2) == picture()
     assert owner.asked == ["/3/1/2.png"]
     (cached,) = (file for file in tmp_path.rglob("*") if file.is_file())
     os.utime(cached, (0, 0))
-    assert await tiles_in(tmp_path, owner.url).tile(0, 3, 1, 2) == picture()
+    assert await owner.tiles(tmp_path).tile(0, 3, 1, 2) == picture()
     assert owner.asked == ["/3/1/2.png"] * 2
 
 
 async def test_tile_that_is_no_picture_or_endless_is_dropped(tmp_path: Path, owner: Owner) -> None:
-    sent = 0
+    count = 0
 
-    def endless() -> Iterator[bytes]:
-        nonlocal sent
+    async def endless() -> AsyncIterator[bytes]:
+        nonlocal count
         yield picture(1)
-        while sent < 100 * MAX_TILE:
-            sent += 1 << 16
+        while count < 100 * MAX_TILE:
+            count += 1 << 16
             yield bytes(1 << 16)
 
-    owner.answers = {"/0/0/0.png": [b"<script>alert(1)</script>"], "/1/0/0.png": endless()}
+    owner.answers = {"/0/0/0.png": sent(b"<script>alert(1)</script>"), "/1/0/0.png": endless()}
     for zoom in (0, 1):
-        assert await tiles_in(tmp_path, owner.url).tile(0, zoom, 0, 0) is None
+        assert await owner.tiles(tmp_path).tile(0, zoom, 0, 0) is None
     assert list(tmp_path.iterdir()) == []
-    assert 0 < sent < 50 * MAX_TILE, "not all was read"
+    assert 0 < count < 50 * MAX_TILE, "not all was read"
 
 
 async def test_unreachable_server_gives_no_tile(tmp_path: Path) -> None:
@@ -140,7 +129,7 @@ async def test_unreachable_server_gives_no_tile(tmp_path: Path) -> None:
 async def test_outer_tiles_are_not_asked(
     tmp_path: Path, owner: Owner, tile: tuple[int, int, int]
 ) -> None:
-    tiles = tiles_in(tmp_path, owner.url)
+    tiles = owner.tiles(tmp_path)
     assert await tiles.tile(0, *tile) is None
     assert await tiles.tile(1, 0, 0, 0) is None
     assert owner.asked == []

@@ -80,7 +80,11 @@ class TestCalibration:
 
     def test_gyroscope_is_stored_only_after_confirmation(self, bench: ViewBench) -> None:
         self.started(bench, "Gyroscope")
-        bench.fly(3.2, gyro=GYRO_BIAS)
+        bench.fly(1.5, gyro=GYRO_BIAS)
+        [progress] = ElementFilter(kind=ui.linear_progress)
+        assert progress.value == pytest.approx(0.5, abs=0.1)
+        bench.fly(1.7, gyro=GYRO_BIAS)
+        assert any(text.startswith("Done. Measuring the remaining error") for text in texts())
         bench.fly(2.2)
         assert "Calibrated, and in use until the gateway ends. Store it?" in texts()
         shown = rows()

@@ -1,4 +1,3 @@
-import math
 from typing import Any
 
 import numpy as np
@@ -24,27 +23,6 @@ def started(step: CalibrationStep) -> VehicleBench:
     bench = VehicleBench(CalibrationRun(1, step, 10 * US_PER_S))
     bench.send(bench.client.start_message())
     return bench
-
-
-def test_gyro_calibration_reports_bias_before_and_after() -> None:
-    bench = started(CalibrationStep.GYRO)
-    assert bench.client.state is RunState.RUNNING
-    bench.hold(1.5, gyro=(0.01, 0.0, 0.0))
-    assert bench.client.progress in range(40, 60)
-    bench.hold(1.6, gyro=(0.01, 0.0, 0.0))
-    assert bench.client.state is RunState.CHECKING
-    bench.hold(2.1)
-    assert bench.client.state is RunState.DONE
-    [residual] = bench.client.residuals()
-    assert residual.before == pytest.approx(math.degrees(0.01), rel=0.1)
-    assert residual.after < 0.1
-
-
-def test_motion_fails_gyro_calibration_with_the_reason() -> None:
-    bench = started(CalibrationStep.GYRO)
-    for n in range(40):
-        bench.hold(0.1, gyro=(math.sin(n), 0.0, 0.0))
-    assert (bench.client.state, bench.client.trouble) == (RunState.FAILED, "it was moved")
 
 
 def test_each_of_six_sides_is_reported_once_done() -> None:
@@ -88,13 +66,10 @@ def test_magnetometer_shows_uncovered_directions() -> None:
     assert residual.after < 0.1
 
 
-def test_cancelling_and_timeout_end_a_calibration() -> None:
-    bench = started(CalibrationStep.MAG)
-    bench.send(bench.client.cancel_message())
-    assert (bench.client.state, bench.client.trouble) == (RunState.FAILED, "cancelled")
-    lonely = CalibrationRun(2, CalibrationStep.GYRO, 0)
-    lonely.poll(5 * US_PER_S)
-    assert (lonely.state, lonely.trouble) == (RunState.FAILED, "the aircraft does not answer")
+def test_calibration_without_an_answer_fails() -> None:
+    run = CalibrationRun(2, CalibrationStep.GYRO, 0)
+    run.poll(5 * US_PER_S)
+    assert (run.state, run.trouble) == (RunState.FAILED, "the aircraft does not answer")
 
 
 @pytest.mark.parametrize(
