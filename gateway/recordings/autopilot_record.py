@@ -317,14 +317,12 @@ class RecordTranslator:
             before_us = time_us if self._beat_us is None else self._beat_us
             self._beat_us = max(before_us + BEAT_US, time_us)
         for number, (row, bound) in enumerate(self._repeated):
-            if time_us < self._due_us[number] or not self._has_rows(row):
+            is_known = not row.of or any(map(self._newest.has, row.of))
+            if time_us < self._due_us[number] or not is_known:
                 continue
             interval_us = round((row.every_s or 1.0) * US_PER_S)
             self._due_us[number] = max(self._due_us[number] + interval_us, time_us)
             yield bound.packer(*bound.values(self._newest, self._times()))
-
-    def _has_rows(self, row: MessageRow) -> bool:
-        return not row.of or any(self._newest.has(topic) for topic in row.of)
 
     def _event(self, event: Event) -> Iterator[Any]:
         match event:
@@ -336,7 +334,7 @@ class RecordTranslator:
                 if event.custom_mode != self._mode:
                     self._mode = event.custom_mode
                     yield self._heartbeat()
-                    yield self._current_mode()
+                    yield mavlink.MAVLink_current_mode_message(0, self._mode, 0)
             case Text():
                 yield from self._text(event)
             case LoggedParameter():
@@ -368,9 +366,6 @@ class RecordTranslator:
         zero_us = self._log.unix_us_at_zero
         unix_us = 0 if zero_us is None else zero_us + time_us
         return mavlink.MAVLink_system_time_message(unix_us, self._own_us // 1000 & UINT32)
-
-    def _current_mode(self) -> Any:
-        return mavlink.MAVLink_current_mode_message(0, self._mode, 0)
 
     def _introduction(self) -> Iterator[Any]:
         yield self._heartbeat()

@@ -20,15 +20,14 @@ Intervals shorter than `HELD_S` are merged with their neighbours.
 
 import math
 from array import array
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from hashlib import sha256
 from typing import Final
 
 import numpy as np
 
 from gateway.recordings.columns import BoolArray, FloatArray
-from gateway.recordings.figures import gps_outages_us
-from gateway.recordings.recorded_clock import DAY_US
+from gateway.recordings.recorded_clock import DAY_US, Gap, TimesSpan
 from gateway.records import NAN
 from gateway.units import US_PER_S
 from gateway.vehicle_state.positions import (
@@ -43,9 +42,6 @@ from gateway.wire.recorded_frames import IntArray
 
 POINT_US: Final = US_PER_S // 10
 """Minimum interval of positions and attitudes; closer ones add no information on a flight."""
-GAP_US: Final = 2 * US_PER_S
-"""Minimum pause that is a gap: every vehicle sends a heartbeat once a second."""
-MAX_GAPS: Final = 1000
 MAX_TEXTS: Final = 10_000
 """Maximum number of texts, and of changes of mode, that are stored."""
 AIRBORNE_MPS: Final = 3.0
@@ -59,67 +55,19 @@ HELD_S: Final = 2.0
 HOME, FIRST = "home", "first position"
 """Zero of heights and distances."""
 CHECKSUM_DIGITS: Final = 12
+OUTAGE_US: Final = US_PER_S
+"""Minimum length of an outage: a longer gap between fixes is one."""
+OUTAGE_STEPS: Final = 2.5
+"""Minimum length of an outage in usual intervals, for receivers with a low rate."""
+NODE_WRAP_US: Final = 1 << 32
+"""Period after which a node's 32-bit clock wraps to zero."""
+LONGEST_LOSS_US: Final = 60 * US_PER_S
+"""Longest gap counted as lost samples; in a longer one the node was switched off."""
 _POINT: Final = (
     *("time_us", "lat_deg", "lon_deg", "alt_amsl_m", "alt_home_m", "speed_mps", "climb_mps"),
     *("armed", "landed", "broken"),
 )
 """Columns of a position: the last three are 0 or 1; NaN is unknown."""
-
-
-@dataclass(frozen=True, slots=True)
-class Gap:
-    """A gap in the data."""
-
-    time_us: int
-    """Start of the gap, in the recording's own time."""
-    duration_s: float
-
-
-@dataclass(slots=True)
-class TimesSpan:
-    """Sum up the duration of records; a clock jump of more than a day adds nothing."""
-
-    first_us: int | None = None
-    gaps: list[Gap] = field(default_factory=list)
-    """The first `MAX_GAPS` between records."""
-    last_us: int | None = None
-    """Greatest time."""
-    _begin_us: int = 0
-    """Start of the part since the last clock jump."""
-    _newest_us: int = 0
-    _last_us: int = 0
-    _before_us: int = 0
-    """Total length of the parts before it."""
-
-    @property
-    def length_us(self) -> int:
-        """Duration from the first record to the last, without clock jumps."""
-        return self._before_us + self._newest_us - self._begin_us
-
-    def add_all(self, times_us: IntArray) -> None:
-        """Add the times of the next records."""
-        if not len(times_us):
-            return
-        before_us = times_us[0] if self.first_us is None else self._last_us
-        steps_us = np.diff(times_us, prepend=before_us)
-        for i in np.flatnonzero(steps_us > GAP_US)[: MAX_GAPS - len(self.gaps)].tolist():
-            step_us = int(steps_us[i])
-            self.gaps.append(Gap(int(times_us[i]) - step_us, step_us / US_PER_S))
-        for between in np.split(times_us, np.flatnonzero(np.abs(steps_us) > DAY_US)):
-            if len(between):
-                self._add(int(between[0]))
-                self._newest_us = max(self._newest_us, int(between.max()))
-                self.last_us = max(self.last_us or self._newest_us, self._newest_us)
-                self._last_us = int(between[-1])
-
-    def _add(self, time_us: int) -> None:
-        if self.first_us is None:
-            self.first_us = self._begin_us = self._newest_us = time_us
-        elif abs(time_us - self._last_us) > DAY_US:
-            self._before_us = self.length_us
-            self._begin_us = self._newest_us = time_us
-        elif time_us > self._newest_us:
-            self._newest_us = time_us
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -361,6 +309,40 @@ class FlightTally:
             Continuity(),
         )
         self._newest.clear()
+
+
+def gps_outages_us(gps_us: IntArray, fixed: BoolArray, end_us: int) -> list[tuple[int, int]] | None:
+    """Return start and end of each outage from the first fix on; None if there is no fix at all.
+
+    `gps_us`, shape (n,), are the times of all reports of the receiver; `fixed` marks reports with a
+    fix.
+    """
+    fixes_us = gps_us[fixed]
+    if not len(fixes_us):
+        return None
+    usual_us = float(np.median(np.diff(gps_us))) if len(gps_us) > 1 else 0.0
+    ends_us = np.append(fixes_us[1:], max(end_us, int(fixes_us[-1])))
+    gaps_us = ends_us - fixes_us
+    # A gap of days is a jump of the clock, not an outage.
+    is_outage = (gaps_us > max(OUTAGE_US, OUTAGE_STEPS * usual_us)) & (gaps_us <= DAY_US)
+    begins, ends = fixes_us[is_outage].tolist(), ends_us[is_outage].tolist()
+    return list(zip(begins, ends, strict=True))
+
+
+def missing_samples(node_time_us: IntArray) -> FloatArray:
+    """Count the samples missing before each sample except the first, by the node's own clock."""
+    interval_us = np.diff(node_time_us) % NODE_WRAP_US
+    usual_us = np.median(interval_us[interval_us > 0]) if interval_us.any() else 1.0
+    missing = np.maximum(np.rint(interval_us / usual_us) - 1.0, 0.0)
+    return np.where(interval_us > LONGEST_LOSS_US, 0.0, missing)
+
+
+def lost_share(node_time_us: IntArray) -> float | None:
+    """Return the proportion of missing samples; None for fewer than two samples."""
+    if len(node_time_us) < 2:
+        return None
+    lost = float(missing_samples(node_time_us).sum())
+    return lost / (lost + len(node_time_us))
 
 
 def checksum(data: bytes) -> str:

@@ -171,8 +171,9 @@ class Track:
         left_out: Counter[int] = Counter()
         for batch in batches:
             wanted = self._wanted(batch, begin)
-            answers = self._left_out(batch)
-            answers, begin = answers[answers >= begin], 0
+            answers = answers_of(batch, self._source.index.senders.stations)
+            answers = answers[:0] if self._with_commands else answers[answers >= begin]
+            begin = 0
             if not len(answers) and not left_out:
                 yield from batch.records(wanted)
                 continue
@@ -187,11 +188,6 @@ class Track:
                     read = frame_of(frame)
                     frame = renumbered(read, read.sequence - count & 0xFF).data
                 yield RecordedFrame(int(batch.time_us[i]), frame)
-
-    def _left_out(self, batch: Batch) -> IntArray:
-        if self._with_commands:
-            return np.empty(0, np.int64)
-        return answers_of(batch, self._source.index.senders.stations)
 
     def _addressed(self, frame: bytes) -> bytes:
         system_id = self._system_ids.get(origin_of(frame)[0])

@@ -4,7 +4,6 @@ Readers that require large packages are imported with the first file of their fo
 """
 
 import codecs
-import math
 from collections.abc import Callable, Iterable, Iterator
 from importlib import import_module
 from importlib.resources import files
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import msgspec
-import numpy as np
 
 from gateway.extras import how_to_add
 from gateway.recordings.autopilot_record import AutopilotLog
@@ -36,7 +34,7 @@ from gateway.recordings.files import (
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.logged_samples import read_samples
-from gateway.recordings.recorded_clock import ORDER_US
+from gateway.recordings.recorded_clock import RestartClock
 from gateway.recordings.recorded_table import (
     ReadOptions,
     RecordedTable,
@@ -198,28 +196,19 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
 
     remarks: list[str] = []
     header = header_of_today(options, options.system_id or 1, reader.unix_us_at_zero)
-    return RecordedTable(header, _monotone(counting(), path, remarks), remarks)
+    clock = RestartClock()
 
+    def in_order() -> Iterator[TableBlock]:
+        for block in counting():
+            block.cells[:, TIMES] += clock.shifts_us(block.cells[:, 0])[:, None]
+            yield block
+        if clock.restarts:
+            remarks.append(
+                f"{path}: its clock went back {counted(clock.restarts, 'time')}; "
+                "later times continue from there"
+            )
 
-def _monotone(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> Iterator[TableBlock]:
-    """Shift times after each backward step of the clock, as at a restart, so that they increase."""
-    last_us, shift_us, restarts = -math.inf, 0.0, 0
-    for block in blocks:
-        times_us = block.cells[:, 0]
-        steps_us = np.diff(times_us, prepend=last_us)
-        back_us = np.where(steps_us < -ORDER_US, -steps_us, 0.0)
-        last_us = times_us[-1]
-        restarts += int(np.count_nonzero(back_us))
-        shifts_us = shift_us + np.cumsum(back_us)
-        shift_us = shifts_us[-1]
-        if shift_us:
-            block.cells[:, TIMES] += shifts_us[:, None]
-        yield block
-    if restarts:
-        remarks.append(
-            f"{path}: its clock went back {counted(restarts, 'time')}; "
-            "later times continue from there"
-        )
+    return RecordedTable(header, in_order(), remarks)
 
 
 def check_vehicle(paths: Iterable[Path], wanted: int | None, found: Iterable[int]) -> None:

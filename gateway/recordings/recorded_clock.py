@@ -3,6 +3,8 @@
 | clock        | rule                                                                           |
 | ------------ | ------------------------------------------------------------------------------ |
 | `is_damaged` | a time that is not between those of its neighbours, by more than `ORDER_US`    |
+|`RestartClock`| the time of another program's log, whose clock may restart: it continues       |
+| `TimesSpan`  | duration and gaps of any recording, without jumps of its clock                 |
 | `Timeline`   | the time of a tlog whose clock was set while it was written: steps are removed |
 | `FrameClock` | the time of a capture without time stamps, from the times in its messages      |
 | `CivilClock` | civil time of the running gateway: GPS if available, else the machine's clock  |
@@ -18,6 +20,7 @@ offset from the gateway clock to civil time is constant while a file is open, an
 requires a new file.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, Final, Generic, TypeVar
 
@@ -39,6 +42,9 @@ DAY_US: Final = 86_400 * US_PER_S
 ORDER_US: Final = 2 * US_PER_S
 """A time before that of the previous record, or after that of the next, by more is damaged."""
 
+GAP_US: Final = 2 * US_PER_S
+"""Minimum pause that is a gap: every vehicle sends a heartbeat once a second."""
+MAX_GAPS: Final = 1000
 BACK_US: Final = 60 * US_PER_S
 """Maximum backward step from reordering of two links' frames; more means a clock change."""
 FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
@@ -111,6 +117,70 @@ class ClockJump:
     offset_us: int
     """Time of the step since the first record."""
     step_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A gap in the data."""
+
+    time_us: int
+    """Start of the gap, in the recording's own time."""
+    duration_s: float
+
+
+class TimesSpan:
+    """Sum up the duration of records; a clock jump of more than a day adds nothing."""
+
+    def __init__(self) -> None:
+        self.first_us: int | None = None
+        self.last_us: int | None = None
+        """Greatest time."""
+        self.gaps: list[Gap] = []
+        """The first `MAX_GAPS` between records."""
+        self._before_us = self._begin_us = self._newest_us = self._last_us = 0
+        """Length of the parts before the last clock jump; begin and greatest time since it."""
+
+    @property
+    def length_us(self) -> int:
+        """Duration from the first record to the last, without clock jumps."""
+        return self._before_us + self._newest_us - self._begin_us
+
+    def add_all(self, times_us: IntArray) -> None:
+        """Add the times of the next records."""
+        if not len(times_us):
+            return
+        steps_us = np.diff(
+            times_us, prepend=times_us[0] if self.first_us is None else self._last_us
+        )
+        for i in np.flatnonzero(steps_us > GAP_US)[: MAX_GAPS - len(self.gaps)].tolist():
+            step_us = int(steps_us[i])
+            self.gaps.append(Gap(int(times_us[i]) - step_us, step_us / US_PER_S))
+        for part, times in enumerate(np.split(times_us, np.flatnonzero(abs(steps_us) > DAY_US))):
+            if part or self.first_us is None:
+                self._before_us = self.length_us
+                self._begin_us = self._newest_us = int(times[0])
+            if len(times):
+                self._newest_us = max(self._newest_us, int(times.max()))
+                self.last_us = max(self.last_us or self._newest_us, self._newest_us)
+            self.first_us = self._begin_us if self.first_us is None else self.first_us
+        self._last_us = int(times_us[-1])
+
+
+class RestartClock:
+    """Shift times after each backward step of a clock, as at a restart, so that they increase."""
+
+    def __init__(self) -> None:
+        self.restarts = 0
+        self._last_us, self._shift_us = -math.inf, 0.0
+
+    def shifts_us(self, times_us: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the shifts of the next times."""
+        steps_us = np.diff(times_us, prepend=self._last_us)
+        back_us = np.where(steps_us < -ORDER_US, -steps_us, 0.0)
+        shifts_us = self._shift_us + np.cumsum(back_us)
+        self.restarts += int(np.count_nonzero(back_us))
+        self._last_us, self._shift_us = times_us[-1], shifts_us[-1]
+        return shifts_us
 
 
 class Timeline:

@@ -22,7 +22,8 @@ from gateway.recordings.files import (
     open_tlog,
     read_blocks,
 )
-from gateway.recordings.flight_facts import FlightFacts, FlightTally, Gap, TimesSpan, checksum
+from gateway.recordings.flight_facts import FlightFacts, FlightTally, checksum
+from gateway.recordings.recorded_clock import Gap, TimesSpan
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableNote, TableReader
 from gateway.recordings.tallies import MessageTally, RowTally
 from gateway.recordings.tlog_index import DAMAGED_TIME, TlogIndex

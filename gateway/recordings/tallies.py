@@ -24,8 +24,7 @@ from gateway.recordings.columns import (
     has_group,
     has_position,
 )
-from gateway.recordings.figures import lost_share
-from gateway.recordings.flight_facts import MAX_TEXTS, POINT_US, FlightTally, checksum
+from gateway.recordings.flight_facts import MAX_TEXTS, POINT_US, FlightTally, checksum, lost_share
 from gateway.recordings.table import TableBlock
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.records import NAN, NodeStatus

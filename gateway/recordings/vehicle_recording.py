@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -13,6 +14,8 @@ from gateway.recordings.workshop.convert import FlightToWrite
 from gateway.recordings.workshop.extracts import RecordedPlan
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.recorded_frames import Batch
+
+NO_AUTOPILOT: Final = mavlink.MAV_AUTOPILOT_INVALID
 
 
 class VehicleRecording:
@@ -66,7 +69,8 @@ class VehicleRecording:
 
 def _only_vehicle(files: Sequence[Path], senders: Senders) -> int:
     systems = senders.systems()
-    piloted = [one for one in systems if _has_autopilot(senders.vehicle(one).heartbeat)]
+    beats = {one: senders.vehicle(one).heartbeat for one in systems}
+    piloted = [one for one, beat in beats.items() if beat and beat[1] != NO_AUTOPILOT]
     found = piloted or systems
     if not found:
         raise FlightError(f"{files[0]}: contains no vehicle")
@@ -74,7 +78,3 @@ def _only_vehicle(files: Sequence[Path], senders: Senders) -> int:
         listed = ", ".join(map(str, found))
         raise FlightError(f"{files[0]}: several vehicles; choose one with --system: {listed}")
     return found[0]
-
-
-def _has_autopilot(heartbeat: tuple[int, int] | None) -> bool:
-    return heartbeat is not None and heartbeat[1] != mavlink.MAV_AUTOPILOT_INVALID

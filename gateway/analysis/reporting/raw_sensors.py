@@ -22,7 +22,7 @@ from gateway.analysis.signals import (
     power_density,
     response,
 )
-from gateway.recordings.figures import NODE_WRAP_US, lost_share, missing_samples
+from gateway.recordings.flight_facts import NODE_WRAP_US, lost_share, missing_samples
 
 EXCERPT_S: Final = 6.0
 COLOURS: Final = {"butterworth": style.BLUE, "chebyshev": style.RED}

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from gateway.geometry.atmosphere import pressure_at_height
 from gateway.recordings.columns import BARO, COLUMNS, GPS, MAG, NAV, RAW, SI, FloatArray, normalise
-from gateway.recordings.recorded_clock import is_damaged
+from gateway.recordings.recorded_clock import BACK_US, is_damaged
 from gateway.recordings.table import BLOCK_ROWS, NO_ROWS, TableBlock
 from gateway.records import NAN, GpsFixType, ImuFlags
 from gateway.settings import Settings, setting
@@ -43,10 +43,6 @@ DAY_S, HOUR_S, MINUTE_S = 86_400, 3600, 60
 EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 MAX_CELL: Final = 40
 """Characters of an unreadable cell that are quoted in a message."""
-LATE_US: Final = 60 * US_PER_S
-"""Maximum difference of a value's time from its row's; beyond it, damaged or of another clock."""
-
-
 MAX_LISTED: Final = 20
 """Maximum number of unknown columns that are listed."""
 _GROUPS_NEED: Final = [
@@ -332,7 +328,7 @@ def _begun(names: Iterable[str]) -> frozenset[str]:
 
 def _measured_us(own_us: FloatArray, row_us: FloatArray) -> FloatArray:
     """Return the times of measurement; the time of the row if that is on another clock."""
-    return np.where(np.abs(own_us - row_us) <= LATE_US, np.rint(own_us), row_us)
+    return np.where(np.abs(own_us - row_us) <= BACK_US, np.rint(own_us), row_us)
 
 
 def level_velocity(speed_mps: FloatArray, course_deg: FloatArray) -> tuple[FloatArray, FloatArray]:
