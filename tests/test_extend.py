@@ -22,7 +22,7 @@ from gateway.hub.settings import HubSettings
 from gateway.hub.transports.registry import CLIENTS
 from gateway.panel.added_views import ADDED_VIEWS, add_view
 from gateway.recordings.columns import TableRow, row_to_line
-from gateway.recordings.files import OTHER_FORMATS
+from gateway.recordings.file_format import OTHER_FORMATS
 from gateway.recordings.reading import READERS
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import encode_head

@@ -21,15 +21,8 @@ import msgspec
 from gateway.batch.executors import Executor, WorkFailed
 from gateway.batch.facts import CataloguedFlight, Flown, Segments, flights_of
 from gateway.printable import UserError
-from gateway.recordings.files import (
-    GZIP,
-    NO_RECORDING,
-    OTHER_FORMATS,
-    FlightError,
-    first_bytes,
-    format_of,
-    open_recording,
-)
+from gateway.recordings.file_format import NO_RECORDING, OTHER_FORMATS, first_bytes, format_of
+from gateway.recordings.files import GZIP, FlightError, open_recording
 from gateway.recordings.formats.maps import track_feature
 from gateway.recordings.index import as_text, recording_name
 from gateway.recordings.recorded_table import ReadOptions

@@ -21,7 +21,8 @@ from gateway.live.control_socket import ControlError
 from gateway.live.terminal import own_command
 from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import ControlClient, Uplink
-from gateway.recordings.files import TABLE, FlightError
+from gateway.recordings.file_format import TABLE
+from gateway.recordings.files import FlightError
 from gateway.recordings.flight_facts import FlightTrackPoints
 from gateway.recordings.index import RecordingError, find_recording, parts_together
 from gateway.recordings.summary import read_summary

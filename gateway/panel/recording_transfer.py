@@ -25,7 +25,7 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from gateway.panel.access import RECORDINGS, ROLE
 from gateway.panel.admission import Role
 from gateway.recordings.columns import TableRow
-from gateway.recordings.files import TABLE, TLOG, format_of
+from gateway.recordings.file_format import TABLE, TLOG, format_of
 from gateway.recordings.index import RecordingError, check_free, find_recording
 from gateway.recordings.table import TableReader
 from gateway.recordings.tlog import TlogScanner

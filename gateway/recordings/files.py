@@ -1,42 +1,21 @@
-"""Read recordings from disk as streams of chunks, and any recorded MAVLink as a tlog.
+"""Read files of any kind, gzipped or not, as streams of chunks, lines and blocks."""
 
-| layout | bytes before each frame           | times                                   |
-| ------ | --------------------------------- | --------------------------------------- |
-| tlog   | 8: the time                       | as recorded, without jumps of the clock |
-| padded | 16: the time and eight zeros      | as for tlog                             |
-| bare   | 0: a capture of a link            | from the messages, see `FrameClock`     |
-"""
-
-import codecs
 import errno
 import gzip
 import io
 import os
-import re
 import stat
 import zlib
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from enum import IntEnum
-from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryFile, gettempdir
-from typing import IO, Any, BinaryIO, Final, Literal, cast
+from typing import IO, Any, BinaryIO, Final, cast
 
 from gateway.printable import UserError
-from gateway.recordings.recorded_clock import LINE_BPS, FrameClock, Timeline
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
-from gateway.recordings.tlog import TlogScanner, encode_record
-from gateway.units import US_PER_S, counted
-from gateway.vehicle_state.senders import Senders
-from gateway.wire.frame_scan import TIME_SIZE
-from gateway.wire.mavlink_splitter import MavlinkSplitter, SplitFault
-from gateway.wire.recorded_frames import Batch
 
 CHUNK: Final = 1 << 20
-SNIFF: Final = 512
 TAIL: Final = 1 << 14
 """Bytes read at the end of a table, about 20 rows."""
 MAX_HEAD: Final = 4 * MAX_LINE
@@ -49,13 +28,6 @@ LEAST_BOMB: Final = 1 << 25
 MAX_UNPACKED: Final = 1 << 30
 """Maximum unpacked size of a file, bytes, unless the settings give another limit: a megabyte of
 gzip can expand to a gigabyte of zeros."""
-HEAD: Final = 1 << 14
-"""Bytes that are searched for the start of a log, which may follow text that a console wrote, and
-from which the layout of a tlog is recognised: several hundred frames."""
-BLANK: Final = b"\xff\0"
-"""Erased flash memory, and zeros of a card that lost its power; they may precede a log that was
-copied from raw memory."""
-MAX_BLANK: Final = 1 << 20
 GZIP: Final = ".gz"
 GZIP_MAGIC: Final = b"\x1f\x8b"
 """First bytes of a gzipped file; its name is not considered."""
@@ -64,122 +36,8 @@ Progress = Callable[[int], None]
 """Callback with the number of bytes read since its last call."""
 
 
-Position = Literal["causal", "interpolated"]
-SettingsChoice = Literal["recorded", "current"]
-Estimates = Literal["own", "fused", "both"]
-"""Estimates to use from an autopilot's log: its own, those of mavgate, or both as two vehicles."""
-
-NO_RECORDING: Final = (
-    "unknown file format; readable: tlog, raw MAVLink, CSV, ULog, DataFlash, MCAP, Parquet"
-)
-TLOG, TABLE, CSV, PARQUET = "tlog", "table", "csv", "Parquet"
-"""Names of formats; a CSV is one of another program, with columns of its own."""
-ULOG_HEAD: Final = b"ULog\x01\x12\x35"
-ULOG_BEGIN: Final = re.compile(
-    rb"\A[^\xfd\xfe]*?(?=ULog\x01\x12\x35|..F[a-z0-9_]+:uint64_t timestamp;)", re.DOTALL
-)
-"""Match up to the header of a ULog or, if the header is lost, up to the first format of a topic. A
-tlog that contains a log download does not match: it begins with MAVLink frames."""
-DATAFLASH_BEGIN: Final = re.compile(
-    rb"\A(?:(?=\xa3\x95)|[^\xfd\xfe]*?(?=\xa3\x95\x80..[A-Z][A-Z0-9]{2,3}))", re.DOTALL
-)
-"""Match up to a binary DataFlash log: its first message or, after other bytes, its first format."""
-_DATAFLASH_LINE: Final = re.compile(rb"^FMT, ?\d", re.MULTILINE)
-PIECE: Final = 1 << 12
-SHOWN_JUMPS: Final = 3
-_DAY_S: Final = 86_400
-
-
 class FlightError(UserError):
     """A file lacks the data that a command needs; the text names the data and the file."""
-
-
-def _begins(*heads: bytes) -> Callable[[bytes], bool]:
-    return lambda head: head.startswith(heads)
-
-
-OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {
-    "ULog": lambda head: ULOG_BEGIN.search(head) is not None,
-    "DataFlash": lambda head: any(
-        begin.search(head) is not None for begin in (DATAFLASH_BEGIN, _DATAFLASH_LINE)
-    ),
-    PARQUET: _begins(b"PAR1"),
-}
-"""Test whether a file that begins with these bytes is of a format, by the format's name."""
-
-
-def encoding_of(head: bytes) -> str:
-    """Return the encoding of a text by its byte order mark or its zeros; UTF-8 by default."""
-    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return "utf-16"
-    sample = head[: SNIFF & ~1]
-    even, odd = sample[::2], sample[1::2]
-    for letters, zeros, encoding in ((even, odd, "utf-16-le"), (odd, even, "utf-16-be")):
-        if letters and letters.isascii() and all(letters) and not any(zeros):
-            return encoding
-    return "utf-8-sig"
-
-
-def format_of(path: Path) -> str:
-    """Recognise the format of a file by its first bytes; raises OSError if it cannot be read."""
-    head = first_bytes(path)
-    if encoding_of(head) != "utf-8-sig":
-        return CSV
-    known = (name for name, knows in OTHER_FORMATS.items() if knows(head))
-    if (name := next(known, None)) is not None:
-        return name
-    if head.startswith((b"# mavgate table", b"time_us,")):
-        return TABLE
-    first = head[:SNIFF]
-    has_frames = b"\xfd" in head or b"\xfe" in head
-    is_binary = b"\0" in first or b"\xfd" in first or b"\xfe" in first
-    is_binary |= has_frames and b"\0" in head
-    has_cells = any(delimiter in first for delimiter in (b",", b";", b"\t"))
-    is_markup = head.lstrip()[:1] in (b"{", b"[", b"<")  # JSON, HTML and other XML
-    return CSV if has_cells and not is_binary and not is_markup else TLOG
-
-
-def first_bytes(path: Path) -> bytes:
-    """Return the start of a file, unpacked, to recognise its format; raises OSError."""
-    with open_unpacked(path) as (file, _):
-        head, _ = _behind_blank(iter(lambda: file.read(HEAD), b""))
-        return head[:HEAD].removeprefix(codecs.BOM_UTF8)
-
-
-def _behind_blank(content: Iterator[bytes]) -> tuple[bytes, int]:
-    """Return up to `HEAD` bytes after the blank ones, and the number of blank bytes."""
-    head, size = b"", 0
-    for data in content:
-        size += len(data)
-        head += data
-        if head[:1] * 2 == head[:2] and head[:1] in (b"\xff", b"\0"):
-            head = head.lstrip(BLANK)
-        if len(head) >= HEAD or size > MAX_BLANK:
-            break
-    return head, size - len(head)
-
-
-@dataclass(frozen=True, slots=True)
-class Before:
-    """Bytes before the start of a log."""
-
-    blank: int = 0
-    text: bytes = b""
-    """The bytes that follow the blank ones."""
-
-    @property
-    def remarks(self) -> list[str]:
-        """Remarks for the user on these bytes."""
-        size = self.blank + len(self.text)
-        return [f"left out {counted(size, 'byte')} before its first message"] if size else []
-
-
-def skip_to(begin: re.Pattern[bytes], content: Iterator[bytes]) -> tuple[Iterator[bytes], Before]:
-    """Skip the bytes before the start of a log."""
-    head, blank = _behind_blank(content)
-    found = begin.search(head, 0, HEAD)
-    at = found.end() if found else 0
-    return chain([head[at:]], content), Before(blank, head[:at])
 
 
 def is_packed(path: Path) -> bool:
@@ -323,147 +181,3 @@ def read_blocks(path: Path, reader: TableReader, progress: Progress | None) -> I
     for data in read_chunks(path, progress):
         yield reader.feed_block(data)
     yield reader.feed_block(b"", final=True)
-
-
-class Layout(IntEnum):
-    """Number of bytes before each frame."""
-
-    BARE = 0
-    TLOG = TIME_SIZE
-    PADDED = 2 * TIME_SIZE
-
-
-@dataclass(frozen=True, slots=True)
-class TlogSource:
-    """A file of recorded MAVLink with its recognised layout and its clock."""
-
-    path: Path
-    layout: Layout
-    timeline: Timeline
-    senders: Senders
-    remarks: tuple[str, ...] = ()
-    """Remarks for the user on its times."""
-    civil_us_at_zero: int = 0
-    by_size: bool = False
-    """Whether frames of a capture without times are spaced by their transmission time."""
-
-    def chunks(self, progress: Progress | None = None, limit: int | None = None) -> Iterator[bytes]:
-        """Read the file as the bytes of a tlog; see `read_chunks`."""
-        data = read_chunks(self.path, progress, limit)
-        if self.layout is Layout.TLOG:
-            return data
-        if self.layout is Layout.PADDED:
-            return _stamped(data)
-        return self._timed(data)
-
-    def batches(self, progress: Progress | None = None, *, strict: bool = False) -> Iterator[Batch]:
-        """Read the file batch by batch, at corrected times; see `TlogScanner`."""
-        scanner = TlogScanner(strict=strict)
-        for data in self.chunks(progress):
-            yield self.timeline.apply(scanner.feed(data))
-        yield self.timeline.apply(scanner.feed(b"", final=True))
-
-    def _timed(self, data: Iterator[bytes]) -> Iterator[bytes]:
-        clock = FrameClock(by_size=self.by_size)
-        for pieces in _frames(data):
-            yield b"".join(
-                encode_record(self.civil_us_at_zero + clock.time_us(frame), frame)
-                for *_, frame in pieces
-            )
-
-
-def open_tlog(path: Path) -> TlogSource:
-    """Recognise the layout of a file, and read all its times once; raises OSError."""
-    layout = file_layout(first_bytes(path))
-    if layout is Layout.BARE:
-        return _open_bare(path)
-    timeline, senders = Timeline(), Senders()
-    for batch in TlogSource(path, layout, Timeline(), senders).batches():
-        timeline.add(batch)
-        senders.add(batch)
-    padded = ("has eight extra zero bytes in each record; left out",)
-    remarks = padded if layout is Layout.PADDED else ()
-    return TlogSource(path, layout, timeline, senders, (*remarks, *_jumps_in_words(timeline)))
-
-
-def file_layout(head: bytes) -> Layout:
-    """Recognise the layout by the bytes between the first frames; a tlog if that is ambiguous."""
-    gaps: Counter[int] = Counter()
-    splitter, gap, met = MavlinkSplitter(), 0, False
-    # In pieces, which bounds the work for bytes with many false starts of frames.
-    for begin in range(0, len(head), PIECE):
-        for event in splitter.feed(head[begin : begin + PIECE]):
-            if isinstance(event, SplitFault):
-                gap += event.size
-            else:
-                gaps[gap] += met
-                gap, met = 0, True
-    return max((Layout.TLOG, Layout.PADDED, Layout.BARE), key=lambda layout: gaps[int(layout)])
-
-
-def _open_bare(path: Path) -> TlogSource:
-    clock, left_out = FrameClock(), 0
-    for pieces in _frames(read_chunks(path)):
-        for size, _, frame in pieces:
-            left_out += size
-            clock.time_us(frame)
-    how = "its times are those in its messages"
-    if not clock.is_timed:
-        how = f"no message contains a time, so frames are spaced as on a link of {LINE_BPS} baud"
-    remarks = [f"is a capture without time stamps; {how}"]
-    if left_out:
-        remarks.append(f"left out {counted(left_out, 'byte')} between frames")
-    zero_us = clock.civil_us_at_zero or 0
-    source = TlogSource(
-        path, Layout.BARE, Timeline(), Senders(), tuple(remarks), zero_us,
-        by_size=not clock.is_timed,
-    )  # fmt: skip
-    for batch in source.batches():
-        source.senders.add(batch)
-    return source
-
-
-def _frames(data: Iterator[bytes]) -> Iterator[list[tuple[int, bytes, bytes]]]:
-    """Yield the frames of each chunk, each with the number and the last of the skipped bytes."""
-    splitter, rest, lead, left_out = MavlinkSplitter(), b"", b"", 0
-    for chunk in data:
-        for begin in range(0, len(chunk), PIECE):
-            piece = chunk[begin : begin + PIECE]
-            rest, at = rest + piece, 0
-            found: list[tuple[int, bytes, bytes]] = []
-            for event in splitter.feed(piece):
-                size = event.size if isinstance(event, SplitFault) else len(event.data)
-                if isinstance(event, SplitFault):
-                    left_out += size
-                    lead = (lead + rest[at : at + size])[-2 * TIME_SIZE :]
-                else:
-                    found.append((left_out, lead, event.data))
-                    lead, left_out = b"", 0
-                at += size
-            rest = rest[at:]
-            yield found
-
-
-def _stamped(data: Iterator[bytes]) -> Iterator[bytes]:
-    """Remove the eight zeros of each record, which are before or after its time."""
-    for pieces in _frames(data):
-        records = []
-        for _, lead, frame in pieces:
-            first, second = lead[-2 * TIME_SIZE : -TIME_SIZE], lead[-TIME_SIZE:]
-            time = second if not any(first) else first
-            records.append(time.rjust(TIME_SIZE, b"\0") + frame)
-        yield b"".join(records)
-
-
-def _jumps_in_words(timeline: Timeline) -> Iterator[str]:
-    for jump in timeline.jumps[:SHOWN_JUMPS]:
-        step_s = jump.step_us / US_PER_S
-        days = abs(step_s) / _DAY_S
-        size = f"{days:.1f} days" if days >= 1 else f"{abs(step_s):.0f} s"
-        direction = "forward" if step_s > 0 else "back"
-        yield (
-            f"its clock jumped {direction} by {size} at {jump.offset_us / US_PER_S:.1f} s; "
-            "its times continue without the jump"
-        )
-    if (more := len(timeline.jumps) - SHOWN_JUMPS) > 0:
-        yield f"and {counted(more, 'more jump')} of its clock"

@@ -13,27 +13,23 @@ from typing import Final
 
 from gateway.answers.log_answers import LogAnswers
 from gateway.recordings.autopilot_record import RecordTranslator
+from gateway.recordings.file_format import NO_RECORDING, TLOG, format_of
 from gateway.recordings.files import (
     MAX_UNPACKED,
-    NO_RECORDING,
-    TLOG,
-    Estimates,
     FlightError,
-    Layout,
     Progress,
-    format_of,
     is_packed,
     open_descriptor,
-    open_tlog,
     temporary_copy,
 )
 from gateway.recordings.index import parts_together
 from gateway.recordings.play import Source, Track
-from gateway.recordings.reading import beside_id, estimates_of, open_record
+from gateway.recordings.reading import Estimates, beside_id, estimates_of, open_record
 from gateway.recordings.recorded_fusion import RecordedFusion, end_of
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.recordings.tlog_index import TlogIndex
+from gateway.recordings.tlog_source import Layout, open_tlog
 from gateway.vehicle_state.senders import FIRST_GROUND_STATION
 from gateway.wire.recorded_frames import RecordedFrame
 

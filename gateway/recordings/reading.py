@@ -9,28 +9,23 @@ from importlib import import_module
 from importlib.resources import files
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import msgspec
 
 from gateway.extras import how_to_add
 from gateway.recordings.autopilot_record import AutopilotLog
 from gateway.recordings.columns import TIMES
-from gateway.recordings.files import (
+from gateway.recordings.file_format import (
     CSV,
     OTHER_FORMATS,
     PARQUET,
     TABLE,
     TLOG,
-    Estimates,
-    FlightError,
-    Progress,
     encoding_of,
     format_of,
-    open_tlog,
-    read_blocks,
-    read_chunks,
 )
+from gateway.recordings.files import FlightError, Progress, read_blocks, read_chunks
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.logged_samples import read_samples
@@ -42,6 +37,7 @@ from gateway.recordings.recorded_table import (
     table_of_blocks,
 )
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
+from gateway.recordings.tlog_source import open_tlog
 from gateway.toml_file import TomlError, read_toml
 from gateway.units import counted
 from gateway.vehicle_state.senders import FIRST_GROUND_STATION
@@ -50,6 +46,9 @@ TRACKER_LOG: Final = files("gateway.recordings.formats") / "tracker-log.toml"
 """Column map for logs with the columns time_s, ax, gx and so on."""
 RECORDS: Final = {"DataFlash": "dataflash_record", "ULog": "ulog_record"}
 """Module that reads an autopilot's log, by the name of the format."""
+
+Estimates = Literal["own", "fused", "both"]
+"""Estimates to use from an autopilot's log: its own, those of mavgate, or both as two vehicles."""
 
 Read = Callable[[Path, ReadOptions], RecordedTable]
 

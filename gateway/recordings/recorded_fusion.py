@@ -33,15 +33,8 @@ from gateway.recordings.columns import (
     has_group,
     write_lines,
 )
-from gateway.recordings.files import (
-    CSV,
-    TABLE,
-    FlightError,
-    encoding_of,
-    format_of,
-    read_chunks,
-    read_ends,
-)
+from gateway.recordings.file_format import CSV, TABLE, encoding_of, format_of
+from gateway.recordings.files import FlightError, read_chunks, read_ends
 from gateway.recordings.fuse import (
     SMOOTHED_ESTIMATOR,
     Correct,

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -12,7 +12,7 @@ from gateway import __version__
 from gateway.aircraft import AircraftSettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TableRow
-from gateway.recordings.files import MAX_UNPACKED, FlightError, Position, Progress, SettingsChoice
+from gateway.recordings.files import MAX_UNPACKED, FlightError, Progress
 from gateway.recordings.formats.csv import ColumnMap
 from gateway.recordings.table import (
     BLOCK_ROWS,
@@ -27,6 +27,8 @@ from gateway.recordings.table import (
 from gateway.records import FusionState, NodeStatus
 from gateway.sensing.calibration import NodeCalibration
 
+Position = Literal["causal", "interpolated"]
+SettingsChoice = Literal["recorded", "current"]
 Line = TableRow | TableHeader | TableNote | FusionState | NodeStatus
 
 

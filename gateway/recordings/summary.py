@@ -12,21 +12,14 @@ import msgspec
 import numpy as np
 
 from gateway.recordings.columns import BARO, GPS, MAG, NAV, RAW, SI, FloatArray, has_group
-from gateway.recordings.files import (
-    NO_RECORDING,
-    TABLE,
-    TLOG,
-    FlightError,
-    Progress,
-    format_of,
-    open_tlog,
-    read_blocks,
-)
+from gateway.recordings.file_format import NO_RECORDING, TABLE, TLOG, format_of
+from gateway.recordings.files import FlightError, Progress, read_blocks
 from gateway.recordings.flight_facts import FlightFacts, FlightTally, checksum
 from gateway.recordings.recorded_clock import Gap, TimesSpan
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableNote, TableReader
 from gateway.recordings.tallies import MessageTally, RowTally
 from gateway.recordings.tlog_index import DAMAGED_TIME, TlogIndex
+from gateway.recordings.tlog_source import open_tlog
 from gateway.units import US_PER_S, counted
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.mavlink_messages import MESSAGE_NAMES

@@ -30,21 +30,14 @@ from gateway.cli.support.terminal import (
 )
 from gateway.output import write_new
 from gateway.printable import UNKNOWN, figure
-from gateway.recordings.files import (
-    CSV,
-    NO_RECORDING,
-    TLOG,
-    FlightError,
-    Progress,
-    format_of,
-    open_tlog,
-    read_blocks,
-)
+from gateway.recordings.file_format import CSV, NO_RECORDING, TLOG, format_of
+from gateway.recordings.files import FlightError, Progress, read_blocks
 from gateway.recordings.index import Recording, list_recordings
 from gateway.recordings.moment import civil_time
 from gateway.recordings.summary import FileInfo, VehicleInfo, read_summary
 from gateway.recordings.table import TableFault, TableHeader, TableReader, encode_block, encode_head
 from gateway.recordings.tlog_index import DAMAGED, DAMAGED_TIME, INCOMPLETE
+from gateway.recordings.tlog_source import open_tlog
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:

@@ -14,9 +14,11 @@ from rich.progress import DownloadColumn, TimeElapsedColumn, TimeRemainingColumn
 from gateway.cli.support.control import recordings_folder
 from gateway.cli.support.options import folder_of
 from gateway.cli.support.terminal import console_of, progress_bar, refuse
-from gateway.recordings.files import TABLE, TLOG, FlightError, Position, SettingsChoice, format_of
+from gateway.recordings.file_format import TABLE, TLOG, format_of
+from gateway.recordings.files import FlightError
 from gateway.recordings.index import NEWEST, RecordingError, find_recording, recording_name
 from gateway.recordings.moment import Moment, parse_moment
+from gateway.recordings.recorded_table import Position, SettingsChoice
 
 if TYPE_CHECKING:
     from gateway.analysis.flight import Flight

@@ -10,14 +10,8 @@ from typing import Any, Final, TypeVar
 
 from pymavlink.DFReader import DFReader_binary, DFReader_text
 
-from gateway.recordings.files import (
-    DATAFLASH_BEGIN,
-    FlightError,
-    name_of,
-    read_chunks,
-    skip_to,
-    temporary_copy,
-)
+from gateway.recordings.file_format import DATAFLASH_BEGIN, skip_to
+from gateway.recordings.files import FlightError, name_of, read_chunks, temporary_copy
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.units import counted
 

@@ -13,15 +13,8 @@ from typing import Any, Final
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
-from gateway.recordings.files import (
-    ULOG_BEGIN,
-    ULOG_HEAD,
-    FlightError,
-    name_of,
-    read_chunks,
-    skip_to,
-    temporary_copy,
-)
+from gateway.recordings.file_format import ULOG_BEGIN, ULOG_HEAD, skip_to
+from gateway.recordings.files import FlightError, name_of, read_chunks, temporary_copy
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.units import counted
 

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.gps_time import GPS_EPOCH_UNIX_US
-from gateway.recordings.files import TlogSource
 from gateway.recordings.recorded_clock import DAY_US, LAST_CIVIL_US
+from gateway.recordings.tlog_source import TlogSource
 from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.recordings.workshop.editing import FrameEdit
 from gateway.recordings.workshop.private_fields import (

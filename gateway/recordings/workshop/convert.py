@@ -13,15 +13,8 @@ from typing import Any, Final
 from weakref import finalize
 
 from gateway.recordings.autopilot_record import AutopilotLog, RecordTranslator
-from gateway.recordings.files import (
-    NO_RECORDING,
-    TABLE,
-    TLOG,
-    FlightError,
-    TlogSource,
-    format_of,
-    open_tlog,
-)
+from gateway.recordings.file_format import NO_RECORDING, TABLE, TLOG, format_of
+from gateway.recordings.files import FlightError
 from gateway.recordings.formats import message_csv
 from gateway.recordings.formats.maps import (
     DRAWN_IDS,
@@ -46,6 +39,7 @@ from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, aircraft_of
 from gateway.recordings.table import encode_block, encode_head
 from gateway.recordings.tlog import encode_record
+from gateway.recordings.tlog_source import TlogSource, open_tlog
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.recordings.workshop.editing import NOTHING_LEFT, TlogEdits
 from gateway.recordings.workshop.joining import joined_tables, trimmed

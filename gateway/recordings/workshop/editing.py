@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.recordings.files import FlightError, TlogSource
+from gateway.recordings.files import FlightError
 from gateway.recordings.tlog import encode_record
+from gateway.recordings.tlog_source import TlogSource
 from gateway.recordings.workshop.selection import (
     NOTHING_WITHIN,
     ChosenState,

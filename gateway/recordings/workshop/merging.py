@@ -22,8 +22,9 @@ from typing import Final
 
 import numpy as np
 
-from gateway.recordings.files import Progress, TlogSource
+from gateway.recordings.files import Progress
 from gateway.recordings.tlog import TlogScanner, encode_record
+from gateway.recordings.tlog_source import TlogSource
 from gateway.units import US_PER_S, counted
 from gateway.wire.frame_scan import TIME_SIZE
 from gateway.wire.recorded_frames import Batch, IntArray, RecordedFrame

@@ -12,7 +12,8 @@ from gateway.estimation.kernel import FoundLatency
 from gateway.estimation.select import EstimationSettings
 from gateway.recordings import recorded_fusion as log_facts
 from gateway.recordings.columns import TableRow
-from gateway.recordings.files import TABLE, FlightError
+from gateway.recordings.file_format import TABLE
+from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_table import header_for
 from gateway.records import ImuCalibrated, ImuFlags
 from tests.kit.recordings import write_table

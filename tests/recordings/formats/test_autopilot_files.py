@@ -18,7 +18,8 @@ from gateway.cli.support.options import read_options
 from gateway.cli.support.recording_options import load_flight
 from gateway.config import GatewaySettings
 from gateway.recordings.columns import TableRow
-from gateway.recordings.files import TLOG, FlightError, format_of
+from gateway.recordings.file_format import TLOG, format_of
+from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
 from gateway.recordings.opening import open_flights
 from gateway.recordings.reading import open_rows

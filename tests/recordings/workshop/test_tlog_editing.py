@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.files import open_tlog
 from gateway.recordings.tlog import TlogScanner
+from gateway.recordings.tlog_source import open_tlog
 from gateway.recordings.workshop.merging import MAX_SAMPLE, Alignment, FrameSample, batched
 from gateway.recordings.workshop.selection import (
     MAX_MARGIN_S,
