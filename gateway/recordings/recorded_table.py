@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
@@ -17,6 +17,8 @@ from gateway.recordings.formats.csv import ColumnMap
 from gateway.recordings.table import (
     BLOCK_ROWS,
     HEAD_LINES,
+    Position,
+    SettingsChoice,
     TableBlock,
     TableFault,
     TableHeader,
@@ -27,8 +29,6 @@ from gateway.recordings.table import (
 from gateway.records import FusionState, NodeStatus
 from gateway.sensing.calibration import NodeCalibration
 
-Position = Literal["causal", "interpolated"]
-SettingsChoice = Literal["recorded", "current"]
 Line = TableRow | TableHeader | TableNote | FusionState | NodeStatus
 
 

@@ -18,7 +18,7 @@ not known, or no new value.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import msgspec
 import numpy as np
@@ -53,6 +53,10 @@ MAX_LINE: Final = 1 << 20
 zeros without line ends."""
 
 
+Position = Literal["causal", "interpolated"]
+"""Positions of a table that is fused again."""
+SettingsChoice = Literal["recorded", "current"]
+"""Settings that a table is fused again with."""
 TimeUs = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
 """A time in µs; the sum of two fits 64 bits."""
 IntArray = NDArray[np.int64]

@@ -5,9 +5,18 @@ import math
 import pytest
 
 from gateway.recordings.play import Player, PlayState
+from gateway.recordings.tlog import STRIDE
 from gateway.wire.mavlink_splitter import origin_of
 from gateway.wire.recorded_frames import RecordedFrame
-from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, make_track, with_jump
+from tests.kit.recordings import (
+    START_US,
+    STEP_US,
+    make_records,
+    make_tlog,
+    make_track,
+    play_all,
+    with_jump,
+)
 
 MANY = 10_000
 RECORDS = make_records(100)
@@ -185,6 +194,14 @@ def test_several_recordings_interleave_by_time() -> None:
     found = play_to_end(player)
     assert [origin_of(frame)[0] for _, frame in found] == [1, 2] * 100
     assert [time_us for time_us, _ in found] == [i * STEP_US // 2 for i in range(200)]
+
+
+@pytest.mark.parametrize("at", [0, 1, STRIDE - 1, STRIDE, STRIDE + 1, 999])
+def test_seek_goes_to_the_first_record_not_before(at: int) -> None:
+    records = make_records(1000)
+    track = make_track(make_tlog(records))
+    track.seek(records[at].time_us - STEP_US + 1)
+    assert play_all(track) == records[at:]
 
 
 def test_empty_recording_ends_at_once() -> None:

@@ -102,10 +102,3 @@ def test_lines_between_rows_stay_there_and_settings_are_followed() -> None:
         FusionState, TableNote, TableHeader
     ]  # fmt: skip
     assert found[501:503] == [mark, header]
-
-
-def test_state_of_other_settings_is_refused_and_left_out() -> None:
-    state = Aircraft(1, settings_for("eskf")).fusion_state
-    fusion = Fusion(1, settings_for("paper"), follow=True)
-    assert fusion.block(block_of([state])).comments == ()
-    assert fusion.refused == ["it is of another version or other settings"]

@@ -112,12 +112,6 @@ def test_jump_of_the_clock_by_years_does_not_add_to_the_duration(years: int, chu
     assert [gap.duration_s for gap in info.gaps] == ([leap_us / 1e6 + 1.0] if years > 0 else [])
 
 
-def test_vehicles_are_summarised_separately() -> None:
-    records = [r for pair in zip(make_flight(9, 1), make_flight(9, 2), strict=True) for r in pair]
-    info = sum_up(make_tlog(records))
-    assert [vehicle.system_id for vehicle in info.vehicles] == [1, 2]
-
-
 def test_table_is_summarised(rng: np.random.Generator) -> None:
     builder = RowBuilder()
     text = encode_head(TableHeader(vehicle_id=3))

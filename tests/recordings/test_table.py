@@ -73,27 +73,6 @@ def test_truncated_table_loses_at_most_its_last_line() -> None:
         assert len(faults) == (size > 0 and not data[:size].endswith(b"\n"))
 
 
-def test_damaged_line_loses_only_itself() -> None:
-    rows = make_rows(4, 6)
-    lines = make_table(rows).split(b"\n")
-    lines[4] = bytes(300)
-    lines[5] = b"1,2,3"
-    events = read(b"\n".join(lines))[1]
-    assert [e.line for e in events if isinstance(e, TableFault)] == [5, 6]
-    assert repr([e for e in events if isinstance(e, TableRow)]) == repr([rows[0], *rows[3:]])
-
-
-def test_damaged_line_has_its_number_in_the_file() -> None:
-    reader = TableReader()
-    whole = make_table(make_rows(4, 6))
-    reader.feed(whole)
-    rows = "".join(map(row_to_line, make_rows(4, 6))).encode()
-    reader.feed(rows)
-    (fault,) = reader.feed(b"1,2,3\n")
-    assert isinstance(fault, TableFault)
-    assert fault.line == (whole + rows).count(b"\n") + 1
-
-
 @pytest.mark.parametrize("chunk", [None, 4096])
 def test_endless_zeros_are_read_within_bounded_memory(chunk: int | None) -> None:
     rows = make_rows(5, 4)

@@ -212,12 +212,6 @@ def test_index_stays_in_order_where_the_clock_jumped_back() -> None:
     assert index.offset_before(last_us) < len(data)
 
 
-def test_index_of_an_empty_file_is_empty() -> None:
-    index = index_of(scan(b""))
-    assert (index.count, index.first_us, index.last_us) == (0, None, None)
-    assert index.offset_before(START_US) == 0
-
-
 UTC_US = 1_781_000_000_000_000
 MINUTE_US = 60_000_000
 

@@ -18,7 +18,7 @@ from gateway.recordings.file_format import TABLE, TLOG, format_of
 from gateway.recordings.files import FlightError
 from gateway.recordings.index import NEWEST, RecordingError, find_recording, recording_name
 from gateway.recordings.moment import Moment, parse_moment
-from gateway.recordings.recorded_table import Position, SettingsChoice
+from gateway.recordings.table import Position, SettingsChoice
 
 if TYPE_CHECKING:
     from gateway.analysis.flight import Flight

@@ -121,11 +121,6 @@ def test_velocity_of_a_fix_is_from_its_course_and_the_climb_of_the_position() ->
     assert second.utc_us is None
 
 
-def test_message_without_a_fix_is_not_ok() -> None:
-    (fix,) = fixes_of([(0, gps(0, fix=1))])
-    assert not fix.fix_ok
-
-
 def test_other_systems_and_components_are_ignored() -> None:
     assert read([(0, raw(0))], component_id=191) == []
     assert rows_of(AutopilotReader(system_id=2), records_sent([((1, 1), raw(0))])) == []
@@ -169,9 +164,13 @@ def test_fix_without_a_time_follows_the_imu_despite_clock_drift() -> None:
     assert fixes == [*range(4_000, 4_000_000, 200_000)]
 
 
-@pytest.mark.parametrize(("age_us", "is_known"), [(500_000, True), (500_001, False)])
-def test_climb_rate_is_unknown_once_it_is_outdated(age_us: int, is_known: bool) -> None:
-    (fix,) = fixes_of([(0, position(0, -150)), (age_us, gps(age_us))])
+@pytest.mark.parametrize(
+    ("age_us", "fix_type", "is_known"), [(500_000, 3, True), (500_001, 3, False), (1, 2, False)]
+)
+def test_climb_rate_is_known_while_it_is_new_and_the_fix_has_a_height(
+    age_us: int, fix_type: int, is_known: bool
+) -> None:
+    (fix,) = fixes_of([(0, position(0, -150)), (age_us, gps(age_us, fix=fix_type))])
     assert math.isfinite(fix.vel_n_mps[2]) == is_known
 
 
@@ -181,16 +180,12 @@ def test_climb_rate_is_unknown_after_a_lost_fix() -> None:
     flight = [(n * 500_000, gps(n * 500_000 + 1, *height)) for n, height in enumerate(heights)]
     assert [math.isfinite(fix.vel_n_mps[2]) for fix in fixes_of(flight)] == [False] * 4
     lost = fixes_of(flight)[1]
+    assert not lost.fix_ok
     assert not any(map(math.isfinite, lost.vel_n_mps))
     positions = [(at_us, position(at_us // 1000, 20)) for at_us, _ in flight]
     both = [message for pair in zip(positions, flight, strict=True) for message in pair]
     downs = [fix.vel_n_mps[2] for fix in fixes_of(both)]
     assert downs == pytest.approx([0.2, math.nan, 0.2, 0.2], nan_ok=True)
-
-
-def test_climb_rate_of_a_2d_fix_is_unknown() -> None:
-    (fix,) = fixes_of([(0, position(0, -150)), (0, gps(1, fix=2))])
-    assert math.isnan(fix.vel_n_mps[2])
 
 
 def attitude(time_ms: int) -> Message:

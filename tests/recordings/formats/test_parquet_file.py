@@ -78,19 +78,6 @@ def test_one_kind_of_message_is_a_typed_table(tmp_path: Path) -> None:
     assert (mode.type, mode.metadata) == (pa.uint8(), {b"enum": b"MAV_SEVERITY"})
 
 
-@pytest.mark.parametrize(
-    ("message", "said"),
-    [
-        ("VFR_HUD", "contains no VFR_HUD, but ATTITUDE"),
-        ("NONSENSE", "no MAVLink message is named NONSENSE"),
-    ],
-)
-def test_message_that_the_file_lacks_is_refused(tmp_path: Path, message: str, said: str) -> None:
-    path, out = write_tlog(tmp_path / "x.tlog", make_records(30)), tmp_path / "a.parquet"
-    assert said in run("convert", path, "-o", out, "--message", message, code=2)
-    assert not out.exists()
-
-
 def test_parquet_is_written_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """So memory is bounded by a few rows."""
     monkeypatch.setattr(parquet_file, "ROWS", 50)
