@@ -19,10 +19,12 @@ SUSPENDED_S: Final = 60.0
 """After a longer delay, as of a suspended machine, the frames continue without drops."""
 CATCH_UP_S: Final = 2.0
 """Frames that stay late for longer are generated too slowly: all of them would be dropped."""
+DROPS_AT_ONCE: Final = 64
+"""Frames dropped in the time of writing one: they cost little more than their generation."""
 
 NAME: Final = "pseudo-terminal of the simulated receiver (/dev/ptmx)"
 MAX_BATCH: Final = 4
-"""Maximum frames written or dropped before the loop's other work gets its turn."""
+"""Maximum frames written before the loop's other work gets its turn; some are generated first."""
 
 
 class PtyPort:
@@ -73,7 +75,8 @@ class PtyPort:
     def _advance(self) -> None:
         loop = asyncio.get_running_loop()
         self._timer = None
-        for _ in range(MAX_BATCH):
+        budget = MAX_BATCH * DROPS_AT_ONCE
+        while budget > 0:
             if self._next is None:
                 self._next = next(self._frames, None)
             if self._next is None:
@@ -88,11 +91,13 @@ class PtyPort:
                 self._late_since_s = None
             elif self._is_dropped(late_s):
                 self.dropped += 1
+                budget -= MAX_BATCH
                 self._next = None
                 continue
             else:
                 self._start_s += late_s
             self._write(self._next.data)
+            budget -= DROPS_AT_ONCE
             self._next = None
         self._timer = loop.call_soon(self._advance)
 
