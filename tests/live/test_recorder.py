@@ -1,9 +1,11 @@
-"""The recorder on a real folder, turned by hand on a manual clock."""
+"""The recorder on a real folder and on a small disk, turned by hand on a manual clock."""
 
 import errno
 import itertools
 import os
 import shutil
+import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -408,3 +410,53 @@ async def test_recording_is_reported_once_the_disk_has_written_something(
     assert outcome() == (False, "")
     await bench.record(FRAMES[5:])
     assert outcome() == (True, "")
+
+
+SIZE = 2 << 20
+
+
+def mount(*arguments: str) -> None:
+    done = subprocess.run(["mount", *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip(f"mounting is not allowed here: {done.stderr.strip()}")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    if os.geteuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("mounting a disk needs root")
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount("-t", "tmpfs", "-o", f"size={SIZE}", "tmpfs", str(folder))
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@pytest.fixture
+async def small(small_disk: Path, make_bench: MakeBench) -> RecorderBench:
+    made = make_bench(small_disk / "recordings")
+    await made.turn()
+    await made.record(FRAMES[:5])
+    assert made.troubles == []
+    return made
+
+
+async def test_full_disk_stops_recording_until_there_is_space(
+    small: RecorderBench, small_disk: Path
+) -> None:
+    ballast = small_disk / "ballast"
+    with pytest.raises(OSError, match="No space left"):
+        ballast.write_bytes(bytes(2 * SIZE))
+    # The page that the file has begun has room for some of these, which are taken back.
+    await small.record(FRAMES[5:] * 20)
+    assert small.troubles == ["Recording stopped: disk is full"]
+    assert small.recorder.status().reason == "disk is full"
+    await small.record(FRAMES[5:8], RETRY_S)
+    assert not small.recorder.recording
+    ballast.unlink()
+    await small.turn(RETRY_S)
+    await small.record(FRAMES[8:])
+    assert small.recorder.recording
+    assert frames_of(small.recorder.folder) == FRAMES[:5] + FRAMES[8:]
+    assert small.announced[-1] == (False, f"Recording {NAME}")
+    assert len(small.troubles) == 1
