@@ -53,9 +53,9 @@ class PlayerEdge:
         emit: Callable[[Iterable[bytes]], None],
         now_us: Callable[[], int],
         *,
-        repeat: Callable[[Iterable[bytes]], None] | None = None,
+        repeat: Callable[[Iterable[bytes]], None] = lambda _: None,
         files: Sequence[str] = (),
-        on_end: Callable[[], None] | None = None,
+        on_end: Callable[[], None] = lambda: None,
     ) -> None:
         self._player = player
         self._emit = emit
@@ -104,8 +104,7 @@ class PlayerEdge:
     def stop(self) -> PlayerStatus:
         """End the playback."""
         self._player.pause(self._clock())
-        if self._on_end is not None:
-            self._on_end()
+        self._on_end()
         return self.status()
 
     def step(self, count: int = 1) -> PlayerStatus:
@@ -180,11 +179,11 @@ class PlayerEdge:
         elif due_us is not None:
             wait_s = min(max((due_us - self._clock()) / US_PER_S, 0.0), LONGEST_WAIT_S)
         self._timer = asyncio.get_running_loop().call_later(wait_s, self._turn)
-        if was_playing and state is PlayState.ENDED and not is_seeking and self._on_end is not None:
+        if was_playing and state is PlayState.ENDED and not is_seeking:
             self._on_end()
 
     def _hold(self) -> None:
         """Repeat the state if nothing was emitted for a while."""
-        if self._repeat is not None and self._clock() - self._emitted_us >= HOLD_US:
+        if self._clock() - self._emitted_us >= HOLD_US:
             self._emitted_us = self._clock()
             self._repeat(self._player.held())
