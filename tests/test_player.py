@@ -167,6 +167,8 @@ async def test_all_parameters_arrive_with_consecutive_sequence_numbers(
     ]
     # What was played before ended with 1; the answers go on from there.
     assert [f[4] for f in station.frames[:PARAMETERS]] == list(range(2, 2 + PARAMETERS))
+    # Recorded frames are shifted by the number of answers from then on.
+    assert [f[4] for f in station.frames[PARAMETERS:]] == [PARAMETERS, PARAMETERS + 1]
 
 
 class Played:
