@@ -74,6 +74,7 @@ class Running:
         trusted: str = "yes",
         flies: bool = True,
         passphrase: str = "",
+        mode: str = "always",
         line: Callable[[], Iterator[TimedFrame]] = board,
     ) -> None:
         self.station = Station(None, socket.SOCK_DGRAM, (255, STATION))
@@ -87,7 +88,7 @@ class Running:
                     f"udp-listen:127.0.0.1:{self.port}",
                 )
             ),
-            recording=RecordingSettings(folder=str(self.recordings), mode="always"),
+            recording=RecordingSettings(folder=str(self.recordings), mode=mode),
             serial=SerialSettings(port="none"),
             vehicle=VehicleSettings(signing_passphrase=passphrase),
         )
@@ -228,6 +229,19 @@ async def test_note_without_an_own_aircraft_is_sent_by_the_hub(tmp_path: Path) -
             chunks = [await running.receive("STATUSTEXT") for _ in range(2)]
     assert {chunk.get_srcSystem() for chunk in chunks} == {7}
     assert "".join(chunk.text for chunk in chunks) == "Note: " + "x" * 50
+
+
+async def test_foreign_vehicle_is_recorded_from_arming_on(tmp_path: Path) -> None:
+    def state_after(armed: bool) -> str:
+        vehicle.sendto(sender.heartbeat(armed=armed), ("127.0.0.1", running.port))
+        return running.daemon.snapshot().recorder.state
+
+    sender = Sender(7)
+    async with Running(tmp_path, flies=False, mode="armed") as running:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+            await until(lambda: state_after(False) and running.daemon.snapshot().vehicles, 0.01)
+            assert state_after(False) == "idle"
+            await until(lambda: state_after(True) == "recording", 0.01)
 
 
 @pytest.mark.parametrize("due_us", [0, 999_000_000], ids=["overdue", "far"])
