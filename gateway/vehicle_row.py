@@ -16,7 +16,7 @@ SILENT_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class VehicleRow:
-    """Status of one vehicle of the hub, own or foreign, from its MAVLink; None is unknown."""
+    """Status of one vehicle of the hub, from its MAVLink; None and NaN are unknown."""
 
     system_id: int
     kind: str

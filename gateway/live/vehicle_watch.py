@@ -5,7 +5,6 @@ at most, since a router passes on thousands. The lost frames of a system are cou
 numbers; with several links to one system, only frames that all of them lost count.
 """
 
-import math
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Final
@@ -116,15 +115,11 @@ class VehicleWatch:
             armed=state.is_armed(),
             lat_deg=None if at is None else at.lat_deg,
             lon_deg=None if at is None else at.lon_deg,
-            alt_amsl_m=_known(at.alt_amsl_m) if at is not None else None,
+            alt_amsl_m=None if at is None else at.alt_amsl_m,
             fix_type=None if fix is None else fix.fix_type,
-            battery_v=_known(volts),
-            battery_percent=_known(percent),
+            battery_v=volts,
+            battery_percent=percent,
             link=link,
             age_s=state.age_us(now_us, *state.heard_us) / US_PER_S,
             loss=stream.lost / (stream.lost + stream.count) if stream else None,
         )
-
-
-def _known(value: float) -> float | None:
-    return value if math.isfinite(value) else None
