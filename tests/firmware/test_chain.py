@@ -30,9 +30,9 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 START_S = 10.0
 """Into the flight: it stands on the runway until 12.9 s, long enough for the first fix by NMEA."""
-FLOWN_S = 20.0
+FLOWN_S = 15.0
 """Take-off, climb, and from 22 s on the first turn."""
-COUNTED_S = 5
+COUNTED_S = 3
 SETTLED_S = 3.0
 CHUNK_S = 0.01
 RMS_DEG = 1.2
@@ -40,7 +40,7 @@ WORST_DEG = 4.0
 """Twice what this flight gives; the simulator's own nodes give as much."""
 HEADING_DEG = 2.0
 HEIGHT_M = 2.0
-FAULT_S = 12.0
+FAULT_S = 7.0
 
 
 @dataclass
