@@ -18,6 +18,8 @@ M_PER_CM: Final = 1e-2
 PA_PER_HPA: Final = 100.0
 BITS_PER_BYTE: Final = 10
 """Bits that a serial line transfers for a byte: 8 data bits, no parity, a start and a stop bit."""
+FIX_2D: Final = 2
+"""Least GPS_FIX_TYPE with a position; DataFlash and ULog use the same numbers."""
 
 
 def counted(number: int, noun: str) -> str:

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from typing import Final
 
 from gateway.printable import UNKNOWN, figure, printable
+from gateway.units import FIX_2D
 
 VEHICLE_HEADS: Final = (
     *("vehicle", "type", "mode", "armed", "position", "AMSL m", "battery", "link", "age s"),
     "loss",
 )
-FIX_2D: Final = 2
 SILENT_S: Final = 5.0
 """Age of the newest message from which the log line states it."""
 

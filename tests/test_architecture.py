@@ -41,7 +41,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "sources": FOUNDATION | {"wire", "printable", "hub.endpoint", *COLUMN_CODEC},
     "aircraft": FOUNDATION | {"wire", "sensing", "estimation", "vehicle"},
     "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft", "sources"},
-    "vehicle_row": {"printable"},
+    "vehicle_row": {"printable", "units"},
     "status": FOUNDATION | {"hub", "vehicle", "aircraft", "printable", "vehicle_row"},
     "vehicle_state": FOUNDATION | {"wire"},
     "answers": FOUNDATION | {"wire", "vehicle", "vehicle_state"},

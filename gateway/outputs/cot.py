@@ -16,34 +16,22 @@ from datetime import UTC, datetime, timedelta
 from typing import Final
 from xml.etree import ElementTree
 
-from pymavlink.dialects.v20 import all as mavlink
-
 from gateway.hub.endpoint import Endpoint, EndpointKind
 from gateway.outputs.output import Output
 from gateway.units import US_PER_S
 from gateway.vehicle_state.newest import NewestState
 from gateway.vehicle_state.positions import Position
+from gateway.wire.vehicle_types import CLASSES
 
 HEADER: Final = '<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'
 UNKNOWN: Final = 9_999_999.0
 """Value for an unknown height or error, defined by the specification."""
 UNMANNED_PLANE, UNMANNED_ROTOR = "a-f-A-M-F-Q", "a-f-A-M-H-Q"
-ROTORS: Final = frozenset(
-    (
-        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_COAXIAL, mavlink.MAV_TYPE_HELICOPTER,
-        mavlink.MAV_TYPE_HEXAROTOR, mavlink.MAV_TYPE_OCTOROTOR, mavlink.MAV_TYPE_TRICOPTER,
-        mavlink.MAV_TYPE_DODECAROTOR, mavlink.MAV_TYPE_DECAROTOR,
-    )
-)  # fmt: skip
 TYPES: Final = {
-    **dict.fromkeys(ROTORS, UNMANNED_ROTOR),
-    mavlink.MAV_TYPE_AIRSHIP: "a-f-A-M-L",
-    mavlink.MAV_TYPE_FREE_BALLOON: "a-f-A-M-L",
-    mavlink.MAV_TYPE_GROUND_ROVER: "a-f-G-E-V",
-    mavlink.MAV_TYPE_SURFACE_BOAT: "a-f-S",
-    mavlink.MAV_TYPE_SUBMARINE: "a-f-U",
-}
-"""CoT types (friendly) by MAV_TYPE; all others are unmanned fixed-wing aircraft."""
+    "copter": UNMANNED_ROTOR, "balloon": "a-f-A-M-L", "rover": "a-f-G-E-V", "boat": "a-f-S",
+    "sub": "a-f-U",
+}  # fmt: skip
+"""CoT types (friendly) by class of vehicle; all others are unmanned fixed-wing aircraft."""
 LEAST_STALE_S: Final = 10.0
 STALE_INTERVALS: Final = 3.0
 """Intervals without a new event after which one is stale, but at least the time above."""
@@ -99,7 +87,7 @@ def event_of(
     accuracies = (report.h_acc_m, report.v_acc_m) if report else (math.nan, math.nan)
     event = ElementTree.Element("event", version="2.0")
     event.set("uid", f"mavgate.{socket.gethostname()}.{system_id}")
-    event.set("type", TYPES.get(state.kind(), UNMANNED_PLANE))
+    event.set("type", TYPES.get(CLASSES.get(state.kind(), ""), UNMANNED_PLANE))
     event.set("how", "m-g")
     times = {"time": at, "start": at, "stale": at + timedelta(seconds=stale_s)}
     event.attrib.update({name: _written(time) for name, time in times.items()})

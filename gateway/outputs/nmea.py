@@ -20,10 +20,10 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.endpoint import Endpoint, EndpointKind
 from gateway.outputs.output import Output, station_of
-from gateway.units import US_PER_S
+from gateway.units import FIX_2D, US_PER_S
 from gateway.vehicle_state.antenna import Pointing, pointing_of
 from gateway.vehicle_state.newest import NewestState
-from gateway.vehicle_state.positions import FIX_2D, Position
+from gateway.vehicle_state.positions import Position
 
 KNOTS_PER_MPS: Final = 3600 / 1852
 KMH_PER_MPS: Final = 3.6

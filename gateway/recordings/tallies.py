@@ -28,23 +28,17 @@ from gateway.recordings.flight_facts import MAX_TEXTS, POINT_US, FlightTally, ch
 from gateway.recordings.table import TableBlock
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.records import NAN, NodeStatus
-from gateway.units import DEG_PER_DEGE7, MV_PER_V, US_PER_S
-from gateway.vehicle_state.positions import FIX_2D, GPS_IDS, Position, named_position
+from gateway.units import DEG_PER_DEGE7, FIX_2D, MV_PER_V, US_PER_S
+from gateway.vehicle_state.positions import GPS_IDS, Position, named_position
 from gateway.vehicle_state.senders import RecordedSender, Senders
 from gateway.wire.frame_scan import TIME_SIZE
 from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS, MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import SEQUENCE_V1, SEQUENCE_V2, START_V2
 from gateway.wire.recorded_frames import Batch, IntArray, columns_of
+from gateway.wire.vehicle_types import CLASSES, SURFACE
 
 ERROR: Final = 3
 """MAV_SEVERITY_ERROR; lower numbers are more severe."""
-SURFACE_TYPES: Final = frozenset(
-    {
-        *(mavlink.MAV_TYPE_GROUND_ROVER, mavlink.MAV_TYPE_SURFACE_BOAT),
-        *(mavlink.MAV_TYPE_SUBMARINE, mavlink.MAV_TYPE_ANTENNA_TRACKER),
-    }
-)
-"""Values of MAV_TYPE that never fly."""
 STATES, FIXES = "states", "GPS fixes"
 """Rows with the positions of a table."""
 Columns = NDArray[np.void]
@@ -87,7 +81,7 @@ class VehicleTally(FlightTally):
         self.vehicle = vehicle
         self.firmware: str | None = None
         """Version of the autopilot's firmware."""
-        self.is_surface = (vehicle.heartbeat or (0, 0))[0] in SURFACE_TYPES
+        self.is_surface = CLASSES.get((vehicle.heartbeat or (0, 0))[0]) in SURFACE
         self._parameters: dict[bytes, float] = {}
         self._drops = np.zeros(2, np.int64)
         """Sum and number of the reported losses."""

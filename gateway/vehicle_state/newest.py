@@ -14,9 +14,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import from_euler
 from gateway.records import NAN, UNKNOWN_VEC3, Quat, Vec3
-from gateway.units import DEG_PER_CDEG, M_PER_CM, M_PER_MM, MV_PER_V, US_PER_S
+from gateway.units import DEG_PER_CDEG, FIX_2D, M_PER_CM, M_PER_MM, MV_PER_V, US_PER_S
 from gateway.vehicle_state.positions import (
-    FIX_2D,
     RANKS,
     UNKNOWN_U16,
     Position,

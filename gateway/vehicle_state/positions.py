@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import displacement_m, offset_deg, radii_m
 from gateway.records import NAN, UNKNOWN_VEC3, Vec3
-from gateway.units import DEG_PER_DEGE7, M_PER_CM, M_PER_MM, US_PER_S
+from gateway.units import DEG_PER_DEGE7, FIX_2D, M_PER_CM, M_PER_MM, US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]
 
-FIX_2D: Final = 2
-"""GPS_FIX_TYPE_2D_FIX."""
 UNKNOWN_U16: Final = 65535
 MAX_LAT_DEGE7, MAX_LON_DEGE7 = 900_000_000, 1_800_000_000
 GPS_IDS: Final = (MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["GPS2_RAW"])

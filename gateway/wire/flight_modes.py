@@ -4,6 +4,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.wire.vehicle_types import CLASSES
+
 PX4_MODES: Final = {
     1: "MANUAL", 2: "ALTCTL", 3: "POSCTL", 4: "AUTO", 5: "ACRO", 6: "OFFBOARD", 7: "STABILIZED",
 }  # fmt: skip
@@ -12,11 +14,10 @@ PX4_AUTO_MODES: Final = {
     9: "PRECLAND",
 }  # fmt: skip
 ARDUPILOT_MODES: Final = {
-    **dict.fromkeys((1, 16, *range(19, 26)), "PLANE_MODE"),
-    **dict.fromkeys((2, 3, 4, 13, 14, 15, 29, 35), "COPTER_MODE"),
-    **dict.fromkeys((10, 11), "ROVER_MODE"), 12: "SUB_MODE", 5: "TRACKER_MODE",
+    "plane": "PLANE_MODE", "vtol": "PLANE_MODE", "copter": "COPTER_MODE", "rover": "ROVER_MODE",
+    "boat": "ROVER_MODE", "sub": "SUB_MODE", "tracker": "TRACKER_MODE",
 }  # fmt: skip
-"""Enumeration of the modes by MAV_TYPE; those of other types are not known."""
+"""Enumeration of the modes by class of vehicle; those of others are not known."""
 
 
 def mode_name(autopilot: int, mav_type: int, number: int) -> str:
@@ -25,6 +26,6 @@ def mode_name(autopilot: int, mav_type: int, number: int) -> str:
         return PX4_AUTO_MODES.get(number >> 24, "") or PX4_MODES.get(number >> 16 & 0xFF, "")
     if autopilot != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
         return ""
-    words = ARDUPILOT_MODES.get(mav_type, "")
+    words = ARDUPILOT_MODES.get(CLASSES.get(mav_type, ""), "")
     entry = mavlink.enums[words].get(number) if words else None
     return "" if entry is None else str(entry.name).removeprefix(f"{words}_")

@@ -36,10 +36,9 @@ from gateway.recordings.recorded_clock import LogClock
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.workshop.extracts import CIRCLES
 from gateway.records import NAN
-from gateway.units import DEGE7_PER_DEG, US_PER_S, counted
+from gateway.units import DEGE7_PER_DEG, FIX_2D, US_PER_S, counted
 from gateway.vehicle.encoding import int32
 from gateway.vehicle.plan import FENCE, MISSION, RALLY, Item
-from gateway.vehicle_state.positions import FIX_2D
 
 TIME_COLUMNS: Final = frozenset({"TimeUS", "TimeMS"})
 INSTANCES: Final = frozenset({"I", "C", "Instance", "Inst", "IMU"})

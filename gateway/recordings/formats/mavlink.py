@@ -24,7 +24,14 @@ from gateway.recordings.columns import BARO, COLUMNS, GPS, LARGEST_WHOLE, NAV, S
 from gateway.recordings.formats.csv import level_velocity
 from gateway.recordings.recorded_clock import FIRST_CIVIL_US
 from gateway.records import NAN, GpsFixType, ImuFlags, NavFlags
-from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S, UT_PER_GAUSS
+from gateway.units import (
+    DEG_PER_DEGE7,
+    FIX_2D,
+    PA_PER_HPA,
+    STANDARD_GRAVITY_MPS2,
+    US_PER_S,
+    UT_PER_GAUSS,
+)
 from gateway.vehicle_state.positions import is_located
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.mavlink_messages import layout_of
@@ -37,7 +44,7 @@ UNKNOWN_U16: Final = 65535
 UNKNOWN_U8: Final = 255
 MAG_FIELDS: Final = 0b111 << 6
 """Bits of the magnetometer in `fields_updated` of HIGHRES_IMU."""
-FIX_2D, FIX_3D = 2, 3
+FIX_3D: Final = 3
 GPS_NODE: Final = 1
 
 Fields = NDArray[np.void]

@@ -31,8 +31,8 @@ from gateway.recordings.formats.ulog import NEEDED, load
 from gateway.recordings.message_table import MessageTable, read_table
 from gateway.recordings.recorded_clock import FIRST_CIVIL_US, sound_times
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.units import counted
-from gateway.vehicle_state.positions import FIX_2D
+from gateway.units import FIX_2D, counted
+from gateway.wire.vehicle_types import CLASSES
 
 Topic = Mapping[str, NDArray[Any]]
 Instance = tuple[str, int]
@@ -57,11 +57,8 @@ ARMED: Final = 2
 FIRMWARE: Final = 0
 """Kind of default parameters: those of the firmware, independent of the vehicle."""
 STATUS: Final = "vehicle_status"
-_KINDS: Final = {
-    mavlink.MAV_TYPE_FIXED_WING: "plane", mavlink.MAV_TYPE_GROUND_ROVER: "rover",
-    mavlink.MAV_TYPE_SURFACE_BOAT: "rover", mavlink.MAV_TYPE_SUBMARINE: "sub",
-} | dict.fromkeys(range(19, 26), "vtol")  # fmt: skip
-"""Kind of vehicle by MAV_TYPE; all others are copters."""
+_KINDS: Final = {"plane": "plane", "vtol": "vtol", "rover": "rover", "boat": "rover", "sub": "sub"}
+"""Kind of vehicle by its class; all others are copters."""
 
 
 @cache
@@ -98,7 +95,7 @@ def open_record(path: Path, options: ReadOptions, *, sampled: bool = False) -> A
         vehicle_id=options.system_id or _system_id_of(log),
         autopilot=mavlink.MAV_AUTOPILOT_PX4,
         mav_type=mav_type,
-        kind=_KINDS.get(mav_type, "copter"),
+        kind=_KINDS.get(CLASSES.get(mav_type, ""), "copter"),
         present=frozenset({"SENSORS"} | names),
         counts=_counts_of(log),
         unix_us_at_zero=None if boot_us is None else boot_us + zero_us,
