@@ -346,7 +346,6 @@ class RecordTranslator:
                 yield mavlink.MAVLink_mission_current_message(event.seq, total)
 
     def _change(self, event: LoggedParameter) -> Iterator[Any]:
-        """Yield a parameter if its value has changed."""
         if self._newest.parameters.get(event.name) == event.value:
             return
         self._newest.parameters[event.name] = event.value

@@ -326,7 +326,6 @@ class RowBuilder:
 
 
 def _calibrated(fused: FusedSample) -> ImuCalibrated:
-    """Return the calibrated values of a sample."""
     sample = fused.sample
     return ImuCalibrated(
         sample.time_us,

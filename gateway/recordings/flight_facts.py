@@ -302,12 +302,8 @@ class FlightTally:
         return None
 
     def _restart(self) -> None:
-        """Discard the positions."""
-        self.ground, self._points, self._continuity = (
-            GroundDistance(),
-            _Columns(_POINT),
-            Continuity(),
-        )
+        self.ground, self._continuity = GroundDistance(), Continuity()
+        self._points = _Columns(_POINT)
         self._newest.clear()
 
 

@@ -160,7 +160,6 @@ def fuse(
 def _fuse_singly(
     estimator: Estimator, samples: Samples, on_fix: Callable[[], None] | None
 ) -> FloatArray:
-    """Fuse samples one by one, with any estimator."""
     waiting = deque(samples.aiding)
     rows = []
     for number, sample in enumerate([*samples.imu.samples(), None]):

@@ -252,7 +252,10 @@ def read_summary(
     if kind != TABLE:
         if options is None:
             raise FlightError(f"{file}: {NO_RECORDING}")
-        return _of_other_file(file, kind, options())
+        # These import all stages, which the summary of our own recordings does not need.
+        from gateway.recordings.reading import has_record
+
+        return (_of_log if has_record(file) else _of_rows)(file, kind, options())
     table, reader = TableSummary(), TableReader()
     for block in read_blocks(file, reader, progress):
         table.add(block, reader.header)
@@ -268,13 +271,6 @@ def _of_messages(senders: Senders, batches: Iterable[Batch], size: int) -> Summa
 
 def _with(found: Summary, kind: str, remarks: Iterable[str]) -> Summary:
     return replace(found, info=replace(found.info, kind=kind, remarks=tuple(remarks)))
-
-
-def _of_other_file(file: Path, kind: str, options: ReadOptions) -> Summary:
-    # These import all stages, which the summary of our own recordings does not need.
-    from gateway.recordings.reading import has_record
-
-    return _of_log(file, kind, options) if has_record(file) else _of_rows(file, kind, options)
 
 
 def _of_rows(file: Path, kind: str, options: ReadOptions) -> Summary:

@@ -243,7 +243,6 @@ class CsvReader:
         self.first_fault = self.first_fault or f"line {number}: {why}"
 
     def _find_names(self, head: Sequence[str]) -> tuple[str, list[str], int]:
-        """Find the line with the names of the columns."""
         best: tuple[int, int, str, list[str]] | None = None
         for number, line in enumerate(head):
             for delimiter in DELIMITERS if line.strip() else ():

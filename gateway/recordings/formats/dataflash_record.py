@@ -314,7 +314,6 @@ def _modes_of(firmware: str) -> dict[str, int]:
 
 
 def _item_of(name: str, m: Message) -> LoggedItem:
-    """Return an item of a mission, fence, or rally points."""
 
     def get(name: str) -> float:
         # Always the same NaN object, so that equal items compare equal.
@@ -409,7 +408,6 @@ def _unix_us_at(log: DataFlash, own_us: int) -> int | None:
 
 
 def _why_no_samples(formats: Mapping[str, set[str]], *, is_undecoded: bool) -> str:
-    """Return the reason why a log contains no IMU samples."""
     if not formats.keys() - {"FMT"}:
         return "it has no list of formats (FMT), without which its messages cannot be decoded"
     for name, columns in formats.items():
@@ -465,7 +463,6 @@ def _begin_of(log: DataFlash, modes: Mapping[str, int]) -> list[tuple[int, Event
 
 
 def _set_begin(path: Path, found: AutopilotLog, entries: list[tuple[int, Event]]) -> None:
-    """Set parameters, mission, type and state at the start of a log."""
     begin_us = entries[0][0] if entries else 0
     early_us = begin_us + EARLY_US
     parameters: dict[str, float | int] = {}

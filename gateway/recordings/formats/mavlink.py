@@ -250,7 +250,6 @@ class AutopilotReader:
     def _times(
         self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
     ) -> IntArray:
-        """Convert the times of messages to the rows' clock."""
         own_us = np.zeros(len(message_ids), np.int64)
         for message_id, values in fields.items():
             if "time_usec" in (values.dtype.names or ()):

@@ -64,6 +64,13 @@ _TIME: Final = {
     "properties": {"sec": _INTEGER, "nsec": _INTEGER},
 }
 _AXIS: Final = {"type": "number"}
+_COVARIANCE: Final = {"type": "array", "items": _AXIS, "minItems": 9, "maxItems": 9}
+_STATE: Final = {
+    "roll_deg": ", right wing down positive", "pitch_deg": ", nose up positive",
+    "heading_deg": " from true north, clockwise", "alt_amsl_m": " above mean sea level",
+    "height_m": " above home", "speed_mps": " over the ground", "climb_mps": ", upwards positive",
+}  # fmt: skip
+"""Meaning of each number of a state, after its unit."""
 _NUMBERS: Final = {"float": "number", "double": "number", "char": "string"}
 GPS_ID: Final = MESSAGE_IDS["GPS_RAW_INT"]
 ESTIMATOR_ID: Final = MESSAGE_IDS["ESTIMATOR_STATUS"]
@@ -83,57 +90,28 @@ def _number(description: str) -> dict[str, Any]:
 _VECTOR3: Final = _object("foxglove.Vector3", x=_AXIS, y=_AXIS, z=_AXIS)
 _QUATERNION: Final = _object("foxglove.Quaternion", x=_AXIS, y=_AXIS, z=_AXIS, w=_AXIS)
 
+_POSE: Final = _object("foxglove.Pose", position=_VECTOR3, orientation=_QUATERNION)
+_FIELDS: Final[dict[str, dict[str, Any]]] = {
+    "foxglove.FrameTransform": {
+        "parent_frame_id": _TEXT, "child_frame_id": _TEXT, "translation": _VECTOR3,
+        "rotation": _QUATERNION,
+    },
+    "foxglove.PoseInFrame": {"frame_id": _TEXT, "pose": _POSE},
+    "foxglove.LocationFix": {
+        "frame_id": _TEXT, "latitude": _number("degrees"), "longitude": _number("degrees"),
+        "altitude": _number("m above mean sea level"), "position_covariance": _COVARIANCE,
+        "position_covariance_type": _INTEGER,
+    },
+    "foxglove.Log": {
+        "level": _INTEGER, "message": _TEXT, "name": _TEXT, "file": _TEXT, "line": _INTEGER,
+    },
+}  # fmt: skip
 SCHEMAS: Final[dict[str, dict[str, Any]]] = {
-    schema["title"]: schema
-    for schema in (
-        _object(
-            "foxglove.FrameTransform",
-            timestamp=_TIME,
-            parent_frame_id=_TEXT,
-            child_frame_id=_TEXT,
-            translation=_VECTOR3,
-            rotation=_QUATERNION,
-        ),
-        _object(
-            "foxglove.PoseInFrame",
-            timestamp=_TIME,
-            frame_id=_TEXT,
-            pose=_object("foxglove.Pose", position=_VECTOR3, orientation=_QUATERNION),
-        ),
-        _object(
-            "foxglove.LocationFix",
-            timestamp=_TIME,
-            frame_id=_TEXT,
-            latitude=_number("degrees"),
-            longitude=_number("degrees"),
-            altitude=_number("m above mean sea level"),
-            position_covariance={"type": "array", "items": _AXIS, "minItems": 9, "maxItems": 9},
-            position_covariance_type=_INTEGER,
-        ),
-        _object(
-            "foxglove.Log",
-            timestamp=_TIME,
-            level=_INTEGER,
-            message=_TEXT,
-            name=_TEXT,
-            file=_TEXT,
-            line=_INTEGER,
-        ),
-        _object(
-            "mavgate.State",
-            **{
-                name: _number(unit_of(name).replace("deg", "degrees") + meaning)
-                for name, meaning in (
-                    ("roll_deg", ", right wing down positive"),
-                    ("pitch_deg", ", nose up positive"),
-                    ("heading_deg", " from true north, clockwise"),
-                    ("alt_amsl_m", " above mean sea level"),
-                    ("height_m", " above home"),
-                    ("speed_mps", " over the ground"),
-                    ("climb_mps", ", upwards positive"),
-                )
-            },
-        ),
+    title: _object(title, timestamp=_TIME, **fields) for title, fields in _FIELDS.items()
+} | {
+    "mavgate.State": _object(
+        "mavgate.State",
+        **{n: _number(unit_of(n).replace("deg", "degrees") + how) for n, how in _STATE.items()},
     )
 }
 
