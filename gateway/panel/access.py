@@ -137,7 +137,12 @@ class AccessControl:
             scope[HOLDER] = holder = Holder(role, token, address_group(str(client[0])))
             if role is not None:
                 self._on_authenticated(client, holder)
-            await self._pass_on(scope, receive, send, token)
+            if scope["type"] == "websocket":
+                await self._pass_websocket(scope, receive, send, token)
+            else:
+                # HEAD too: the server, which has the original scope, omits the body.
+                method = "GET" if scope["method"] == "HEAD" else scope["method"]
+                await self._pass_request({**scope, "method": method}, receive, send)
         elif scope["type"] == "http" and scope["path"] == "/":
             answer = RedirectResponse("/login", HTTPStatus.SEE_OTHER)
             await answer(scope, receive, with_headers(send))
@@ -168,13 +173,7 @@ class AccessControl:
         # An IP address, unlike a name, cannot be rebound.
         return not self._is_local and is_numeric(name)
 
-    async def _pass_on(self, scope: Scope, receive: Receive, send: Send, token: str) -> None:
-        if scope["type"] == "websocket":
-            await self._pass_websocket(scope, receive, send, token)
-            return
-        if scope.get("method") == "HEAD":
-            # Answered as GET; the server, which has the original scope, omits the body.
-            scope = {**scope, "method": "GET"}
+    async def _pass_request(self, scope: Scope, receive: Receive, send: Send) -> None:
         limit = self._upload_limit if scope["path"].startswith((RECORDINGS, MAPS)) else MAX_BODY
         refusal = _TooLargeError(limit)
         answer = PlainTextResponse(refusal.detail, refusal.status_code)
@@ -182,7 +181,14 @@ class AccessControl:
         if len(length) > MAX_DIGITS or int(length or 0) > limit:
             await answer(scope, receive, with_headers(send))
             return
-        began = False
+        began = has_left = False
+        limited = _limited(receive, limit)
+
+        async def received() -> Message:
+            nonlocal has_left
+            message = await limited()
+            has_left = message["type"] == "http.disconnect"
+            return message
 
         async def noted(message: Message) -> None:
             nonlocal began
@@ -195,10 +201,17 @@ class AccessControl:
 
         try:
             async with self._turn(scope):
-                await _answer(self.app, scope, _limited(receive, limit), with_headers(noted))
+                await self.app(scope, received, with_headers(noted))
         except _TooLargeError:
             if not began:
                 await answer(scope, receive, with_headers(send))
+        except ClientDisconnect:
+            pass
+        except RuntimeError:
+            # Starlette's middleware raises an error without an answer, which is not due any more
+            # after a disconnect.
+            if not has_left:
+                raise
 
     def _turn(self, scope: Scope) -> AbstractAsyncContextManager[None]:
         """Wait for other large answers to the session, or to a connection without a session."""
@@ -305,26 +318,6 @@ class _SessionSocket:
         self._is_closed = True
         with suppress(OSError, RuntimeError):
             await self._send(_closing("logged out"))
-
-
-async def _answer(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer a request, unless the browser disconnects before the end."""
-    left = False
-
-    async def receive_noting() -> Message:
-        nonlocal left
-        message = await receive()
-        left = message["type"] == "http.disconnect"
-        return message
-
-    try:
-        await app(scope, receive_noting, send)
-    except ClientDisconnect:
-        return
-    except RuntimeError:
-        # Starlette's middleware raises an error without an answer; after a disconnect none is due.
-        if not left:
-            raise
 
 
 async def _send_in_pieces(send: Send, message: Message) -> None:

@@ -11,7 +11,6 @@ import html
 import json
 import math
 import re
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -65,6 +64,7 @@ RESOLUTION: Final = {
 }  # fmt: skip
 DEFAULT_RESOLUTION: Final = 0.1
 """Resolution of the other columns, m or m/s."""
+FACTS: Final = ("distance_m", "airborne_s", "highest_m", "height_above")
 LEFT_OUT: Final = frozenset(
     {*(f"rate_b_radps.{n}" for n in range(3)), *(f"vel_n_mps.{n}" for n in range(3))}
 )
@@ -85,18 +85,41 @@ LEAFLET_CSS: Final = "elements/leaflet/dist/leaflet/leaflet.css"
 
 
 @dataclass(slots=True)
+class _Flown:
+    """One aircraft of a flight."""
+
+    vehicle: VehicleState
+    tally: VehicleTally
+    track: Continuity = field(default_factory=Continuity)
+    breaks: list[int] = field(default_factory=list)
+    """Times at which its track begins again after an interruption, µs."""
+
+    def __post_init__(self) -> None:
+        self.vehicle.history = FlightHistory(MAX_ROWS)
+
+    def add(self, message: VehicleMessage) -> None:
+        self.tally.update(message)
+        vehicle, time_us = self.vehicle, message.time_us
+        if message.text is not None:
+            return
+        vehicle.state.update(MESSAGE_NAMES[message.message_id], message.fields, time_us)
+        if (at := message.position) is None or vehicle.state.position is None:
+            return
+        if time_us - vehicle.history.newest_us < STEP_US and len(vehicle.history):
+            return
+        if self.track.is_broken_at(time_us, at.lat_deg, at.lon_deg, message.boot_us):
+            self.breaks.append(time_us)
+        vehicle.history.add(time_us, vehicle.instant(time_us))
+
+
+@dataclass(slots=True)
 class PageFlight:
     """Data of a flight that a page shows."""
 
     name: str
     begin_us: int = 0
     """Civil time of the first state, in µs since 1970; 0 if unknown."""
-    aircraft: dict[int, VehicleState] = field(default_factory=dict)
-    histories: dict[int, FlightHistory] = field(default_factory=dict)
-    breaks: dict[int, list[int]] = field(default_factory=dict)
-    """Times at which the track of an aircraft begins again after an interruption, µs."""
-    tallies: dict[int, VehicleTally] = field(default_factory=dict)
-    """Facts of each aircraft."""
+    aircraft: dict[int, _Flown] = field(default_factory=dict)
     texts: list[tuple[int, int, int, str]] = field(default_factory=list)
     """Time in µs, system id, severity and text of each STATUSTEXT."""
     compared: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
@@ -111,40 +134,22 @@ def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageF
     """
     flight = PageFlight(name)
     recorded = FlightToWrite(files, options)
-    tracks: defaultdict[int, Continuity] = defaultdict(Continuity)
     for message in recorded.vehicle_messages(READ | FACT_IDS):
         system_id = message.system_id
-        if system_id not in flight.tallies:
-            flight.tallies[system_id] = VehicleTally(recorded.senders.vehicle(system_id))
-            flight.aircraft[system_id] = VehicleState(system_id, "recorded")
-            flight.histories[system_id] = FlightHistory(MAX_ROWS)
-        flight.tallies[system_id].update(message)
-        _add(flight, message, tracks[system_id])
+        if system_id not in flight.aircraft:
+            tally = VehicleTally(recorded.senders.vehicle(system_id))
+            flight.aircraft[system_id] = _Flown(VehicleState(system_id, "recorded"), tally)
+        flight.aircraft[system_id].add(message)
+        if (text := message.text) is not None and len(flight.texts) < MAX_TEXTS:
+            flight.texts.append((message.time_us, system_id, text.severity, text.text))
     flight.remarks += recorded.remarks
-    flight.histories = {key: one for key, one in flight.histories.items() if len(one) > 1}
-    if not flight.histories:
+    flight.aircraft = {
+        key: one for key, one in sorted(flight.aircraft.items()) if len(one.vehicle.history) > 1
+    }
+    if not flight.aircraft:
         raise FlightError(f"{name}: it contains no position, so there is no flight to show")
-    flight.begin_us = min(one.time_us[0] for one in flight.histories.values())
+    flight.begin_us = min(one.vehicle.history.time_us[0] for one in flight.aircraft.values())
     return flight
-
-
-def _add(flight: PageFlight, message: VehicleMessage, track: Continuity) -> None:
-    """Add the next message of an aircraft."""
-    system_id, time_us = message.system_id, message.time_us
-    if (text := message.text) is not None:
-        if len(flight.texts) < MAX_TEXTS:
-            flight.texts.append((time_us, system_id, text.severity, text.text))
-        return
-    vehicle, history = flight.aircraft[system_id], flight.histories[system_id]
-    vehicle.state.update(MESSAGE_NAMES[message.message_id], message.fields, time_us)
-    if (at := message.position) is None or vehicle.state.position is None:
-        return
-    place = (time_us, at.lat_deg, at.lon_deg, message.boot_us)
-    if time_us - history.newest_us < STEP_US and len(history):
-        return
-    if track.is_broken_at(*place):
-        flight.breaks.setdefault(system_id, []).append(time_us)
-    history.add(time_us, vehicle.instant(time_us))
 
 
 def begin_comparison(files: Sequence[Path], options: ReadOptions) -> Connection:
@@ -220,15 +225,15 @@ def _data_of(flight: PageFlight) -> dict[str, Any]:
         "aircraft": [
             {
                 "system_id": system_id,
-                "title": printable(flight.aircraft[system_id].name),
-                "model": flight.aircraft[system_id].model,
-                "battery_name": flight.aircraft[system_id].battery_name,
-                "home": _spot(flight.aircraft[system_id].home),
-                "columns": dict(_columns_of(history, zero_us)),
-                "breaks": [time_us - zero_us for time_us in flight.breaks.get(system_id, ())],
-                **_facts_of(flight.tallies[system_id]),
+                "title": printable(one.vehicle.name),
+                "model": one.vehicle.model,
+                "battery_name": one.vehicle.battery_name,
+                "home": _spot(one.vehicle.home),
+                "columns": dict(_columns_of(one.vehicle.history, zero_us)),
+                "breaks": [time_us - zero_us for time_us in one.breaks],
+                **{fact: getattr(one.tally.facts(), fact) for fact in FACTS},
             }
-            for system_id, history in sorted(flight.histories.items())
+            for system_id, one in flight.aircraft.items()
         ],
         "texts": [
             [(time_us - zero_us) / US_PER_S, system_id, severity, printable(text)]
@@ -240,12 +245,6 @@ def _data_of(flight: PageFlight) -> dict[str, Any]:
         },
         "remarks": [printable(remark) for remark in flight.remarks],
     }
-
-
-def _facts_of(tally: VehicleTally) -> dict[str, Any]:
-    facts = tally.facts()
-    names = ("distance_m", "airborne_s", "highest_m", "height_above")
-    return {name: getattr(facts, name) for name in names}
 
 
 def _spot(spot: Any) -> dict[str, float] | None:

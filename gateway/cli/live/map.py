@@ -48,7 +48,7 @@ def get_map(
         files = files_of([Path(around)], folder_of(settings), "tlogs")
         around = name_of(Path(around), files)
         flight = read_flight(files, read_options(settings), around)
-        for history in flight.histories.values():
+        for history in (one.vehicle.history for one in flight.aircraft.values()):
             positions += zip(history.columns["lat_deg"], history.columns["lon_deg"], strict=True)
     folder = Path(settings.panel.tiles_folder).expanduser()
     target = folder / f"{_file_name(name or around)}.pmtiles"
