@@ -167,7 +167,8 @@ async def test_listed_origin_may_use_the_api_only(path: str, origin: str, is_all
         preflight = await client.options(path, headers=asked)
     statuses = (HTTPStatus.OK, HTTPStatus.OK) if is_allowed else (HTTPStatus.FORBIDDEN,) * 2
     assert (answer.status_code, preflight.status_code) == statuses
-    assert answer.headers.get("access-control-allow-origin") == (origin if is_allowed else None)
+    found = [answer.headers.get(f"access-control-allow-{key}") for key in ("origin", "credentials")]
+    assert found == ([origin, "true"] if is_allowed else [None, None])
     allowed = preflight.headers.get("access-control-allow-headers", "")
     assert ("content-type" in allowed.lower()) == is_allowed
 
@@ -182,6 +183,7 @@ async def test_listed_origin_may_use_the_api_only(path: str, origin: str, is_all
         (ALLOWED, "/v1/ws/mavlink", "127.0.0.1:14590", FOREIGN, True),
         (ALLOWED, "/v1/ws/mavlink", "evil.example", FOREIGN, False),
     ],
+    ids=["page", "foreign page", "foreign host", "no login", "listed", "listed at foreign host"],
 )
 async def test_websocket_needs_host_origin_and_password(
     settings: PanelSettings, path: str, host: str, origin: str, is_accepted: bool
@@ -351,6 +353,7 @@ def test_hash_matches_only_its_password() -> None:
         ({"address": "::", "insecure": True}, "password"),
         ({"certificate_key": "panel.key"}, "certificate"),
     ],
+    ids=["open", "without TLS", "insecure without password", "key alone"],
 )
 def test_network_needs_password_and_certificate(settings: dict[str, object], missing: str) -> None:
     with pytest.raises(ValueError, match=missing):
@@ -389,6 +392,7 @@ def test_key_in_the_certificate_file_is_accepted_unless_encrypted(tmp_path: Path
 @pytest.mark.parametrize(
     ("error", "is_kept"),
     [(UnicodeDecodeError("utf-8", b"\xff", 0, 1, "no text"), False), (OSError("another"), True)],
+    ids=["invalid text", "another error"],
 )
 def test_request_with_invalid_text_is_one_line_in_the_log(error: Exception, is_kept: bool) -> None:
     cause = (type(error), error, None)

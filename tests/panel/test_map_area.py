@@ -54,6 +54,7 @@ def test_length_is_read_in_metres_kilometres_and_nautical_miles() -> None:
         ([(-60.0, 20.0), (0.0, 30.0), (math.nan, 0.0)], (-61.0, 18.0, 1.0, 32.0)),
         ([(84.5, -179.0)], (83.5, -180.0, 85.0, -168.57)),
     ],
+    ids=["one position", "both hemispheres", "near the pole and the 180th meridian"],
 )
 def test_box_has_the_margin_on_every_side(
     positions: list[tuple[float, float]], box: tuple[float, ...]

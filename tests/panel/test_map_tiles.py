@@ -125,7 +125,11 @@ async def test_unreachable_server_gives_no_tile(tmp_path: Path) -> None:
     assert await tiles.tile(0, 2, 1, 1) is None
 
 
-@pytest.mark.parametrize("tile", [(0, 0, 1), (0, -1, 0), (3, 8, 0), (25, 0, 0), (-1, 0, 0)])
+@pytest.mark.parametrize(
+    "tile",
+    [(0, 0, 1), (0, -1, 0), (3, 8, 0), (25, 0, 0), (-1, 0, 0)],
+    ids=["too far south", "too far west", "too far east", "zoom too great", "negative zoom"],
+)
 async def test_outer_tiles_are_not_asked(
     tmp_path: Path, owner: Owner, tile: tuple[int, int, int]
 ) -> None:

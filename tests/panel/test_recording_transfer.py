@@ -59,7 +59,9 @@ async def test_outside_name_is_refused(client: httpx.AsyncClient, folder: Path, 
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"a text\n", b"a,b,c\n1,2,3\n", bytes(range(256)) * 40, short_tlog()[:12]]
+    "content",
+    [b"", b"a text\n", b"a,b,c\n1,2,3\n", bytes(range(256)) * 40, short_tlog()[:12]],
+    ids=["empty", "text", "another table", "noise", "cut tlog"],
 )
 async def test_bad_upload_is_deleted(
     client: httpx.AsyncClient, folder: Path, content: bytes

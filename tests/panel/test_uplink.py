@@ -130,6 +130,7 @@ PROGRESS = mavlink.MAV_RESULT_IN_PROGRESS
         ([mavlink.MAV_RESULT_TEMPORARILY_REJECTED], "temporarily"),
         ([200], "200"),
     ],
+    ids=["accepted late", "failed late", "rejected", "unknown result"],
 )
 async def test_command_fails_unless_accepted_and_has_a_longer_timeout_while_in_progress(
     uplink: Uplink,

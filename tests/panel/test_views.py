@@ -109,6 +109,9 @@ class TestCalibration:
         run = bench.parts.dialogues.of(1).calibration
         assert run is not None
         assert run.step == "gyro", "the other one is neither stored nor undone"
+        self.choose("Mounting")
+        press("Store it")
+        assert bench.commands == [], "storing would store the other too"
         self.choose("Gyroscope")
         press("Undo it")
         bench.fly()
@@ -227,6 +230,11 @@ class TestTuning:
         bench.handle(decoded(number), bench.now_us())
         bench.refresh()
         assert field.value == pytest.approx(math.degrees(0.01))
+        field.set_value(7.0)
+        number = mavlink.MAVLink_param_value_message(self.NAME.encode(), 0.02, 9, 110, 65535)
+        bench.handle(decoded(number), bench.now_us())
+        bench.refresh()
+        assert field.value == 7.0, "typed, and not sent yet"
 
     def test_list_waits_for_the_end_of_editing_and_follows_group_and_search(
         self, bench: ViewBench, field: Any

@@ -109,3 +109,9 @@ def test_scaled_and_raw_imu_are_read_in_thousandths(kind: Any) -> None:
         run.handle(kind(0, 0, 0, -1000, 0, 0, 0, *mag), 0)
     # A field of nothing is that of a vehicle without a magnetometer.
     assert run.field_points.tolist() == [pytest.approx([20.0, -3.0, 40.0])]
+    level = CalibrationRun(1, CalibrationStep.ACCEL, 0)
+    level.state = RunState.RUNNING
+    for axis, sign in ((axis, sign) for axis in range(3) for sign in (-1000, 1000)):
+        for _ in range(30):
+            level.handle(kind(0, *(sign * (n == axis) for n in range(3)), 0, 0, 0, 0, 0, 0), 0)
+    assert level.residuals()[0].before == pytest.approx(0.0, abs=1e-3)

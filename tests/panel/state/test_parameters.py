@@ -215,6 +215,7 @@ def test_file_request_without_an_answer_is_given_up() -> None:
         b"[" * 100_000,
         b'{"metadataTypes": [{"type": 1, "uri": "mftp://general.json"}]}',
     ],
+    ids=["empty", "cut", "list", "number", "wrong entries", "deep", "own path"],
 )
 def test_invalid_metadata_describes_no_parameter(content: bytes) -> None:
     assert parse_parameters(content) == {}
