@@ -44,7 +44,7 @@ def exports(tmp_path: Path) -> Iterator[Exports]:
 @pytest.mark.slow
 async def test_recording_is_exported_cut_anonymised_and_extracted(exports: Exports) -> None:
     to_10, system_3, found = ("--to=10",), ("--system=3",), {}
-    kinds = [("gpx", ()), ("page", ()), ("cut", ()), ("cut", to_10), ("anonymised", ())]
+    kinds = [("gpx", ()), ("page", ()), ("cut", to_10), ("anonymised", ())]
     async with client_of(exports.jobs.serve) as client:
         for kind, options in [*kinds, ("texts", system_3)]:
             url = await exports.make(kind, *options)
@@ -60,9 +60,9 @@ async def test_recording_is_exported_cut_anonymised_and_extracted(exports: Expor
         assert (await client.get(url)).status_code == 404
     assert found["gpx", ()].startswith(b"<?xml")
     assert found["page", ()].startswith(b"<!doctype html>")
-    assert found["cut", ()] == (exports.folder / f"{NAME}_01.tlog").read_bytes()
-    assert found["cut", ()].startswith(found["cut", to_10])
-    assert len(found["cut", to_10]) < len(found["cut", ()]) == len(found["anonymised", ()])
+    whole = (exports.folder / f"{NAME}_01.tlog").read_bytes()
+    assert whole.startswith(found["cut", to_10])
+    assert 0 < len(found["cut", to_10]) < len(whole) == len(found["anonymised", ()])
     assert found["texts", system_3].startswith(b"time,system,component")
 
 

@@ -16,6 +16,7 @@ from gateway.panel.recording_jobs import CUTS, EXTRACTS, FORMATS, KINDS, ExportE
 from gateway.panel.recording_search import RecordingFacts
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets import (
+    IDLE,
     Cells,
     DataTable,
     RecorderControls,
@@ -34,7 +35,6 @@ from gateway.recordings.moment import parse_moment
 from gateway.units import counted
 
 REFRESH_S: Final = 1.0
-IDLE: Final = "idle"
 MUCH_LOST: Final = 0.05
 """Share of lost samples above which the loss is highlighted."""
 ARMED_OPTIONS: Final = ("--armed", "--margin=10")
