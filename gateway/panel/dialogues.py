@@ -31,7 +31,10 @@ SAMPLES_US: Final = 20_000
 class Dialogue:
     """The dialogue with one aircraft."""
 
-    def __init__(self, system_id: int) -> None:
+    def __init__(
+        self, system_id: int, send: Callable[[Any], object], now_us: Callable[[], int]
+    ) -> None:
+        self._send, self._now_us = send, now_us
         self.parameters = ParameterClient(system_id)
         self.files = FileClient(system_id)
         self.metas: dict[str, ParameterMeta] = {}
@@ -43,13 +46,17 @@ class Dialogue:
         self.before: dict[str, float] = {}
         """All parameters at the start of the calibration."""
 
-    def load(self, now_us: int) -> list[Any]:
-        """Request the parameters and their metadata; return the messages to send."""
-        found = self.parameters.load(now_us)
+    def load(self, *, again: bool = False) -> None:
+        """Request parameters and metadata; known or requested ones only with `again`."""
+        if not again and self.parameters.state not in (ListState.UNKNOWN, ListState.FAILED):
+            return
+        self._send_all(self.parameters.load(self._now_us()))
         if not self.metas:
-            self._reading = GENERAL_PATHS[0]
-            found += self.files.read(GENERAL_PATHS[0], now_us)
-        return found
+            self._read(GENERAL_PATHS[0])
+
+    def change(self, name: str, value: float) -> None:
+        """Set a parameter; raises ValueError for an invalid one."""
+        self._send_all(self.parameters.change(name, value, self._now_us()))
 
     @property
     def unanswered(self) -> CalibrationStep | None:
@@ -57,37 +64,53 @@ class Dialogue:
         run = self.calibration
         return run.step if run is not None and run.state is RunState.DONE else None
 
-    def calibrate(self, step: CalibrationStep, now_us: int) -> list[Any]:
-        """Start a calibration; return the messages to send."""
+    def calibrate(self, step: CalibrationStep) -> None:
+        """Start a calibration."""
         if self.unanswered is None:
             self.before = {name: entry.value for name, entry in self.parameters.entries.items()}
-        self.calibration = CalibrationRun(self.parameters.system_id, step, now_us)
-        return [*self.ask_for_samples(), self.calibration.start_message()]
+        self.calibration = CalibrationRun(self.parameters.system_id, step, self._now_us())
+        self.ask_for_samples()
+        self._send(self.calibration.start_message())
 
-    def ask_for_samples(self) -> list[Any]:
-        """Request sensor rates high enough for drawing and fusing; return the messages to send."""
+    def cancel(self) -> None:
+        """Cancel the calibration."""
+        if self.calibration is not None:
+            self._send(self.calibration.cancel_message())
+
+    def ask_for_samples(self) -> None:
+        """Request sensor rates high enough for drawing and fusing."""
         system_id, number = self.parameters.system_id, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
-        return [command_long(system_id, number, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, SAMPLES_US)]
+        self._send(command_long(system_id, number, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, SAMPLES_US))
 
-    def handle(self, message: Any, now_us: int) -> list[Any]:
-        """Handle one message of the aircraft; return the messages to send."""
+    def handle(self, message: Any, now_us: int) -> None:
+        """Handle one message of the aircraft."""
         self.parameters.handle(message, now_us)
         if self.calibration is not None:
             self.calibration.handle(message, now_us)
-        return self.files.handle(message, now_us) + self._follow_files(now_us)
+        self._send_all(self.files.handle(message, now_us))
+        self._follow_files()
 
-    def poll(self, now_us: int) -> list[Any]:
-        """Return the messages that are due by time."""
+    def poll(self) -> None:
+        """Send what is due by time."""
+        now_us = self._now_us()
         if self.calibration is not None:
             self.calibration.poll(now_us)
-        found = self.parameters.poll(now_us) + self.files.poll(now_us)
-        return found + self._follow_files(now_us)
+        self._send_all(self.parameters.poll(now_us) + self.files.poll(now_us))
+        self._follow_files()
 
-    def _follow_files(self, now_us: int) -> list[Any]:
+    def _read(self, path: str) -> None:
+        self._reading = path
+        self._send_all(self.files.read(path, self._now_us()))
+
+    def _send_all(self, messages: list[Any]) -> None:
+        for message in messages:
+            self._send(message)
+
+    def _follow_files(self) -> None:
         """Read the general metadata file, then that of the parameters; each is parsed only once."""
         path, following = self._reading, None
         if path is None or self.files.busy:
-            return []
+            return
         content = self.files.content
         if content is None:
             following = GENERAL_PATHS[1] if path == GENERAL_PATHS[0] else None
@@ -95,8 +118,9 @@ class Dialogue:
             following = parameter_path(content)
         else:
             self.metas = parse_parameters(content)
-        self._reading = following
-        return [] if following is None else self.files.read(following, now_us)
+        self._reading = None
+        if following is not None:
+            self._read(following)
 
 
 class Dialogues:
@@ -123,46 +147,17 @@ class Dialogues:
 
     def of(self, system_id: int) -> Dialogue:
         """Return the dialogue with an aircraft."""
-        return self._all.setdefault(system_id, Dialogue(system_id))
-
-    def load(self, system_id: int, *, reload: bool = False) -> None:
-        """Request an aircraft's parameters; known or requested ones only with `reload`."""
-        dialogue = self.of(system_id)
-        if reload or dialogue.parameters.state in (ListState.UNKNOWN, ListState.FAILED):
-            self._send_all(dialogue.load(self._clock()))
-
-    def change(self, system_id: int, name: str, value: float) -> None:
-        """Set a parameter; raises ValueError for an invalid one."""
-        self._send_all(self.of(system_id).parameters.change(name, value, self._clock()))
-
-    def calibrate(self, system_id: int, step: CalibrationStep) -> None:
-        """Start a calibration."""
-        self._send_all(self.of(system_id).calibrate(step, self._clock()))
-
-    def ask_for_samples(self, system_id: int) -> None:
-        """Request an aircraft's sensor rates high enough for fusing."""
-        self._send_all(self.of(system_id).ask_for_samples())
-
-    def cancel(self, system_id: int) -> None:
-        """Cancel a calibration."""
-        run = self.of(system_id).calibration
-        if run is not None:
-            self._send(run.cancel_message())
+        return self._all.setdefault(system_id, Dialogue(system_id, self._send, self._clock))
 
     def _discard(self, system_id: int) -> None:
         self._all.pop(system_id, None)
 
     def _handle(self, system_id: int, message: Any, now_us: int) -> None:
-        dialogue = self._all.get(system_id)
-        if dialogue is not None:
-            self._send_all(dialogue.handle(message, now_us))
+        if (dialogue := self._all.get(system_id)) is not None:
+            dialogue.handle(message, now_us)
 
     async def _poll(self) -> None:
         while True:
             await asyncio.sleep(POLL_S)
             for dialogue in tuple(self._all.values()):
-                self._send_all(dialogue.poll(self._clock()))
-
-    def _send_all(self, messages: list[Any]) -> None:
-        for message in messages:
-            self._send(message)
+                dialogue.poll()

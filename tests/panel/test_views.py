@@ -17,6 +17,7 @@ from starlette.requests import Request
 from gateway.batch.catalogue import FlightFigures
 from gateway.panel import estimator_trial
 from gateway.panel.admission import LOCAL, Role
+from gateway.panel.dialogues import Dialogue
 from gateway.panel.estimator_trial import ComparisonError
 from gateway.panel.page import PageRail, build_page, waiting_lines
 from gateway.panel.player_bar import PlayerBar
@@ -99,7 +100,7 @@ class TestCalibration:
         self.started(bench, "Gyroscope")
         bench.fly(1.5, gyro=GYRO_BIAS)
         # As the calibration does, which this vehicle leaves to its gateway.
-        bench.parts.dialogues.change(1, "CAL_GYRO_BIAS_X", GYRO_BIAS[0])
+        bench.parts.dialogues.of(1).change("CAL_GYRO_BIAS_X", GYRO_BIAS[0])
         bench.fly(1.7, gyro=GYRO_BIAS)
         bench.fly(2.2)
         assert any(name.endswith("(°/s), CAL_GYRO_BIAS_X") for name in rows())
@@ -215,7 +216,7 @@ class TestTuning:
         self, bench: ViewBench, field: Any, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         sent: list[float] = []
-        monkeypatch.setattr(bench.parts.dialogues, "change", lambda *given: sent.append(given[2]))
+        monkeypatch.setattr(Dialogue, "change", lambda *given: sent.append(given[2]))
         for value in (0.0, 45.0, 45.0):
             self.enter(field, value)
         assert sent == pytest.approx([math.radians(45.0)] * 2)
@@ -302,6 +303,23 @@ class TestTuning:
         press("Compare")
         assert [row[0] for row in rows().values()] == ["eskf", "paper"]
         assert all(row[1].endswith(" °") for row in rows().values())
+
+    def test_metadata_without_parameters_is_parsed_once(
+        self, bench: ViewBench, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """It would be parsed again with each message, which takes long for a large one."""
+        parsed: list[bytes] = []
+
+        def parse(content: bytes) -> dict[str, ParameterMeta]:
+            parsed.append(content)
+            return {}
+
+        monkeypatch.setattr("gateway.panel.dialogues.parse_parameters", parse)
+        dialogue = bench.parts.dialogues.of(1)
+        for count in (1, 2):
+            dialogue.load(again=True)
+            bench.fly(10.0)
+            assert len(parsed) == count
 
     def test_range_of_a_parameter_has_units_and_open_ends(self) -> None:
         meta = ParameterMeta(name=self.NAME, unit="rad/s", low=-10.0, high=10.0, default=0.0)

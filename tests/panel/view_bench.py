@@ -67,7 +67,7 @@ class ViewBench:
         return self._taken()
 
     def poll(self, now_us: int) -> list[Any]:
-        self._outgoing += self.parts.dialogues.of(1).poll(now_us)
+        self.parts.dialogues.of(1).poll()
         return self._taken()
 
     def _taken(self) -> list[Any]:

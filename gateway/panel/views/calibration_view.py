@@ -103,9 +103,9 @@ class CalibrationView:
 
     def _refresh(self) -> None:
         """Show the present state; the guide is built again for another step or another run."""
-        if self._context.system_id is not None:
-            self._context.parts.dialogues.load(self._context.system_id)
         run, dialogue = self._run(), self._context.dialogue
+        if dialogue is not None:
+            dialogue.load()
         if run is not None and run.state.is_over:
             done = run.state is RunState.DONE
             self._outcomes[run.step] = ("done", "good") if done else ("failed", "bad")
@@ -246,13 +246,13 @@ class CalibrationView:
     def _mount(self) -> None:
         """Set the angles of both sensors, in use until the gateway ends."""
         self._context.check_may_change()
-        angles = ORIENTATIONS.get(self._choice.value)
-        if angles is None or self._context.system_id is None:
+        angles, dialogue = ORIENTATIONS.get(self._choice.value), self._context.dialogue
+        if angles is None or dialogue is None:
             ui.notify("Choose an orientation first", type="warning")
             return
         for names in (MNT_NAMES, MAG_MNT_NAMES):
             for name, angle_deg in zip(names, angles, strict=True):
-                self._context.parts.dialogues.change(self._context.system_id, name, angle_deg)
+                dialogue.change(name, angle_deg)
         self._outcomes[self._step] = ("in use", "good")
         ui.notify(
             "In use until the gateway ends. Raise the nose: the pitch must rise.", type="info"
@@ -360,10 +360,9 @@ class CalibrationView:
             label.set_text(text)
 
     async def _start(self) -> None:
-        context, system_id = self._context, self._context.system_id
-        context.check_may_change()
-        if system_id is not None and not self._has_other_unanswered():
-            context.parts.dialogues.calibrate(system_id, self._step)
+        self._context.check_may_change()
+        if (dialogue := self._context.dialogue) and not self._has_other_unanswered():
+            dialogue.calibrate(self._step)
             self._refresh()
 
     def _has_other_unanswered(self) -> bool:
@@ -377,7 +376,8 @@ class CalibrationView:
 
     async def _cancel(self) -> None:
         self._context.check_may_change()
-        self._context.parts.dialogues.cancel(self._context.system_id or 0)
+        if self._context.dialogue is not None:
+            self._context.dialogue.cancel()
 
     async def _store(self) -> None:
         """Store it in the vehicle: this button is the confirmation."""
@@ -388,8 +388,9 @@ class CalibrationView:
 
     async def _undo(self) -> None:
         self._context.check_may_change()
-        for name, (old, _) in self._changes().items():
-            self._context.parts.dialogues.change(self._context.system_id or 0, name, old)
+        if (dialogue := self._context.dialogue) is not None:
+            for name, (old, _) in self._changes().items():
+                dialogue.change(name, old)
         self._outcomes.pop(self._step, None)
         ui.notify(f"{TITLES[self._step][0]}: as it was before", type="info")
         self._end(stored=False)

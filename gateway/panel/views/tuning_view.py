@@ -134,14 +134,14 @@ class ParameterRow:
         self._settled = value
         if value is None:
             return
-        name, dialogues = self._meta.name, self._context.parts.dialogues
-        parameters = dialogues.of(self._system_id).parameters
+        name, dialogue = self._meta.name, self._context.parts.dialogues.of(self._system_id)
+        parameters = dialogue.parameters
         kept = self._in_shown_unit(parameters.entries[name].value)
         if name not in parameters.pending and is_same_value(value, kept):
             return
         try:
             self._context.check_may_change()
-            dialogues.change(self._system_id, name, float(value) / self._factor)
+            dialogue.change(name, float(value) / self._factor)
         except (ValueError, NotAllowedError) as error:
             ui.notify(printable(str(error)), type="negative")
             return
@@ -199,9 +199,8 @@ class ComparisonCard:
 
     def _collect(self) -> None:
         """Request the samples when the view is opened, before they are needed."""
-        system_id = self._context.system_id
-        if system_id is not None and self._context.may_change:
-            self._context.parts.dialogues.ask_for_samples(system_id)
+        if self._context.dialogue is not None and self._context.may_change:
+            self._context.dialogue.ask_for_samples()
 
     def _refresh(self) -> None:
         system_id, samples = self._context.system_id, self._context.parts.samples
@@ -335,7 +334,7 @@ class TuningView:
         system_id = dialogue.parameters.system_id
         if self._loaded_id != system_id:
             self._loaded_id = system_id
-            self._context.parts.dialogues.load(system_id)
+            dialogue.load()
         self._chart.refresh()
         self._state.set_text(_state_of(dialogue))
         complete = dialogue.parameters.state is ListState.COMPLETE
@@ -396,8 +395,8 @@ class TuningView:
         return [name for _, name in sorted(found)]
 
     def _reload(self) -> None:
-        if self._context.system_id is not None:
-            self._context.parts.dialogues.load(self._context.system_id, reload=True)
+        if self._context.dialogue is not None:
+            self._context.dialogue.load(again=True)
 
     async def _store(self) -> None:
         await store_parameters(self._context, "All parameters are stored")

@@ -4,14 +4,12 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.dialogues import Dialogue
 from gateway.panel.state.parameters import (
     MAX_ATTEMPTS,
     MAX_PARAMETERS,
     FileClient,
     ListState,
     ParameterClient,
-    ParameterMeta,
     parameter_path,
     parse_parameters,
 )
@@ -174,23 +172,6 @@ def test_metadata_describes_every_parameter(lose_every: int) -> None:
     assert (meta.low, meta.high, meta.group) == (0.0, 1.0, "paper")
     assert meta.short
     assert not files.busy
-
-
-def test_metadata_without_parameters_is_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It would be parsed again with each message, which takes long for a large one."""
-    parsed: list[bytes] = []
-
-    def parse(content: bytes) -> dict[str, ParameterMeta]:
-        parsed.append(content)
-        return {}
-
-    monkeypatch.setattr("gateway.panel.dialogues.parse_parameters", parse)
-    dialogue = Dialogue(1)
-    bench = VehicleBench(dialogue)
-    bench.run(dialogue.load(bench.now_us), 10.0)
-    assert len(parsed) == 1
-    bench.run(dialogue.load(bench.now_us), 10.0)
-    assert len(parsed) == 2
 
 
 def test_missing_file_is_refused() -> None:
