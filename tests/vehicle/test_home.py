@@ -98,16 +98,6 @@ def test_fix_replaces_an_incomplete_home(nowhere: GroundStation) -> None:
     assert home(nowhere)[:2] == [GPS, FIELD32[0]]
 
 
-@pytest.mark.parametrize(
-    ("axis", "value"), [("LAT", 90.1), ("LON", -180.1), ("ALT", 1e6), ("SOURCE", 3.0)]
-)
-def test_invalid_coordinates_are_refused(station: GroundStation, axis: str, value: float) -> None:
-    name, before = f"HOME_{axis}", home(station)
-    error, echo = station.set_parameter(name, value)
-    assert (error.get_type(), echo.param_value) == ("PARAM_ERROR", before[NAMES.index(name)])
-    assert home(station) == before
-
-
 def test_home_of_the_gps_can_be_stored(station: GroundStation) -> None:
     station.set_parameter("HOME_SOURCE", OPERATOR)
     assert store(station) == pytest.approx(FIELD)

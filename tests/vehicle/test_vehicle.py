@@ -11,7 +11,7 @@ from gateway.vehicle.service import INFO
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.conftest import ManualClock
-from tests.kit.ground_station import GroundStation, decode, kinds, of_kind, texts
+from tests.kit.ground_station import GroundStation, kinds, of_kind, texts
 from tests.kit.records import (
     BARO,
     FIX,
@@ -59,18 +59,37 @@ def fly(
     return found
 
 
-def test_every_message_is_sent_at_its_own_rate() -> None:
-    vehicle = make()
-    fly(vehicle, 0, 2)
-    counted = Counter(kinds(fly(vehicle, 2, 10)))
-    expected = {
-        **dict.fromkeys(("ATTITUDE_QUATERNION", "ATTITUDE"), 500),
-        **dict.fromkeys(("GLOBAL_POSITION_INT", "VFR_HUD", "HIGHRES_IMU"), 100),
-        **dict.fromkeys(("GPS_RAW_INT", "SCALED_PRESSURE"), 50),
-        **dict.fromkeys(("SYS_STATUS", "EXTENDED_SYS_STATE"), 20),
-        **dict.fromkeys(("HEARTBEAT", "SYSTEM_TIME", "HOME_POSITION", "ESTIMATOR_STATUS"), 10),
-    }
+AT_RATES = {
+    **dict.fromkeys(("ATTITUDE_QUATERNION", "ATTITUDE"), 500),
+    **dict.fromkeys(("GLOBAL_POSITION_INT", "VFR_HUD", "HIGHRES_IMU"), 100),
+    **dict.fromkeys(("GPS_RAW_INT", "SCALED_PRESSURE"), 50),
+    **dict.fromkeys(("SYS_STATUS", "EXTENDED_SYS_STATE"), 20),
+    **dict.fromkeys(("HEARTBEAT", "SYSTEM_TIME", "HOME_POSITION", "ESTIMATOR_STATUS"), 10),
+}
+RECKONED = NavFlags.ATTITUDE_VALID | NavFlags.DEAD_RECKONING | NavFlags.DEGRADED
+NO_POSITION = {"GLOBAL_POSITION_INT": 0, "HOME_POSITION": 0, "GPS_RAW_INT": 10}
+OFF = ("ATTITUDE", "GPS_RAW_INT", "SYS_STATUS")
+SENT: dict[str, tuple[dict[str, float], dict[str, Any], dict[str, int]]] = {
+    "usual rates": ({}, {}, AT_RATES),
+    "rates of zero": (
+        {f"{name.lower()}_hz": 0.0 for name in OFF}, {}, AT_RATES | dict.fromkeys(OFF, 0),
+    ),
+    "no position yet": ({}, {"state": NOTHING, "fix": None}, AT_RATES | NO_POSITION),
+    "dead reckoning": ({}, {"flags": RECKONED}, AT_RATES),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SENT)
+def test_every_message_is_sent_at_its_own_rate(name: str) -> None:
+    rates, flown, expected = SENT[name]
+    vehicle = make(rates=RateSettings(**rates))
+    fly(vehicle, 0, 2, **flown)
+    found = fly(vehicle, 2, 10, **flown)
+    counted = Counter(kinds(found))
     assert {name: counted[name] for name in expected} == pytest.approx(expected, abs=1)
+    if "fix" in flown:
+        no_gps = {mavlink.GPS_FIX_TYPE_NO_GPS}
+        assert {m.fix_type for m in of_kind(found, "GPS_RAW_INT")} == no_gps
 
 
 def test_messages_are_not_due_all_at_once() -> None:
@@ -88,30 +107,6 @@ def test_messages_are_not_due_all_at_once() -> None:
     assert len({name for each in reported for name in each}) > 12
 
 
-def test_rate_of_zero_disables_a_message() -> None:
-    vehicle = make(rates=RateSettings(attitude_hz=0.0, gps_raw_int_hz=0.0, sys_status_hz=0.0))
-    found = set(kinds(fly(vehicle, 0, 2)))
-    assert not found & {"ATTITUDE", "GPS_RAW_INT", "SYS_STATUS"}
-
-
-def test_attitude_is_sent_without_a_position_and_positions_are_not() -> None:
-    found = fly(make(), 0, 10, NOTHING, fix=None)
-    counted = Counter(kinds(found))
-    assert counted["ATTITUDE_QUATERNION"] == pytest.approx(500, abs=1)
-    assert counted["VFR_HUD"] == pytest.approx(100, abs=1)
-    assert not {"GLOBAL_POSITION_INT", "HOME_POSITION"} & set(counted)
-    assert counted["GPS_RAW_INT"] == counted["HEARTBEAT"] == 10
-    assert {m.fix_type for m in of_kind(found, "GPS_RAW_INT")} == {mavlink.GPS_FIX_TYPE_NO_GPS}
-
-
-def test_position_goes_on_while_dead_reckoned() -> None:
-    vehicle = make()
-    fly(vehicle, 0, 2)
-    flags = NavFlags.ATTITUDE_VALID | NavFlags.DEAD_RECKONING | NavFlags.DEGRADED
-    found = fly(vehicle, 2, 10, fix=None, flags=flags)
-    assert kinds(found).count("GLOBAL_POSITION_INT") == pytest.approx(100, abs=1)
-
-
 @pytest.mark.parametrize(
     ("name", "autopilot", "custom_mode", "encoding"),
     [("generic", 0, 0, BYTEWISE), ("ardupilotmega", 3, 0, C_CAST), ("px4", 12, 1 << 16, BYTEWISE)],
@@ -127,21 +122,6 @@ def test_autopilot_of_the_settings_is_reported(
     assert version.capabilities & (BYTEWISE | C_CAST) == encoding
     [_, summary] = station.request(mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2)
     assert (summary.autopilot, summary.custom_mode) == (autopilot, custom_mode >> 16)
-
-
-def test_last_position_is_repeated_when_gps_is_lost() -> None:
-    vehicle = make()
-    fly(vehicle, 0, 2)
-    lost = replace(NO_FIX, lat_dege7=0, lon_dege7=0)
-    found = [
-        *vehicle.on_gps(replace(lost, time_us=2 * ONE_S), 2 * ONE_S),
-        *vehicle.on_gps(replace(lost, time_us=3 * ONE_S), 3 * ONE_S),
-        *vehicle.poll(9 * ONE_S),
-    ]
-    gps = of_kind(found, "GPS_RAW_INT")
-    assert gps[-1].fix_type == mavlink.GPS_FIX_TYPE_NO_GPS
-    assert mavlink.GPS_FIX_TYPE_NO_FIX in {m.fix_type for m in gps}
-    assert {(m.lat, m.lon) for m in gps} == {(FIX.lat_dege7, FIX.lon_dege7)}
 
 
 def test_home_is_the_first_good_fix() -> None:
@@ -348,14 +328,6 @@ def test_one_cause_is_announced_once_and_so_is_its_end(name: str) -> None:
     assert [message.severity < INFO for message in reported] == [True, False][: len(expected)]
 
 
-def test_lost_gps_is_no_failed_attitude() -> None:
-    vehicle = make()
-    fly(vehicle, 0, 2)
-    vehicle.on_state(state_at(2 * ONE_S, flags=FINE | LOST), sample_at(2 * ONE_S), 2 * ONE_S)
-    _, _, healthy = vehicle.health.sensors(2 * ONE_S)
-    assert healthy & mavlink.MAV_SYS_STATUS_AHRS
-
-
 def test_system_time_follows_gps() -> None:
     vehicle = make()
     before = of_kind([*vehicle.poll(0), *vehicle.poll(ONE_S)], "SYSTEM_TIME")
@@ -363,20 +335,3 @@ def test_system_time_follows_gps() -> None:
     vehicle.on_gps(fix_at(ONE_S, utc_us=1_790_000_000_000_000), ONE_S)
     after = of_kind(vehicle.poll(3 * ONE_S), "SYSTEM_TIME")
     assert after[0].time_unix_usec == 1_790_000_002_000_000
-
-
-def test_each_aircraft_answers_only_requests_for_itself_or_all(clock: ManualClock) -> None:
-    one = GroundStation(Vehicle(VehicleSettings(), 1), clock)
-    two = GroundStation(Vehicle(VehicleSettings(rates=RateSettings(attitude_hz=7.0)), 2), clock)
-
-    def ask(station: GroundStation, target: int) -> list[float]:
-        message = mavlink.MAVLink_param_request_read_message(target, 1, b"RATE_ATT", -1)
-        found = station.send(message)
-        assert {m.get_srcSystem() for m in found} <= {station.vehicle.system_id}
-        return [m.param_value for m in found]
-
-    assert (ask(one, 1), ask(one, 2), ask(one, 0)) == ([50.0], [], [50.0])
-    assert (ask(two, 1), ask(two, 2), ask(two, 0)) == ([], [7.0], [7.0])
-    fly(one.vehicle, 0, 2)
-    assert {m.get_srcSystem() for m in decode(two.vehicle.poll(0))} == {2}
-    assert two.vehicle.telemetry.home is None

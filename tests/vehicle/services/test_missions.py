@@ -65,8 +65,12 @@ def test_items_are_uploaded_and_read_over_a_lossy_link(station: GroundStation, s
     assert [content(m) for m in download(station)] == [content(m) for m in items]
 
 
-def test_client_without_the_int_form_is_served_in_the_older_one(station: GroundStation) -> None:
+@pytest.mark.parametrize("version", [1, 2])
+def test_client_without_the_int_form_is_served_in_the_older_one(
+    station: GroundStation, version: int
+) -> None:
     """DroneKit ignores MISSION_REQUEST_INT, and reads MISSION_ITEM only."""
+    station.version = version
     station.send(count(2))
     station.wait(0.9)
     assert kinds(of_kind(station.inbox, *REQUESTS)) == [REQUESTS[0], REQUESTS[0], REQUESTS[1]]
@@ -91,15 +95,6 @@ def test_client_that_refuses_the_older_form_gets_the_int_form(station: GroundSta
     station.wait(0.9)
     assert kinds(station.send(ack(mavlink.MAV_MISSION_UNSUPPORTED))) == ["MISSION_REQUEST_INT"]
     assert kinds(station.send(item(0)))[0] == "MISSION_ACK"
-
-
-def test_items_of_mavlink_1_are_stored_and_returned_as_floats(station: GroundStation) -> None:
-    station.version = 1
-    station.send(to_vehicle("MISSION_COUNT", 1))
-    assert station.send(old_item(47.1))[0].type == ACCEPTED
-    [found] = station.send(old_request(0))
-    assert found.get_type() == "MISSION_ITEM"
-    assert (found.x, found.y) == pytest.approx((47.1, -8.7), abs=1e-5)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -1e30])

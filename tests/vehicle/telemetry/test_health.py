@@ -31,7 +31,8 @@ def later(_health: Health) -> None:
         (with_flags(ImuFlags.SELF_TEST_FAILED), NOW_US, 0, INERTIAL | AHRS | PREARM),
         (with_flags(ImuFlags(0), NavFlags(0)), NOW_US, 0, AHRS | PREARM),
         (with_flags(ImuFlags(0), STATE.flags | NavFlags.SENSOR_FAULT), NOW_US, 0, AHRS | PREARM),
-        # Without a magnetometer it may fly.
+        # Lost GPS is no failed attitude; without a magnetometer it may fly.
+        (with_flags(ImuFlags(0), STATE.flags | NavFlags.DEAD_RECKONING), NOW_US, 0, 0),
         (with_flags(ImuFlags.MAG_ABSENT), NOW_US, MAG, 0),
         (lambda h: h.on_gps(NO_FIX), NOW_US, 0, GPS | PREARM),
         (lambda h: h.on_node_status(status(sensors_failed=0b010)), NOW_US, 0, MAG | PREARM),
