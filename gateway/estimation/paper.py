@@ -49,21 +49,9 @@ from gateway.estimation.vector_filter import (
     filter_step,
     prototype_of,
 )
+from gateway.geometry import quaternion as quat
 from gateway.geometry.angle import wrap_180, wrap_pi
 from gateway.geometry.geodesy import displacement_m, offset_deg
-from gateway.geometry.quaternion import (
-    difference,
-    from_euler,
-    from_rotation_vector,
-    is_below,
-    multiply,
-    norm_sq,
-    normalise,
-    part_way,
-    rotate,
-    scaled,
-    to_euler,
-)
 from gateway.records import NAN, Vec3
 from gateway.settings import Settings, setting
 from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
@@ -224,7 +212,7 @@ def retune(s: PaperState, p: PaperGains, rate_hz: float) -> None:
 def update_imu(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> bool:
     """Advance by one IMU sample; return whether it is valid."""
     gyro, accel, mag = imu_vectors(row)
-    sound = is_below(accel, LIMITS[0]) and is_below(gyro, LIMITS[1])
+    sound = quat.is_below(accel, LIMITS[0]) and quat.is_below(gyro, LIMITS[1])
     if s.started == 0:
         if not sound:
             return False
@@ -233,7 +221,7 @@ def update_imu(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> b
         write_vec(s.accel_mean, accel)
         write_vec(s.rate_b, gyro)
         roll, pitch = tilt(accel)
-        write_quat(s.q_nb, from_euler(roll, pitch, 0.0))
+        write_quat(s.q_nb, quat.from_euler(roll, pitch, 0.0))
     dt_s = (time_us - s.time_us) / US_PER_S
     if abs(dt_s) > GAP_S:
         if dt_s < 0.0:
@@ -252,8 +240,8 @@ def update_imu(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> b
                 c = s.highpass
                 rate = filter_step((c[0], c[1], c[2], c[3], c[4]), s.delays[1], gyro)
             follow_rest(s, accel, gyro, dt_s)
-            advance(s, p, force, difference(rate, as_vec(s.bias_b)), dt_s)
-    if dt_s >= 0.0 and norm_sq(mag) > 0.0 and is_below(mag, math.inf):
+            advance(s, p, force, quat.difference(rate, as_vec(s.bias_b)), dt_s)
+    if dt_s >= 0.0 and quat.norm_sq(mag) > 0.0 and quat.is_below(mag, math.inf):
         correct_yaw(s, p, mag)
     return sound
 
@@ -307,16 +295,20 @@ def bearing_velocity(s: PaperState, location: Vec3, time_us: int) -> Vec3:
 @compiled
 def advance(s: PaperState, p: PaperGains, accel: Vec3, rate: Vec3, dt_s: float) -> None:
     """Advance attitude, velocity and position by a filtered sample."""
-    step = from_rotation_vector(scaled(rate, dt_s))
-    write_quat(s.q_nb, normalise(multiply(as_quat(s.q_nb), step)))
+    step = quat.from_rotation_vector(quat.scaled(rate, dt_s))
+    write_quat(s.q_nb, quat.normalise(quat.multiply(as_quat(s.q_nb), step)))
     write_vec(s.rate_b, rate)
     roll, pitch = tilt(accel)
     if math.cos(pitch) >= MIN_COS_PITCH:
         weight = p.alpha_gyro ** (dt_s / GAIN_INTERVAL_S)
-        own = to_euler(as_quat(s.q_nb))
+        own = quat.to_euler(as_quat(s.q_nb))
         roll, pitch = blend_angle(weight, own[0], roll), blend_angle(weight, own[1], pitch)
-        write_quat(s.q_nb, from_euler(roll, pitch, own[2]))
-    a, v, newest = rotate(as_quat(s.q_nb), accel), s.vel_n, s.gains[(s.gain_count - 1) % MOST_GAINS]
+        write_quat(s.q_nb, quat.from_euler(roll, pitch, own[2]))
+    a, v, newest = (
+        quat.rotate(as_quat(s.q_nb), accel),
+        s.vel_n,
+        s.gains[(s.gain_count - 1) % MOST_GAINS],
+    )
     gain = (a[0] * dt_s, a[1] * dt_s, (a[2] + STANDARD_GRAVITY_MPS2) * dt_s)
     row = s.gains[s.gain_count % MOST_GAINS]
     row[0] = s.time_us
@@ -343,25 +335,25 @@ def follow_rate(s: PaperState, p: PaperGains, dt_s: float) -> None:
 def follow_rest(s: PaperState, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
     """Measure the gyroscope bias at rest."""
     share = min(1.0, dt_s / REST_S)
-    write_vec(s.gyro_mean, part_way(as_vec(s.gyro_mean), gyro, share))
-    write_vec(s.accel_mean, part_way(as_vec(s.accel_mean), accel, share))
+    write_vec(s.gyro_mean, quat.part_way(as_vec(s.gyro_mean), gyro, share))
+    write_vec(s.accel_mean, quat.part_way(as_vec(s.accel_mean), accel, share))
     fresh = s.fix_us != NEVER_US and (s.time_us - s.fix_us) / US_PER_S < col.FRESH_GPS_S
     quiet = (
-        math.sqrt(norm_sq(difference(gyro, as_vec(s.gyro_mean)))) < REST[0]
-        and math.sqrt(norm_sq(difference(accel, as_vec(s.accel_mean)))) < REST[1]
-        and math.sqrt(norm_sq(as_vec(s.gyro_mean))) < REST[2]
-        and not (fresh and math.sqrt(norm_sq(as_vec(s.fix_vel))) > REST[3])
+        math.sqrt(quat.norm_sq(quat.difference(gyro, as_vec(s.gyro_mean)))) < REST[0]
+        and math.sqrt(quat.norm_sq(quat.difference(accel, as_vec(s.accel_mean)))) < REST[1]
+        and math.sqrt(quat.norm_sq(as_vec(s.gyro_mean))) < REST[2]
+        and not (fresh and math.sqrt(quat.norm_sq(as_vec(s.fix_vel))) > REST[3])
     )
     s.rest_s = s.rest_s + dt_s if quiet else 0.0
     if s.rest_s >= REST_S:
-        write_vec(s.bias_b, part_way(as_vec(s.bias_b), as_vec(s.gyro_mean), share))
+        write_vec(s.bias_b, quat.part_way(as_vec(s.bias_b), as_vec(s.gyro_mean), share))
 
 
 @compiled
 def correct_yaw(s: PaperState, p: PaperGains, mag_b: Vec3) -> None:
     """Blend yaw with the tilt-compensated compass: the second complementary filter."""
-    roll, pitch, yaw = to_euler(as_quat(s.q_nb))
-    level = rotate(from_euler(roll, pitch, 0.0), mag_b)
+    roll, pitch, yaw = quat.to_euler(as_quat(s.q_nb))
+    level = quat.rotate(quat.from_euler(roll, pitch, 0.0), mag_b)
     compass = math.atan2(-level[1], level[0])
     if math.isfinite(s.declination_rad):
         compass += s.declination_rad
@@ -369,18 +361,18 @@ def correct_yaw(s: PaperState, p: PaperGains, mag_b: Vec3) -> None:
     if s.mag_us != NEVER_US:
         dt_s = max(s.time_us - s.mag_us, 0) / US_PER_S
         weight = p.alpha_yaw ** (dt_s / GAIN_INTERVAL_S)
-    write_quat(s.q_nb, from_euler(roll, pitch, blend_angle(weight, yaw, compass)))
+    write_quat(s.q_nb, quat.from_euler(roll, pitch, blend_angle(weight, yaw, compass)))
     s.mag_us = s.time_us
 
 
 @compiled
 def blend_fix(s: PaperState, p: PaperGains) -> None:
     """Blend velocity and position with the fix: eq. 1, 2, 7 and 8 as recursions."""
-    write_vec(s.vel_n, part_way(as_vec(s.vel_n), as_vec(s.fix_vel), 1.0 - p.alpha_accel))
+    write_vec(s.vel_n, quat.part_way(as_vec(s.vel_n), as_vec(s.fix_vel), 1.0 - p.alpha_accel))
     # The longitude may wrap between the two positions.
     fix_lon = s.location[1] + wrap_180(s.fix_location[1] - s.location[1])
     fix = (s.fix_location[0], fix_lon, s.fix_location[2])
-    lat, lon, alt = part_way(as_vec(s.location), fix, 1.0 - p.beta_velocity)
+    lat, lon, alt = quat.part_way(as_vec(s.location), fix, 1.0 - p.beta_velocity)
     write_vec(s.location, (lat, wrap_180(lon), alt))
 
 

@@ -23,14 +23,8 @@ from gateway.compiled import compiled
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import MOMENTS, NEVER_S, State
 from gateway.estimation.record import as_quat, as_vec, write_quat, write_vec
+from gateway.geometry import quaternion as quat
 from gateway.geometry.angle import wrap_pi
-from gateway.geometry.quaternion import (
-    from_rotation_vector,
-    multiply,
-    normalise,
-    rotate,
-    rotate_inverse,
-)
 from gateway.records import Quat, Vec3
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
@@ -121,7 +115,7 @@ def contradiction(s: State, reference: Vec3, force: Vec3, weight: float) -> floa
     if s.pairs < FITTED_PARAMETERS + 1.0:
         return 0.0
     q_ni, misfit = solve_rotation(s)
-    north, east, down = rotate(q_ni, force)
+    north, east, down = quat.rotate(q_ni, force)
     level_off = math.hypot(north, east) - math.hypot(reference[0], reference[1])
     off_sq = level_off * level_off + (down - reference[2]) ** 2
     if off_sq < MISMATCH_MPS2**2 + MISMATCH_SIGMA**2 * misfit / weight:
@@ -186,7 +180,7 @@ def solve_rotation(s: State) -> tuple[Quat, float]:
     for i in range(1, 4):
         if A[i, i] > A[best, best]:
             best = i
-    q = normalise((A[best, 0], A[best, 1], A[best, 2], A[best, 3]))
+    q = quat.normalise((A[best, 0], A[best, 1], A[best, 2], A[best, 3]))
     shift = set_davenport(s)
     K, fit = s.work[0], 0.0
     for i in range(4):
@@ -233,7 +227,7 @@ def heading_of_pairs(s: State, q_ni: Quat, bias_radps: float) -> tuple[float, fl
     """
     if s.pairs < FITTED_PARAMETERS + 1.0:
         return 0.0, UNKNOWN_RAD, 0.0
-    x, y = rotate_inverse(q_ni, (1.0, 0.0, 0.0)), rotate_inverse(q_ni, (0.0, 1.0, 0.0))
+    x, y = quat.rotate_inverse(q_ni, (1.0, 0.0, 0.0)), quat.rotate_inverse(q_ni, (0.0, 1.0, 0.0))
     ramp = STANDARD_GRAVITY_MPS2 * max(bias_radps, 1e-4)
     prior = 1.0 / (ramp * ramp)
     M = s.moments
@@ -283,20 +277,20 @@ def align(s: State, bias_radps: float) -> float:
     q_ni, misfit = solve_rotation(s)
     s.aligned_std[0] = level_std(s, misfit)
     turn_rad, s.aligned_std[1], noise = heading_of_pairs(s, q_ni, bias_radps)
-    q_ni = multiply(from_rotation_vector((0.0, 0.0, turn_rad)), q_ni)
-    write_quat(s.aligned_q_nb, normalise(multiply(q_ni, as_quat(s.q_ib))))
+    q_ni = quat.multiply(quat.from_rotation_vector((0.0, 0.0, turn_rad)), q_ni)
+    write_quat(s.aligned_q_nb, quat.normalise(quat.multiply(q_ni, as_quat(s.q_ib))))
     return noise
 
 
 @compiled
 def level_difference(q_a: Quat, q_b: Quat) -> float:
     """Return the angle between the verticals of two attitudes, rad."""
-    x, y = rotate_inverse(q_a, (0.0, 0.0, 1.0)), rotate_inverse(q_b, (0.0, 0.0, 1.0))
+    x, y = quat.rotate_inverse(q_a, (0.0, 0.0, 1.0)), quat.rotate_inverse(q_b, (0.0, 0.0, 1.0))
     return math.acos(max(-1.0, min(1.0, x[0] * y[0] + x[1] * y[1] + x[2] * y[2])))
 
 
 @compiled
 def heading_difference(q_a: Quat, q_b: Quat) -> float:
     """Return the rotation about down from the second attitude to the first, rad."""
-    turn = multiply(q_a, (q_b[0], -q_b[1], -q_b[2], -q_b[3]))
+    turn = quat.multiply(q_a, (q_b[0], -q_b[1], -q_b[2], -q_b[3]))
     return wrap_pi(2.0 * math.atan2(turn[3], turn[0]))

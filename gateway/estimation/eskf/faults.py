@@ -24,18 +24,7 @@ from gateway.estimation.eskf.rest import is_usual_bias
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import ATT, NEVER_S, POS, VEL, State
 from gateway.estimation.record import FloatArray, as_quat, as_vec, write_quat, write_vec
-from gateway.geometry.quaternion import (
-    difference,
-    from_rotation_vector,
-    is_below,
-    multiply,
-    norm_sq,
-    normalise,
-    part_way,
-    rotate,
-    rotate_inverse,
-    scaled,
-)
+from gateway.geometry import quaternion as quat
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -81,8 +70,8 @@ WANDER_RADPS: Final = 0.05
 @compiled
 def is_start(s: State, gyro: Vec3, accel: Vec3) -> bool:
     """Return whether the filter may start with a sample, and set the fault if not."""
-    force = math.sqrt(norm_sq(accel)) / STANDARD_GRAVITY_MPS2
-    sound = is_below(gyro, GYRO_LIMIT_RADPS) and is_below(accel, ACCEL_LIMIT_MPS2)
+    force = math.sqrt(quat.norm_sq(accel)) / STANDARD_GRAVITY_MPS2
+    sound = quat.is_below(gyro, GYRO_LIMIT_RADPS) and quat.is_below(accel, ACCEL_LIMIT_MPS2)
     s.fault = 0 if sound and START_SHARES[0] < force < START_SHARES[1] else 1
     return s.fault == 0
 
@@ -90,7 +79,7 @@ def is_start(s: State, gyro: Vec3, accel: Vec3) -> bool:
 @compiled
 def change_of(v: Vec3, values: FloatArray, first: int) -> float:
     """Return the length of a vector minus three numbers of an array."""
-    return math.sqrt(norm_sq(difference(v, as_vec(values[first : first + 3]))))
+    return math.sqrt(quat.norm_sq(quat.difference(v, as_vec(values[first : first + 3]))))
 
 
 @compiled
@@ -129,7 +118,7 @@ def check_sensor(s: State, k: int, v: Vec3, limit: float, other_same: bool, dt: 
     most = LARGEST_CHANGE[k][0] + LARGEST_CHANGE[k][1] * dt + TIMES_USUAL * s.usual_change[k]
     if math.isfinite(change):
         s.usual_change[k] += dt / (USUAL_S + dt) * (min(change, most) - s.usual_change[k])
-    if not is_below(v, limit) or s.stuck_s[k] >= STUCK_S:
+    if not quat.is_below(v, limit) or s.stuck_s[k] >= STUCK_S:
         return 2
     return 1 if change > most else 0
 
@@ -146,7 +135,7 @@ def check_sensors(
     s.fault = 1 if gyro_fault == 2 or accel_fault == 2 or clipped != 0.0 else 0
     s.sound_s = s.sound_s + dt if s.fault == 0 else 0.0
     # A bus error changes both sensors, like a reset to zeros; a shock changes the force alone.
-    odd = gyro_fault == 1 or norm_sq(gyro) + norm_sq(accel) == 0.0
+    odd = gyro_fault == 1 or quat.norm_sq(gyro) + quat.norm_sq(accel) == 0.0
     good_gyro, good_accel = gyro_fault == 0 and not odd, accel_fault == 0 and not odd
     for k in range(3):
         s.imu_last[k], s.imu_last[3 + k] = gyro[k], accel[k]
@@ -170,8 +159,8 @@ def substitute_accel(s: State) -> Vec3:
     """Return the force for a sample without a valid one."""
     if s.missing_s[1] < HOLD_S:
         return as_vec(s.imu_held[3:6])
-    gravity = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, STANDARD_GRAVITY_MPS2))
-    return difference(as_vec(s.accel_bias_b), gravity)
+    gravity = quat.rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, STANDARD_GRAVITY_MPS2))
+    return quat.difference(as_vec(s.accel_bias_b), gravity)
 
 
 @compiled
@@ -207,7 +196,7 @@ def follow_step(s: State, gyro: Vec3, dt: float) -> None:
     if s.usual_step_s == 0.0:
         s.usual_step_s = min(dt, SLOWEST_STEP_S)
     s.usual_step_s += STEP_SHARE * (min(dt, 2.0 * s.usual_step_s) - s.usual_step_s)
-    s.usual_rate_sq += min(dt / TURNING_S, 1.0) * (norm_sq(gyro) / 3.0 - s.usual_rate_sq)
+    s.usual_rate_sq += min(dt / TURNING_S, 1.0) * (quat.norm_sq(gyro) / 3.0 - s.usual_rate_sq)
 
 
 @compiled
@@ -226,9 +215,9 @@ def interpolate(
     turned = unseen_turn_var(s, gyro_before, gyro, as_vec(s.gyro_bias_b), unseen_s)
     s.pending_noise[0] += turned
     moved = UNSEEN_MPS2**2 * unseen_s * min(unseen_s, RATE_TAU_S)
-    s.pending_noise[1] += moved + 0.25 * unseen_s * unseen_s * turned * norm_sq(accel)
+    s.pending_noise[1] += moved + 0.25 * unseen_s * unseen_s * turned * quat.norm_sq(accel)
     share = 0.5 * unseen_s / dt
-    return part_way(gyro, gyro_before, share), part_way(accel, accel_before, share)
+    return quat.part_way(gyro, gyro_before, share), quat.part_way(accel, accel_before, share)
 
 
 @compiled
@@ -247,21 +236,21 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     mean, about, steady = steady_turn(s)
     before = as_vec(s.imu_held[0:3])
     share = 2.0 * end_share_s(dt) / dt
-    rate = rate_of(s, part_way(steady, part_way(before, gyro, 0.5), share))
+    rate = rate_of(s, quat.part_way(steady, quat.part_way(before, gyro, 0.5), share))
     turned_var = unseen_turn_var(s, before, gyro, steady, dt)
-    turned_var += ((WANDER_RADPS + math.sqrt(norm_sq(mean))) * dt) ** 2
-    turn = from_rotation_vector(scaled(rate, dt))
-    write_quat(s.q_nb, normalise(multiply(as_quat(s.q_nb), turn)))
-    write_quat(s.q_ib, normalise(multiply(as_quat(s.q_ib), turn)))
+    turned_var += ((WANDER_RADPS + math.sqrt(quat.norm_sq(mean))) * dt) ** 2
+    turn = quat.from_rotation_vector(quat.scaled(rate, dt))
+    write_quat(s.q_nb, quat.normalise(quat.multiply(as_quat(s.q_nb), turn)))
+    write_quat(s.q_ib, quat.normalise(quat.multiply(as_quat(s.q_ib), turn)))
     flown_s = 0.0
     if s.aided == 1:
         # Fixes in the gap have already updated position and velocity.
         flown_s = min(s.time_s - s.fix_s, dt)
         half_rad = 0.5 * about * flown_s
-        turn = from_rotation_vector((0.0, 0.0, half_rad))
+        turn = quat.from_rotation_vector((0.0, 0.0, half_rad))
         # The mean velocity of an arc has the direction of its chord.
-        mean = rotate(turn, as_vec(s.vel_n))
-        write_vec(s.vel_n, rotate(turn, mean))
+        mean = quat.rotate(turn, as_vec(s.vel_n))
+        write_vec(s.vel_n, quat.rotate(turn, mean))
         chord = math.sin(half_rad) / half_rad if abs(half_rad) > 1e-6 else 1.0
         for k in range(3):
             s.pos_n[k] += mean[k] * flown_s * (chord if k < 2 else 1.0)
@@ -274,10 +263,10 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
 def steady_turn(s: State) -> tuple[Vec3, float, Vec3]:
     """Return the mean rate before a gap, its part about down, and that part with the bias."""
     bias = as_vec(s.gyro_bias_b)
-    mean = difference(as_vec(s.imu_mean[0:3]), bias)
-    down_b = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, 1.0))
+    mean = quat.difference(as_vec(s.imu_mean[0:3]), bias)
+    down_b = quat.rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, 1.0))
     about = down_b[0] * mean[0] + down_b[1] * mean[1] + down_b[2] * mean[2]
-    return mean, about, difference(bias, scaled(down_b, -about))
+    return mean, about, quat.difference(bias, quat.scaled(down_b, -about))
 
 
 @compiled

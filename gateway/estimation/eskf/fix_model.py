@@ -15,18 +15,12 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.columns import GPS_H_ACC, GPS_SPEED_ACC, GPS_V_ACC
+from gateway.estimation.eskf import update
 from gateway.estimation.eskf.alignment import NOISE_MPS
 from gateway.estimation.eskf.magnetometer import STALE_MAG_S
 from gateway.estimation.eskf.predict import is_accel_degraded, look_back
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import ATT, GAINED, GPS_CLIMB, GPS_ERROR, MOVED, POS, VEL, State
-from gateway.estimation.eskf.update import (
-    clear_row,
-    inject,
-    innovation_variance,
-    set_accel_bias,
-    update_scalar,
-)
 from gateway.estimation.record import FloatArray, as_vec
 from gateway.geometry.quaternion import difference, norm_sq, scaled
 from gateway.records import Vec3
@@ -157,23 +151,23 @@ def mean_acceleration(s: State, lag: float) -> Vec3:
 @compiled
 def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
     """Write the row of one component of a late velocity."""
-    clear_row(s)
+    update.clear_row(s)
     set_attitude(s, k, scaled(once, -1.0))
     s.h[VEL + k] = 1.0
     if k == 2:
         s.h[GPS_CLIMB] = 1.0
-    set_accel_bias(s, k, lag)
+    update.set_accel_bias(s, k, lag)
 
 
 @compiled
 def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
     """Write the row of one component of a late position, which has the slow GPS error."""
-    clear_row(s)
+    update.clear_row(s)
     set_attitude(s, k, difference(scaled(once, lag), twice))
     s.h[VEL + k] = -lag
     s.h[POS + k] = 1.0
     s.h[GPS_ERROR + k] = 1.0
-    set_accel_bias(s, k, -0.5 * lag * lag)
+    update.set_accel_bias(s, k, -0.5 * lag * lag)
 
 
 @compiled
@@ -191,7 +185,7 @@ def is_unlikely(s: State, p: Gains, row: FloatArray, off: Vec3, lag: float) -> b
     worst = 0.0
     for k in range(2):
         position_row(s, k, once, twice, lag)
-        total = innovation_variance(s, position_variance(s, p, row, k, p.gps_correlation_s))
+        total = update.innovation_variance(s, position_variance(s, p, row, k, p.gps_correlation_s))
         worst = max(worst, off[k] * off[k] / total)
     return worst > p.gate_sigma_sq
 
@@ -204,7 +198,7 @@ def raise_glitch_variance(s: State, kind: int, off: float, variance: float, sinc
     sensors. The equivalent variance is that of one error times the number of fixes that share it.
     """
     off = min(abs(off), MAX_GLITCH[kind])
-    excess = off * off / GLITCH_GATE_SQ[kind] - innovation_variance(s, variance)
+    excess = off * off / GLITCH_GATE_SQ[kind] - update.innovation_variance(s, variance)
     s.glitch_var[kind] = max(s.glitch_var[kind], excess * max(1.0, GLITCH_S / since_s))
 
 
@@ -236,11 +230,11 @@ def update_fix(
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
             variance = velocity_variance(s, p, row, accel_n, k, since_s)
-            update_scalar(
+            update.update_scalar(
                 s, off_vel[k], variance + s.glitch_var[VELOCITY], GLITCH_GATE_SQ[VELOCITY]
             )
         if math.isfinite(off_pos[k]):
             position_row(s, k, once, twice, lag)
             variance = position_variance(s, p, row, k, since_s) + s.glitch_var[POSITION]
-            update_scalar(s, off_pos[k], variance, p.gate_sigma_sq)
-    inject(s)
+            update.update_scalar(s, off_pos[k], variance, p.gate_sigma_sq)
+    update.inject(s)

@@ -13,15 +13,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.eskf.alignment import (
-    ENOUGH_PAIRS,
-    MAX_PAIR_S,
-    MISMATCH_SIGMA,
-    align,
-    clear_pairs,
-    heading_difference,
-    level_difference,
-)
+from gateway.estimation.eskf import alignment, update
 from gateway.estimation.eskf.magnetometer import reset_hard_iron, turn_heading
 from gateway.estimation.eskf.predict import NO_HEADING_VAR, propagate
 from gateway.estimation.eskf.settings import Gains
@@ -37,14 +29,8 @@ from gateway.estimation.eskf.state import (
     reset_state,
     reset_states,
 )
-from gateway.estimation.eskf.update import (
-    gravity_force_n,
-    gravity_variance,
-    sustained_sq,
-    update_gravity,
-)
 from gateway.estimation.record import as_quat, as_vec, write_quat, write_vec
-from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
+from gateway.geometry import quaternion as quat
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 LOST_LEVEL_VAR: Final = 0.5**2
@@ -69,7 +55,7 @@ GRAVITY_MISMATCH_S: Final = 5.0
 def lose_attitude(s: State, p: Gains) -> None:
     """Discard the attitude; the position follows the fixes until an attitude is found."""
     s.lost, s.lost_s, s.mismatch_s, s.heading_known = 1, 0.0, 0.0, 0
-    clear_pairs(s)
+    alignment.clear_pairs(s)
     begin_attitude(s, p, LOST_LEVEL_VAR, NO_HEADING_VAR)
     # The low-pass contains forces rotated by the discarded attitude, or by an unknown one.
     s.force_lp_s = 0.0
@@ -100,32 +86,35 @@ def end_aiding(s: State) -> None:
 def level_by_gravity(s: State, p: Gains, dt: float) -> None:
     """Level by gravity while GPS velocities do not; `dt` is the time since the last call."""
     if s.lost == 1:
-        if s.time_s - s.pair_s > MAX_PAIR_S and s.force_lp_s > dt:
+        if s.time_s - s.pair_s > alignment.MAX_PAIR_S and s.force_lp_s > dt:
             find_level(s, p, dt)
         return
-    north, east, down = gravity_force_n(s)
+    north, east, down = update.gravity_force_n(s)
     off = math.atan2(math.hypot(north, east), -down)
-    std = math.sqrt(level_variance(s) + gravity_variance(s, p) / STANDARD_GRAVITY_MPS2**2)
-    wrong = off > max(GRAVITY_MISMATCH_RAD, MISMATCH_SIGMA * std) and sustained_sq(s) == 0.0
+    std = math.sqrt(level_variance(s) + update.gravity_variance(s, p) / STANDARD_GRAVITY_MPS2**2)
+    wrong = (
+        off > max(GRAVITY_MISMATCH_RAD, alignment.MISMATCH_SIGMA * std)
+        and update.sustained_sq(s) == 0.0
+    )
     s.mismatch_s = s.mismatch_s + dt if wrong else 0.0
     if s.mismatch_s > GRAVITY_MISMATCH_S or level_variance(s) > LOST_LEVEL_RAD**2:
         lose_attitude(s, p)
         return
-    update_gravity(s, p, dt)
+    update.update_gravity(s, p, dt)
 
 
 @compiled
 def find_level(s: State, p: Gains, dt: float) -> None:
     """Rotate the attitude to make the filtered force vertical, and accept it if accurate enough."""
     s.lost_s += dt
-    north, east, down = gravity_force_n(s)
+    north, east, down = update.gravity_force_n(s)
     level = math.hypot(north, east)
     if level > 0.0:
         angle = math.atan2(level, -down)
-        turn = from_rotation_vector((-angle * east / level, angle * north / level, 0.0))
-        write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+        turn = quat.from_rotation_vector((-angle * east / level, angle * north / level, 0.0))
+        write_quat(s.q_nb, quat.normalise(quat.multiply(turn, as_quat(s.q_nb))))
     begin_attitude(s, p, LOST_LEVEL_VAR, NO_HEADING_VAR)
-    update_gravity(s, p, 2.0 * p.gravity_tau_s)
+    update.update_gravity(s, p, 2.0 * p.gravity_tau_s)
     if level_variance(s) < 2.0 * (FOUND_LEVEL_RAD * max(1.0, s.lost_s / PATIENCE_S)) ** 2:
         s.lost = 0
         reset_state(s, ATT + 2, 0.0)
@@ -135,9 +124,9 @@ def find_level(s: State, p: Gains, dt: float) -> None:
 def check_attitude(s: State, p: Gains, dt: float, sound: bool) -> None:
     """Compare the attitude with the alignment after a new pair of `dt` seconds."""
     bias_var = 0.5 * (s.P[GYRO_BIAS, GYRO_BIAS] + s.P[GYRO_BIAS + 1, GYRO_BIAS + 1])
-    noise = align(s, math.sqrt(bias_var))
+    noise = alignment.align(s, math.sqrt(bias_var))
     if sound and noise > 0.0:
-        s.fix_excess += s.pairs / (s.pairs + ENOUGH_PAIRS) * (noise - s.fix_excess)
+        s.fix_excess += s.pairs / (s.pairs + alignment.ENOUGH_PAIRS) * (noise - s.fix_excess)
     level, heading = s.aligned_std[0], s.aligned_std[1]
     if s.lost == 1:
         s.lost_s += dt
@@ -150,7 +139,7 @@ def check_attitude(s: State, p: Gains, dt: float, sound: bool) -> None:
             discard_calibration(s, p)
         replace_attitude(s, p)
     elif s.heading_known == 0 and level < FOUND_LEVEL_RAD and heading < FOUND_HEADING_RAD:
-        turn_heading(s, heading_difference(as_quat(s.aligned_q_nb), as_quat(s.q_nb)))
+        turn_heading(s, alignment.heading_difference(as_quat(s.aligned_q_nb), as_quat(s.q_nb)))
         reset_state(s, ATT + 2, heading * heading)
         s.heading_known = s.heading_true = 1
 
@@ -159,13 +148,13 @@ def check_attitude(s: State, p: Gains, dt: float, sound: bool) -> None:
 def differs_from_alignment(s: State) -> bool:
     """Return whether alignment and attitude differ significantly."""
     found, q_nb = as_quat(s.aligned_q_nb), as_quat(s.q_nb)
-    allowed = MISMATCH_SIGMA * math.sqrt(s.aligned_std[0] ** 2 + level_variance(s))
-    if level_difference(found, q_nb) > max(MISMATCH_LEVEL_RAD, allowed):
+    allowed = alignment.MISMATCH_SIGMA * math.sqrt(s.aligned_std[0] ** 2 + level_variance(s))
+    if alignment.level_difference(found, q_nb) > max(MISMATCH_LEVEL_RAD, allowed):
         return True
     if s.heading_known == 0 or s.aligned_std[1] > FOUND_HEADING_RAD:
         return False
-    allowed = MISMATCH_SIGMA * math.sqrt(s.aligned_std[1] ** 2 + s.P[ATT + 2, ATT + 2])
-    return abs(heading_difference(found, q_nb)) > max(FOUND_HEADING_RAD, allowed)
+    allowed = alignment.MISMATCH_SIGMA * math.sqrt(s.aligned_std[1] ** 2 + s.P[ATT + 2, ATT + 2])
+    return abs(alignment.heading_difference(found, q_nb)) > max(FOUND_HEADING_RAD, allowed)
 
 
 @compiled
@@ -178,8 +167,10 @@ def replace_attitude(s: State, p: Gains) -> None:
     if s.heading_known == 1:
         s.heading_true = 1
     else:
-        turn_rad = heading_difference(as_quat(s.q_nb), found)
-        found = normalise(multiply(from_rotation_vector((0.0, 0.0, turn_rad)), found))
+        turn_rad = alignment.heading_difference(as_quat(s.q_nb), found)
+        found = quat.normalise(
+            quat.multiply(quat.from_rotation_vector((0.0, 0.0, turn_rad)), found)
+        )
     write_quat(s.q_nb, found)
     require_bias_variance(s, p.gyro_bias_change_radps)
     begin_attitude(s, p, s.aligned_std[0] ** 2, heading_std * heading_std)

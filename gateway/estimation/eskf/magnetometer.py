@@ -33,18 +33,8 @@ from gateway.estimation.eskf.state import (
 )
 from gateway.estimation.eskf.update import clear_row, consider, inject, update_scalar
 from gateway.estimation.record import as_quat, as_vec, write_quat, write_vec
+from gateway.geometry import quaternion as quat
 from gateway.geometry.angle import wrap_pi
-from gateway.geometry.quaternion import (
-    body_axes,
-    difference,
-    from_rotation_vector,
-    multiply,
-    norm_sq,
-    normalise,
-    rotate,
-    rotate_inverse,
-    scaled,
-)
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
 
@@ -101,14 +91,14 @@ BIAS_TURN_RAD: Final = 4.0 * math.pi
 @compiled
 def is_sound_field(s: State, mag_b: Vec3, dt: float) -> bool:
     """Return whether a sample contains a valid new field; must be called for each sample."""
-    stuck = norm_sq(as_vec(s.mag_turned)) > STUCK_TURN_RAD * STUCK_TURN_RAD
+    stuck = quat.norm_sq(as_vec(s.mag_turned)) > STUCK_TURN_RAD * STUCK_TURN_RAD
     if s.at_rest == 0 and not stuck:
         for k in range(3):
             s.mag_turned[k] += s.rate_b[k] * dt
-    strength_sq = norm_sq(mag_b)
+    strength_sq = quat.norm_sq(mag_b)
     if not FIELD_RANGE_UT[0] ** 2 < strength_sq < FIELD_RANGE_UT[1] ** 2:
         return False
-    if norm_sq(difference(mag_b, as_vec(s.mag_last))) == 0.0:
+    if quat.norm_sq(quat.difference(mag_b, as_vec(s.mag_last))) == 0.0:
         return bool(s.mag_misplaced == 0 and not stuck)
     write_vec(s.mag_last, mag_b)
     s.mag_turned[:] = 0.0
@@ -120,7 +110,7 @@ def is_sound_field(s: State, mag_b: Vec3, dt: float) -> bool:
 def begin_turn(s: State, mag_b: Vec3) -> None:
     """Set the field with which the following ones are compared; zero for no comparison."""
     write_vec(s.mag_from_b, mag_b)
-    write_vec(s.mag_from_i, rotate(as_quat(s.q_ib), mag_b))
+    write_vec(s.mag_from_i, quat.rotate(as_quat(s.q_ib), mag_b))
 
 
 @compiled
@@ -131,25 +121,25 @@ def check_placement(s: State, mag_b: Vec3) -> None:
     but it changes the norm, and is not a reason to reject the compass.
     """
     begin = as_vec(s.mag_from_b)
-    carried = rotate_inverse(as_quat(s.q_ib), as_vec(s.mag_from_i))
-    begin_sq = norm_sq(begin)
-    expected_sq = norm_sq(difference(carried, begin))
+    carried = quat.rotate_inverse(as_quat(s.q_ib), as_vec(s.mag_from_i))
+    begin_sq = quat.norm_sq(begin)
+    expected_sq = quat.norm_sq(quat.difference(carried, begin))
     if expected_sq < TURN_SHARE**2 * begin_sq:
         return
     begin_turn(s, mag_b)
     if begin_sq == 0.0:
         return
-    changed_sq = norm_sq(difference(mag_b, begin))
+    changed_sq = quat.norm_sq(quat.difference(mag_b, begin))
     if changed_sq > NORM_SHARE * expected_sq:
         s.rest_turn_rad = 0.0
     else:
         # Only the gyroscope measures a turn, so its bias is unknown.
         s.rest_seen, s.rest_turn_rad = 0, BIAS_TURN_RAD
-    change = math.sqrt(norm_sq(mag_b)) - math.sqrt(begin_sq)
+    change = math.sqrt(quat.norm_sq(mag_b)) - math.sqrt(begin_sq)
     q = s.mag_squares
     # One such turn is assumed to be explained, so that a few turns cannot decide.
     q[0] = TURNS_KEPT * (q[0] if q[0] > 0.0 else begin_sq) + changed_sq
-    q[1] = TURNS_KEPT * q[1] + norm_sq(difference(mag_b, carried))
+    q[1] = TURNS_KEPT * q[1] + quat.norm_sq(quat.difference(mag_b, carried))
     q[2] = TURNS_KEPT * q[2] + change * change
     most = WELL_PLACED_SHARE if s.mag_misplaced == 1 else MISPLACED_SHARE
     s.mag_misplaced = 1 if q[1] > most * q[0] and q[2] < NORM_SHARE * q[1] else 0
@@ -199,7 +189,7 @@ def learn_field(s: State, p: Gains, norm: float, dip: float, dt: float) -> None:
         new[0], new[1], s.mag_candidate_s = norm, dip, 0.0
         return
     first = s.mag_ref[0] == 0.0
-    if first or norm_sq(as_vec(s.rate_b)) > TURNING_RADPS * TURNING_RADPS:
+    if first or quat.norm_sq(as_vec(s.rate_b)) > TURNING_RADPS * TURNING_RADPS:
         s.mag_candidate_s += dt
     new[0] += dt / FIELD_TAU_S * (norm - new[0])
     new[1] += dt / FIELD_TAU_S * (dip - new[1])
@@ -213,10 +203,10 @@ def update_mag(s: State, p: Gains, mag_b: Vec3) -> None:
     """Use one valid reading of the calibrated field in body FRD, uT."""
     if s.lost == 1:
         return
-    turned = scaled(as_vec(s.rate_b), s.mag_latency_s)
-    earth_b = difference(mag_b, as_vec(s.hard_iron_b))
-    present_b = rotate_inverse(from_rotation_vector(turned), earth_b)
-    field_n = rotate(as_quat(s.q_nb), present_b)
+    turned = quat.scaled(as_vec(s.rate_b), s.mag_latency_s)
+    earth_b = quat.difference(mag_b, as_vec(s.hard_iron_b))
+    present_b = quat.rotate_inverse(quat.from_rotation_vector(turned), earth_b)
+    field_n = quat.rotate(as_quat(s.q_nb), present_b)
     level = math.hypot(field_n[0], field_n[1])
     norm = math.hypot(level, field_n[2])
     since_s = s.time_s - s.mag_s
@@ -250,7 +240,7 @@ def update_hard_iron(s: State, p: Gains, mag_b: Vec3, weight: float, dt: float) 
     consider_unaided(s)
     s.mag_mean_s += dt
     share = dt / min(FIELD_TAU_S, s.mag_mean_s)
-    off = norm_sq(mag_b) - s.mag_mean[3]
+    off = quat.norm_sq(mag_b) - s.mag_mean[3]
     s.mag_mean[3] += share * off
     for k in range(3):
         change = mag_b[k] - s.mag_mean[k]
@@ -260,7 +250,7 @@ def update_hard_iron(s: State, p: Gains, mag_b: Vec3, weight: float, dt: float) 
     if s.mag_mean_s < FIELD_TAU_S:
         return
     propagate(s, p)
-    variance = 4.0 * norm_sq(mag_b) * NORM_NOISE_UT**2 / weight
+    variance = 4.0 * quat.norm_sq(mag_b) * NORM_NOISE_UT**2 / weight
     update_scalar(s, off, variance * max(1.0, CORRELATION_S / dt), p.gate_sigma_sq)
     inject(s)
 
@@ -278,11 +268,11 @@ def heading_row(s: State, field_n: Vec3) -> None:
     s.h[ATT] = -down * north / level_sq
     s.h[ATT + 1] = -down * east / level_sq
     s.h[ATT + 2] = 1.0
-    axes = body_axes(as_quat(s.q_nb))
+    axes = quat.body_axes(as_quat(s.q_nb))
     for k in range(3):
         s.h[HARD_IRON + k] = (east * axes[k][0] - north * axes[k][1]) / level_sq
     # A field that is older by dt is rotated back by the angular rate times dt.
-    rate_n = rotate(as_quat(s.q_nb), as_vec(s.rate_b))
+    rate_n = quat.rotate(as_quat(s.q_nb), as_vec(s.rate_b))
     for k in range(3):
         s.h[MAG_LATENCY] -= s.h[ATT + k] * rate_n[k]
 
@@ -376,8 +366,8 @@ def hard_iron_var(s: State, p: Gains) -> float:
 @compiled
 def turn_heading(s: State, turn_rad: float) -> None:
     """Rotate the attitude about down."""
-    turn = from_rotation_vector((0.0, 0.0, turn_rad))
-    write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+    turn = quat.from_rotation_vector((0.0, 0.0, turn_rad))
+    write_quat(s.q_nb, quat.normalise(quat.multiply(turn, as_quat(s.q_nb))))
     s.resets[ATT + 2] += 1.0
     # The integrals in NED contain the old heading.
     s.history_count = 0

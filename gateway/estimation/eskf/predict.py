@@ -51,16 +51,7 @@ from gateway.estimation.eskf.state import (
     watched_state,
 )
 from gateway.estimation.record import FloatArray, as_quat, as_vec, write_quat, write_vec
-from gateway.geometry.quaternion import (
-    body_axes,
-    difference,
-    from_rotation_vector,
-    multiply,
-    norm_sq,
-    normalise,
-    rotate,
-    scaled,
-)
+from gateway.geometry import quaternion as quat
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -119,15 +110,15 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     """
     rate = rate_of(s, gyro)
     write_vec(s.rate_b, rate)
-    half = from_rotation_vector(scaled(rate, 0.5 * dt))
-    q_i = multiply(as_quat(s.q_ib), half)
-    write_quat(s.q_ib, normalise(multiply(q_i, half)))
-    q = multiply(as_quat(s.q_nb), half)
-    write_quat(s.q_nb, normalise(multiply(q, half)))
-    axes = body_axes(q)
+    half = quat.from_rotation_vector(quat.scaled(rate, 0.5 * dt))
+    q_i = quat.multiply(as_quat(s.q_ib), half)
+    write_quat(s.q_ib, quat.normalise(quat.multiply(q_i, half)))
+    q = quat.multiply(as_quat(s.q_nb), half)
+    write_quat(s.q_nb, quat.normalise(quat.multiply(q, half)))
+    axes = quat.body_axes(q)
     x, y, z = axes
-    f = difference(accel, as_vec(s.accel_bias_b))
-    force_i = rotate(q_i, f)
+    f = quat.difference(accel, as_vec(s.accel_bias_b))
+    force_i = quat.rotate(q_i, f)
     accel_sq = 0.0
     for k in range(3):
         force = x[k] * f[0] + y[k] * f[1] + z[k] * f[2]
@@ -148,7 +139,7 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
             s.pos_n[k] += s.fix_vel[k] * dt
     for k in range(2):
         s.blend_n[k] -= min(1.0, dt / BLEND_S) * s.blend_n[k]
-    s.pending_noise[0] += p.gyro_turn_var * (dt * math.sqrt(norm_sq(rate)))
+    s.pending_noise[0] += p.gyro_turn_var * (dt * math.sqrt(quat.norm_sq(rate)))
     s.pending_noise[1] += p.accel_scale_sq * ACCELERATION_S * accel_sq * dt
     s.pending_s += dt
     follow_gravity(s, p, force_i, dt)
@@ -262,7 +253,7 @@ def propagate(s: State, p: Gains) -> None:
         s.gps_error_n[k] *= kept
     if s.aided == 0:
         s.P[POS + 2, POS + 2] += CLIMB_DENSITY * dt
-    speed_sq = norm_sq(as_vec(s.vel_n))
+    speed_sq = quat.norm_sq(as_vec(s.vel_n))
     s.P[BARO_OFFSET, BARO_OFFSET] += (
         p.baro_walk_density + p.baro_dynamic_density * speed_sq * speed_sq
     ) * dt

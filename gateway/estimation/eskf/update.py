@@ -43,15 +43,7 @@ from gateway.estimation.eskf.state import (
     watched_state,
 )
 from gateway.estimation.record import as_quat, as_vec, write_quat
-from gateway.geometry.quaternion import (
-    body_axes,
-    from_rotation_vector,
-    multiply,
-    norm_sq,
-    normalise,
-    rotate,
-    rotate_inverse,
-)
+from gateway.geometry import quaternion as quat
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -84,7 +76,7 @@ def consider(s: State, first: int, count: int) -> None:
 @compiled
 def set_accel_bias(s: State, k: int, share: float) -> None:
     """Write `share` times row `k` of `R_nb` for the accelerometer bias."""
-    axes = body_axes(as_quat(s.q_nb))
+    axes = quat.body_axes(as_quat(s.q_nb))
     for i in range(3):
         s.h[ACCEL_BIAS + i] = share * axes[i][k]
 
@@ -147,8 +139,8 @@ def update_scalar(s: State, innovation: float, variance: float, gate_sq: float) 
 def inject(s: State) -> None:
     """Apply the corrections of a group of updates to the nominal state: `q(att) * q_nb` [1]_."""
     d = s.dx
-    turn = from_rotation_vector((d[ATT], d[ATT + 1], d[ATT + 2]))
-    write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+    turn = quat.from_rotation_vector((d[ATT], d[ATT + 1], d[ATT + 2]))
+    write_quat(s.q_nb, quat.normalise(quat.multiply(turn, as_quat(s.q_nb))))
     for k in range(3):
         s.vel_n[k] += d[VEL + k]
         s.pos_n[k] += d[POS + k]
@@ -166,8 +158,8 @@ def inject(s: State) -> None:
 @compiled
 def gravity_force_n(s: State) -> Vec3:
     """Return the low-pass filtered force, rotated to NED by the present attitude, m/s2."""
-    force_b = rotate_inverse(as_quat(s.q_ib), as_vec(s.force_lp_i[1]))
-    return rotate(as_quat(s.q_nb), force_b)
+    force_b = quat.rotate_inverse(as_quat(s.q_ib), as_vec(s.force_lp_i[1]))
+    return quat.rotate(as_quat(s.q_nb), force_b)
 
 
 @compiled
@@ -175,7 +167,7 @@ def sustained_sq(s: State) -> float:
     """Return the square of the horizontal acceleration that a mean force beyond gravity implies."""
     bias_std = math.sqrt(s.P[ACCEL_BIAS, ACCEL_BIAS])
     most = (1.0 + GRAVITY_TOLERANCE) * STANDARD_GRAVITY_MPS2 + bias_std
-    return float(max(norm_sq(as_vec(s.force_lp_i[1])) - most * most, 0.0))
+    return float(max(quat.norm_sq(as_vec(s.force_lp_i[1])) - most * most, 0.0))
 
 
 @compiled
