@@ -109,14 +109,8 @@ class SensorChain:
 
     def imu_calibrated(self, imu: ImuCalibrated) -> ImuSample:
         """Return a sample that is already calibrated, such as one of another program's log."""
-        return ImuSample(
-            time_us=imu.time_us,
-            accel_b_mps2=imu.accel_b_mps2,
-            gyro_b_radps=imu.gyro_b_radps,
-            mag_b_ut=imu.mag_b_ut,
-            temperature_degc=imu.temperature_degc,
-            flags=imu.flags,
-        )
+        vectors = (imu.accel_b_mps2, imu.gyro_b_radps, imu.mag_b_ut)
+        return ImuSample(imu.time_us, *vectors, imu.temperature_degc, imu.flags)
 
     def calibrated(
         self, counts: FloatArray, flags: IntArray
@@ -157,9 +151,5 @@ class SensorChain:
 
         It is the height above the 1013.25 hPa level, m; NaN without a pressure.
         """
-        return BaroSample(
-            time_us=raw.time_us,
-            pressure_pa=raw.pressure_pa,
-            temperature_degc=raw.temperature_degc,
-            alt_pressure_m=pressure_altitude_m(raw.pressure_pa),
-        )
+        alt_m = pressure_altitude_m(raw.pressure_pa)
+        return BaroSample(raw.time_us, raw.pressure_pa, raw.temperature_degc, alt_m)

@@ -64,6 +64,7 @@ TEXT_INTERVAL_US: Final = 20 * US_PER_S
 STREAMED: Final = frozenset({"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"})
 """Messages that a ground station with a joystick sends many times a second."""
 
+_MAVLINK: Final[Any] = mavlink.MAVLink(None)
 RecordedAction = Outgoing | ClientInterval
 
 
@@ -108,14 +109,13 @@ class _Missions(MissionService):
         super().__init__(lambda *_: [], lambda *_: [])
         self._answers = answers
         self._read: dict[int, Sequence[bytes]] = {}
-        self._mavlink: Any = mavlink.MAVLink(None)
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         kind = int(getattr(request.message, "mission_type", MISSION))
         recorded = self._answers.mission(kind) or ()
         if kind in KINDS and self._read.get(kind) is not recorded:
             self._read[kind] = recorded
-            items = (read_item(self._mavlink.decode(bytearray(frame))) for frame in recorded)
+            items = (read_item(_MAVLINK.decode(bytearray(frame))) for frame in recorded)
             self.items[kind] = tuple(items)
         return super().handle(request, now_us)
 
@@ -129,7 +129,6 @@ class _Commands(Service):
         self._system_id = system_id
         self._answers = answers
         self._metadata = metadata
-        self._mavlink: Any = mavlink.MAVLink(None)
 
     def changes_state(self, request: Request) -> bool:
         command = read_command(request)
@@ -162,7 +161,7 @@ class _Commands(Service):
 
     def _chosen(self, frames: Sequence[bytes], wanted: MessageRequest) -> list[bytes]:
         """Return the frames that a request selects, in the order of their numbers."""
-        read = [(self._mavlink.decode(bytearray(frame)), frame) for frame in frames]
+        read = [(_MAVLINK.decode(bytearray(frame)), frame) for frame in frames]
         chosen = [(message, frame) for message, frame in read if wanted.selects(message)]
         if (
             wanted.message_id == AVAILABLE_MODES
@@ -220,7 +219,6 @@ class RecordedVehicle:
         )
         self._answers = answers
         self._texts = Announcer(TEXTS_AT_ONCE, TEXT_INTERVAL_US)
-        self._mavlink: Any = mavlink.MAVLink(None)
         queries = QueryService(self._recorded, lambda *_: [])
         self._by_message: dict[str, Service] = {
             kind: service for service in (queries, *self._services) for kind in service.types
@@ -250,7 +248,7 @@ class RecordedVehicle:
     def _recorded(self, message_id: int, _now_us: int) -> Any:
         """Return a recorded message; None if there is none."""
         frames = self._answers.frames(message_id)
-        return self._mavlink.decode(bytearray(frames[0])) if frames else None
+        return _MAVLINK.decode(bytearray(frames[0])) if frames else None
 
     def poll(self, now_us: int) -> list[RecordedAction]:
         """Send the next answers of every list and file."""

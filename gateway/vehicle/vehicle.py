@@ -184,8 +184,7 @@ class Vehicle:
         found = self.telemetry.on_state(state, sample)
         found += self._announcements.on_state(state, sample, now_us)
         found += self._intervals.on_state(state.time_us)
-        if self._calibrator.busy:
-            found += self._calibrator.on_sample(sample)
+        found += self._calibrator.on_sample(sample)
         return self._finish(found) if found else []
 
     def on_baro(self, sample: BaroSample, _now_us: int) -> list[Action]:
@@ -296,7 +295,8 @@ class Vehicle:
         """Answer and announce a request that the sender may not make."""
         self.refusals += 1
         self.requests.add(request, f"refused: {reason}", now_us)
-        name = _describe(request)
+        known = mavlink.enums["MAV_CMD"].get(getattr(request.message, "command", None))
+        name = known.name.removeprefix("MAV_CMD_") if known else request.message.get_type()
         status = StatusText(NOTICE, f"Refused {name} of system {request.system_id}: {reason}")
         answers = service.refuse(request, result)
         answers += self._refusal_texts.say(status, now_us)
@@ -311,10 +311,8 @@ class Vehicle:
         encoder = Encoder(self.system_id)
         asked = ("AUTOPILOT_VERSION", "PROTOCOL_VERSION", "AVAILABLE_MODES", "HOME_POSITION")
         built = [self.telemetry.build(MESSAGE_IDS[name], 0) for name in asked]
-        known = [message for message in built if message is not None]
-        known += self._parameters.values()
-        known += self.plan.missions.download()
-        return [encoder.encode(message, RECORDED_ONLY) for message in known]
+        built += [*self._parameters.values(), *self.plan.missions.download()]
+        return [encoder.encode(each, RECORDED_ONLY) for each in built if each is not None]
 
     def poll(self, now_us: int) -> list[Action]:
         """Return the actions that are due by time."""
@@ -399,11 +397,3 @@ class Vehicle:
             if isinstance(answer, SettingsChange) and isinstance(answer.settings, VehicleSettings):
                 self._reconfigure(answer.settings)
         return actions
-
-
-def _describe(request: Request) -> str:
-    message = request.message
-    number = getattr(message, "command", None)
-    known = mavlink.enums["MAV_CMD"].get(number)
-    kind: str = message.get_type()
-    return str(known.name).removeprefix("MAV_CMD_") if known else kind

@@ -175,8 +175,7 @@ class Calibrator(Service):
 
     def on_sample(self, sample: ImuSample) -> list[Answer]:
         """Process a calibrated sample during a calibration."""
-        run = self._run
-        if run is None:
+        if (run := self._run) is None:
             return []
         if self._in_flight():
             return self._fail("in flight")
@@ -191,9 +190,8 @@ class Calibrator(Service):
 
     def poll(self, now_us: int) -> list[Answer]:
         """End a calibration that takes too long."""
-        if self._run is None or now_us < self._run.deadline_us:
-            return []
-        return self._fail("timed out")
+        is_late = self._run is not None and now_us >= self._run.deadline_us
+        return self._fail("timed out") if is_late else []
 
     def next_due_us(self) -> int | None:
         """Return when to give up."""
@@ -254,8 +252,7 @@ class Calibrator(Service):
 
     def _fail(self, why: str) -> list[Answer]:
         run, self._run = self._run, None
-        ack = [run.command.ack(FAILED)] if run else []
-        return [*ack, *_text(f"calibration failed: {why}")]
+        return [*([run.command.ack(FAILED)] if run else []), *_text(f"calibration failed: {why}")]
 
 
 def _text(text: str) -> list[Answer]:

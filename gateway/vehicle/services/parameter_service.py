@@ -119,13 +119,9 @@ class ParameterService(ReadOnlyParameters[Parameter]):
 
     def value(self, entry: Parameter, client_id: int | None) -> Reply:
         """Return the PARAM_VALUE of a parameter."""
-        message = mavlink.MAVLink_param_value_message(
-            entry.name.encode(),
-            self.table.number(entry),
-            mavlink.MAV_PARAM_TYPE_REAL32,
-            len(self.table.parameters),
-            entry.index,
-        )
+        number, place = self.table.number(entry), (len(self.table.parameters), entry.index)
+        kind = mavlink.MAV_PARAM_TYPE_REAL32
+        message = mavlink.MAVLink_param_value_message(entry.name.encode(), number, kind, *place)
         return Reply(message, client_id)
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
@@ -158,11 +154,11 @@ class ParameterService(ReadOnlyParameters[Parameter]):
         if asked not in (RESET, RESET_CALIBRATION):
             return UNSUPPORTED, []
         before = self._numbers()
-        answers: list[Answer] = []
-        for key in [key for key in self.table.sections if key != HOME_SECTION]:
-            if (key == CALIBRATION) == (asked == RESET_CALIBRATION):
-                fresh = self.table.reset(key)
-                answers.append(SettingsChange(key, fresh))
+        answers: list[Answer] = [
+            SettingsChange(key, self.table.reset(key))
+            for key in self.table.sections
+            if key != HOME_SECTION and (key == CALIBRATION) == (asked == RESET_CALIBRATION)
+        ]
         return ACCEPTED, answers + self._changed_since(before)
 
     def values(self) -> list[Any]:
@@ -185,10 +181,8 @@ class ParameterService(ReadOnlyParameters[Parameter]):
 
     def _changed_since(self, before: Mapping[str, float]) -> list[Answer]:
         """Send the values that differ from `before`."""
-        now = self._numbers()
-        changed = [
-            each for name, each in self.table.parameters.items() if before[name] != now[name]
-        ]
+        now, parameters = self._numbers(), self.table.parameters
+        changed = [each for name, each in parameters.items() if before[name] != now[name]]
         return [answer for each in changed for answer in self._changed(each)]
 
     def _changed(self, parameter: Parameter) -> list[Answer]:
