@@ -244,20 +244,6 @@ def test_gps_latency_is_announced_once_its_estimate_has_settled(
     assert reported == expected
 
 
-def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
-    vehicle = make()
-    reported = texts(fly(vehicle, 0, 2))
-    assert {"Attitude valid", "Heading valid", "GPS fix"} <= set(reported)
-    flood = []
-    for n in range(2000):
-        time_us = 2 * ONE_S + n * 5_000
-        flags = NavFlags.MAG_DISTURBED if n % 2 else NavFlags(0)
-        state = state_at(time_us, flags=state_at(0).flags | flags)
-        flood += vehicle.on_state(state, sample_at(time_us), time_us)
-    assert "Magnetic field disturbed" in texts(flood)
-    assert len(texts(flood)) <= 4
-
-
 LOST = NavFlags.DEAD_RECKONING | NavFlags.DEGRADED
 REJECTED = LOST | NavFlags.GPS_REJECTED
 FAULT = NavFlags.SENSOR_FAULT | NavFlags.DEGRADED

@@ -13,7 +13,7 @@ from gateway.vehicle.telemetry.health import QUIET_REPORTS, RADIO_SPAN_US, Findi
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from gateway.vehicle_state.status_texts import TextJoiner
-from tests.kit.ground_station import decode, kinds, of_kind, texts
+from tests.kit.ground_station import decode, kinds, of_kind
 from tests.kit.mavlink import packed
 from tests.kit.records import link, report, status
 
@@ -113,17 +113,6 @@ def test_supply_without_limit_or_measurement_is_not_announced(flying: Flying) ->
     unlimited.report(supply_mv=1000)
     assert "BATTERY_STATUS" not in kinds(flying.report(supply_mv=0))
     assert unlimited.reported == flying.reported == []
-
-
-def test_radio_trouble_within_the_hold_time_is_announced_at_its_end(flying: Flying) -> None:
-    flying.report(radio_failed=110)
-    for _ in range(RADIO_REPORTS):
-        flying.report()
-    flying.report(radio_failed=250)
-    flying.report()
-    assert flying.reported[1:] == [(INFO, "IMU node 0: radio OK again")]
-    found = flying.vehicle.poll(flying.status.time_us + HOLD_US)
-    assert texts(found) == ["IMU node 0: radio sends failed, 140 in 10 s"]
 
 
 def test_new_overruns_of_the_receiver_are_announced(flying: Flying) -> None:
