@@ -202,13 +202,10 @@ class RadioState(IntEnum):
     @property
     def problem(self) -> str:
         """Description of the fault; empty if there is none."""
-        match self:
-            case RadioState.ABSENT:
-                return "radio module does not answer"
-            case RadioState.LOSES_SETTINGS:
-                return "radio module does not keep its configuration"
-            case _:
-                return ""
+        if self is RadioState.ABSENT:
+            return "radio module does not answer"
+        loses = self is RadioState.LOSES_SETTINGS
+        return "radio module does not keep its configuration" if loses else ""
 
 
 def node_role(sensors_present: int) -> str:

@@ -220,7 +220,7 @@ def update_imu(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> b
         write_vec(s.gyro_mean, gyro)
         write_vec(s.accel_mean, accel)
         write_vec(s.rate_b, gyro)
-        roll, pitch = tilt(accel)
+        roll, pitch = quat.tilt(accel)
         write_quat(s.q_nb, quat.from_euler(roll, pitch, 0.0))
     dt_s = (time_us - s.time_us) / US_PER_S
     if abs(dt_s) > GAP_S:
@@ -298,7 +298,7 @@ def advance(s: PaperState, p: PaperGains, accel: Vec3, rate: Vec3, dt_s: float) 
     step = quat.from_rotation_vector(quat.scaled(rate, dt_s))
     write_quat(s.q_nb, quat.normalise(quat.multiply(as_quat(s.q_nb), step)))
     write_vec(s.rate_b, rate)
-    roll, pitch = tilt(accel)
+    roll, pitch = quat.tilt(accel)
     if math.cos(pitch) >= MIN_COS_PITCH:
         weight = p.alpha_gyro ** (dt_s / GAIN_INTERVAL_S)
         own = quat.to_euler(as_quat(s.q_nb))
@@ -397,13 +397,6 @@ def flags_of(s: PaperState, sound: bool) -> int:
 def blend_angle(weight: float, own: float, measured: float) -> float:
     """Return the weighted mean of two angles, along the shorter arc."""
     return float(measured + weight * wrap_pi(own - measured))
-
-
-@compiled
-def tilt(accel: Vec3) -> tuple[float, float]:
-    """Return roll and pitch from a specific force that is only gravity."""
-    level = math.hypot(accel[1], accel[2])
-    return (math.atan2(-accel[1], -accel[2]), math.atan2(accel[0], level))
 
 
 @compiled

@@ -146,6 +146,13 @@ def to_euler(q: Quat) -> Vec3:
     return (roll, pitch, yaw)
 
 
+@compiled
+def tilt(force_b: Vec3) -> tuple[float, float]:
+    """Return roll and pitch of a body from a specific force that is only gravity."""
+    level = math.hypot(force_b[1], force_b[2])
+    return (math.atan2(-force_b[1], -force_b[2]), math.atan2(force_b[0], level))
+
+
 def from_euler_array(angles_rad: FloatArray) -> FloatArray:
     """Apply `from_euler` to each row of roll, pitch and yaw, shape (n, 3); returns (n, 4)."""
     angles = np.ascontiguousarray(angles_rad, np.float64)

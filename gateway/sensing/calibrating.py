@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.geometry.geomagnetism import MagneticField
-from gateway.geometry.quaternion import body_axes, from_euler, rotate_inverse
+from gateway.geometry.quaternion import body_axes, from_euler, rotate_inverse, tilt
 from gateway.geometry.rotation import Matrix3
 from gateway.records import ImuRaw, Vec3
 from gateway.sensing.calibration import (
@@ -307,12 +307,6 @@ def _angle_deg(a: FloatArray, b: FloatArray) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def _tilt(force: Vec3) -> tuple[float, float]:
-    """Return roll and pitch of a body at rest from its specific force."""
-    x, y, z = force
-    return math.atan2(-y, -z), math.atan2(x, math.hypot(y, z))
-
-
 def _vec3(v: FloatArray) -> Vec3:
     return (float(v[0]), float(v[1]), float(v[2]))
 
@@ -443,7 +437,7 @@ def calibrate_mounting(
 def calibrate_level(samples: NodeSamples, calibration: NodeCalibration) -> NodeCalibration:
     """Correct the mounting by the small tilt measured on a level aircraft."""
     x, y, z = np.array(calibration.mounting) @ np.array(_force(samples, calibration))
-    roll, pitch = _tilt((x, y, z))
+    roll, pitch = tilt((x, y, z))
     if max(abs(roll), abs(pitch)) > MAX_TILT_RAD:
         raise CalibrationError("it was not level")
     return remove_tilt(calibration, (roll, pitch, 0.0))
@@ -471,7 +465,7 @@ def calibrate_magnetometer_by_yaw(
     windows = still_windows(samples)
     if not windows or len(samples.mag) < MIN_FIELD_SAMPLES:
         raise CalibrationError(NOT_STILL if not windows else "there is no magnetometer")
-    q_nb = from_euler(*_tilt(_force(samples, calibration)), yaw_rad)
+    q_nb = from_euler(*tilt(_force(samples, calibration)), yaw_rad)
     level = field.strength_ut * math.cos(field.inclination_rad)
     north = level * math.cos(field.declination_rad), level * math.sin(field.declination_rad)
     down = field.strength_ut * math.sin(field.inclination_rad)
