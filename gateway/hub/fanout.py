@@ -88,15 +88,6 @@ class _Subscription:
             return False
         return not self.client.is_mavlink1 or base_size(frame.message_id) is not None
 
-    @property
-    def bounds_others(self) -> bool:
-        """Whether its link carries no telemetry of vehicles that are not received on it.
-
-        So it is if its capacity is known, unless its options select some systems.
-        """
-        endpoint = self.client.endpoint
-        return endpoint.budget > 0 and not (endpoint.systems or endpoint.monitor)
-
     def lets_out(self, frame: MavFrame) -> bool:
         """Return whether the client's filter passes a frame that is addressed, or a station's."""
         systems = self.client.endpoint.systems
@@ -474,11 +465,12 @@ class Fanout:
 
     def _interval_us(self, each: _Subscription, frame: MavFrame, *, is_ours: bool) -> int:
         """Return the least time between two frames to a client, of those like this one."""
-        if (
-            each.bounds_others
-            and frame.message_id not in each.client.endpoint.systems.also
-            and self.hears_only_others(each.client.client_id, frame.origin[0])
-        ):
+        endpoint = each.client.endpoint
+        # A link of known capacity carries no telemetry of vehicles that are not received on it,
+        # unless its options select some systems.
+        is_bound = endpoint.budget > 0 and not (endpoint.systems or endpoint.monitor)
+        is_bound = is_bound and frame.message_id not in endpoint.systems.also
+        if is_bound and self.hears_only_others(each.client.client_id, frame.origin[0]):
             return NO_MESSAGES
         return each.interval_us(frame, is_ours=is_ours)
 

@@ -14,7 +14,6 @@ import msgspec
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout, OnRun
 from gateway.hub.forwarding import Forwarding
-from gateway.hub.frame_stream import FrameStream
 from gateway.hub.numbering import Numbering
 from gateway.hub.own_vehicles import OwnVehicles
 from gateway.hub.route import OnForeign
@@ -140,7 +139,8 @@ class Hub(HubContext):
         self.greet = self._vehicles.await_greeting
         routing = (self._clients, self._fanout, self._vehicles, on_frame, on_foreign, rejects)
         self._router = Router(self, *routing)
-        self.deliver = self._router.deliver
+        self.deliver, self.routed_vehicles = self._router.deliver, self._router.routed_vehicles
+        self.newest_frames, self.streams = self.forwarding.newest, self._router.streams
         self._ping_us = self._proof_us = self._alerts_us = 0
         self._timer: asyncio.TimerHandle | None = None
         self._gathering: dict[float, list[Callable[[], None]]] = {}
@@ -239,21 +239,6 @@ class Hub(HubContext):
         if self._vehicles.register(frame, now_us):
             self._fanout.clear()
         self._fanout.publish(frame, sequence, now_us)
-
-    def newest_frames(self) -> list[tuple[bytes, int]]:
-        """Return the newest frames that were forwarded unobserved since the last call, and times.
-
-        One frame of each kind from each client.
-        """
-        return self.forwarding.newest()
-
-    def streams(self) -> dict[Origin, FrameStream]:
-        """Return the frames of each system and component that have been received."""
-        return self._router.streams()
-
-    def routed_vehicles(self) -> set[int]:
-        """Return the routed systems that are neither ours nor ground stations."""
-        return self._router.routed_vehicles()
 
     def say(self, messages: Iterable[Any]) -> bool:
         """Send messages of this gateway as a component of each vehicle that it only routes.

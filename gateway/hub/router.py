@@ -191,7 +191,11 @@ class Router:
         if not systems:
             return Reach.EVERYWHERE
         sender, client_id = frame.origin[0], client.client_id
-        if not systems.has_system(sender) and self._is_vehicle(sender, client_id, now_us):
+        others = (key for key in self._clients if key != client_id)
+        if not systems.has_system(sender) and (
+            sender in self._vehicles.systems(now_us)
+            or any(sender in self._table.systems(key).vehicles for key in others)
+        ):
             # A station that uses the id of an excluded vehicle.
             return Reach.NOWHERE
         table = self._table if client.trusted else self._untrusted
@@ -199,12 +203,6 @@ class Router:
         if frame.message_id == HEARTBEAT_ID:
             from_station = frame.is_station_heartbeat
         return systems.reach(frame, from_station=from_station)
-
-    def _is_vehicle(self, system: int, source_id: int, now_us: int) -> bool:
-        """Return whether a system is a vehicle of ours, or of another client than the source."""
-        return system in self._vehicles.systems(now_us) or any(
-            system in self._table.systems(key).vehicles for key in self._clients if key != source_id
-        )
 
     def _may_reach(self, client: Client, frame: MavFrame, reach: Reach, other_id: int) -> bool:
         """Return whether a frame without a target may be sent to another client."""
@@ -282,15 +280,12 @@ class Router:
             self.counters.late += 1
             return True
         self.counters.duplicates += 1
-        if first != client_id:
-            self._register_link(first, client, frame, now_us)
-        return True
-
-    def _register_link(self, first: int, client: Client, frame: MavFrame, now_us: int) -> None:
-        """Pair two links that bring the same frame, if neither can have received it from us."""
-        if frame.target[0] in self._vehicles.systems(now_us) and self._pair(first, client, now_us):
+        # Neither link can have received from us what is for our vehicles.
+        is_for_us = first != client_id and frame.target[0] in self._vehicles.systems(now_us)
+        if is_for_us and self._pair(first, client, now_us):
             # The first request has been answered on one link only.
             self._ask(client, frame, forwarded=False)
+        return True
 
     def _pair(self, first: int, client: Client, now_us: int) -> bool:
         """Note that two links lead to one peer; return whether that is new."""

@@ -224,7 +224,7 @@ CONVERSATIONS: dict[str, list[Any]] = {
     "pose reaches all without options": [("", "", ""), *POSE, {B: [(3, 102)], C: [(3, 102)]}],
     "heartbeat of a station with the id of a vehicle changes nothing": [
         ("systems=1", "", ""), (A, GCS, 2, 1), (B, heartbeat(), 2, 1), {}, (A, GCS, 2, 1),
-        (B, attitude(), 2, 1), {C: [(2, 30)], A: []},
+        (B, attitude(), 2, 1), {C: [(2, 30)], A: [], B: []},
     ],
     "station gets no corrections of another after its heartbeat": [
         ("", "", ""), (A, heartbeat(), 1, 1), (B, GCS, 254, STATION),
