@@ -1,17 +1,22 @@
 """Programs built once, a bench for every test; skipped where the tools are not installed."""
 
+import functools
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from intelhex import IntelHex
+from msgspec.structs import replace
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path.insert(0, str(ROOT))
 
 from firmware.rig import build as builder  # noqa: E402 - the checkout is no installed package
 from firmware.rig.boards import Setup  # noqa: E402
+from gateway.flashing import boards  # noqa: E402
 from tests.firmware.harness import Bench, MakeRig  # noqa: E402
 
 NODE_OPTIONS = {"clock_ppm", "program", "noise"}
@@ -22,12 +27,33 @@ NODE_OPTIONS = {"clock_ppm", "program", "noise"}
 def build() -> Callable[..., Path]:
     if missing := builder.missing_tools():
         pytest.skip(f"{', '.join(missing)} not found: apt-get install {builder.PACKAGES}")
-    return builder.build
+    return functools.cache(builder.build)
 
 
 @pytest.fixture(scope="session")
 def programs(build: Callable[..., Path]) -> Path:
     return build()
+
+
+@pytest.fixture
+def changed(
+    build: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory
+) -> Callable[..., Path]:
+    """Make folders of the built programs with other settings, as `mavgate flash` writes them."""
+
+    def change(radio: str = "nrf24", **settings: Any) -> Path:
+        folder = tmp_path_factory.mktemp("programs")
+        for name in builder.PROGRAMS:
+            image = IntelHex(str(build(radio=radio) / f"{name}.hex"))
+            block, pipe = boards.block_of(image), {}
+            if vehicle_id := settings.get("vehicle_id"):
+                pipe = {"radio_pipe": boards.default_pipe(block.program, vehicle_id)}
+            other = replace(block.settings, **pipe, **settings)
+            (folder / f"{name}.hex").write_bytes(boards.with_settings(image, other))
+            shutil.copy(build(radio=radio) / f"{name}.elf", folder)
+        return folder
+
+    return change
 
 
 @pytest.fixture

@@ -105,23 +105,10 @@ def test_old_bootloader_is_found_and_gets_the_restart_by_interrupt(
     assert len(rig.payloads(ImuPayload, since_s=rig.now_s - 1.0)) == pytest.approx(100, abs=3)
 
 
-@pytest.fixture
-def patched(programs: Path, tmp_path: Path) -> Callable[[BoardSettings], Path]:
-    """Write the IMU node's program with other settings into a folder of its own."""
-
-    def patch(settings: BoardSettings) -> Path:
-        image = IntelHex(str(programs / "imu_node.hex"))
-        (tmp_path / "imu_node.hex").write_bytes(with_settings(image, settings))
-        shutil.copy(programs / "imu_node.elf", tmp_path)
-        return tmp_path / "imu_node"
-
-    return patch
-
-
 def test_hang_on_a_board_with_an_old_bootloader_restarts_it_without_a_reset(
-    imu_rig: MakeRig, patched: Callable[[BoardSettings], Path]
+    imu_rig: MakeRig, changed: Callable[..., Path]
 ) -> None:
-    rig, node = imu_rig(1.2, program=str(patched(BoardSettings(soft_restart=True))))
+    rig, node = imu_rig(1.2, build=changed(soft_restart=True))
     release = node.mcu.hang("events_wait()")
     rig.run(0.3)
     release()
