@@ -16,6 +16,9 @@ UT_PER_GAUSS: Final = 100.0
 M_PER_MM: Final = 1e-3
 M_PER_CM: Final = 1e-2
 PA_PER_HPA: Final = 100.0
+KNOTS_PER_MPS: Final = 3600 / 1852
+KMH_PER_MPS: Final = 3.6
+FEET_PER_M: Final = 1 / 0.3048
 BITS_PER_BYTE: Final = 10
 """Bits that a serial line transfers for a byte: 8 data bits, no parity, a start and a stop bit."""
 FIX_2D: Final = 2

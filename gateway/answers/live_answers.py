@@ -372,7 +372,10 @@ class LiveAnswers:
         if packet.request_opcode == Opcode.OPEN_FILE_RO and packet.opcode == ACK:
             reading.session = packet.session
             reading.size = int.from_bytes(packet.data[:4], "little")
-            self._drop_others(reader, packet.session)
+            for other, rest in [*self._readings.items()]:
+                # The vehicle has opened another file in the session of a station of the same id.
+                if other != reader and other[1] == reader[1] and rest.session == packet.session:
+                    del self._readings[other]
         elif packet.session != reading.session or packet.request_opcode not in READING:
             return
         elif packet.opcode == ACK and packet.data and self.size < MAX_BYTES:
@@ -385,15 +388,6 @@ class LiveAnswers:
             self.files[reading.path] = content
             self.since_us["files"] = now_us
             del self._readings[reader]
-
-    def _drop_others(self, reader: Reader, session: int) -> None:
-        """Drop what other stations with the id of a reader have read in its session.
-
-        The vehicle has opened another file there, so their next chunks would be of that file.
-        """
-        for other, reading in [*self._readings.items()]:
-            if other != reader and other[1] == reader[1] and reading.session == session:
-                del self._readings[other]
 
 
 def _packet_of(frame: MavFrame) -> Packet:

@@ -334,10 +334,6 @@ class LogAnswers:
             course.add(time_us, items)
 
 
-def _no_frames(_origin: int, _message_id: int) -> list[bytes]:
-    return []
-
-
 class VehicleAnswers:
     """The answers of one recorded component at the moment played, under its played id.
 
@@ -352,7 +348,7 @@ class VehicleAnswers:
         played_as: int,
         position_us: Callable[[], int],
         component: int | None = None,
-        newest: Callable[[int, int], list[bytes]] = _no_frames,
+        newest: Callable[[int, int], list[bytes]] = lambda _origin, _message_id: [],
     ) -> None:
         self._log = log
         self._system_id = system_id

@@ -182,12 +182,6 @@ def find_block(image: bytes) -> SettingsBlock:
     raise FlashError("no settings block: not a mavgate program")
 
 
-def patch(image: bytes, settings: BoardSettings) -> tuple[int, bytes]:
-    """Return offset and new bytes of an image's settings block; raises as `find_block`."""
-    block = find_block(image)
-    return block.offset, _encode(block, settings)
-
-
 def _decode(block: bytes, offset: int) -> SettingsBlock:
     values = _LAYOUT.unpack(block[: _LAYOUT.size])
     version, program, clock_mhz, major, minor = values[1:6]
@@ -207,17 +201,6 @@ def _decode(block: bytes, offset: int) -> SettingsBlock:
     except (IndexError, ValueError) as error:
         raise FlashError(f"the settings block contains a value out of range: {error}") from (error)
     return SettingsBlock(offset, kind, clock_mhz, (major, minor), settings)
-
-
-def _encode(block: SettingsBlock, settings: BoardSettings) -> bytes:
-    found = msgspec.to_builtins(settings)
-    found["radio_power_dbm"] = POWERS_DBM.index(settings.radio_power_dbm)
-    found["accel_range_g"] = ACCEL_RANGES_G.index(settings.accel_range_g)
-    found["gyro_range_dps"] = GYRO_RANGES_DPS.index(settings.gyro_range_dps)
-    found["radio"] = RADIOS.index(settings.radio)
-    head = (VERSION, block.program, block.clock_mhz, *block.firmware_version)
-    content = _LAYOUT.pack(MAGIC, *head, *found.values())
-    return content + _CRC.pack(crc16(content))
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,8 +245,15 @@ def block_of(image: IntelHex) -> SettingsBlock:
 
 def with_settings(image: IntelHex, settings: BoardSettings) -> bytes:
     """Return an image with other settings, as an Intel HEX file."""
-    offset, block = patch(image.tobinstr(start=0), settings)
-    image.puts(offset, block)
+    block = block_of(image)
+    found = msgspec.to_builtins(settings)
+    found["radio_power_dbm"] = POWERS_DBM.index(settings.radio_power_dbm)
+    found["accel_range_g"] = ACCEL_RANGES_G.index(settings.accel_range_g)
+    found["gyro_range_dps"] = GYRO_RANGES_DPS.index(settings.gyro_range_dps)
+    found["radio"] = RADIOS.index(settings.radio)
+    head = (VERSION, block.program, block.clock_mhz, *block.firmware_version)
+    content = _LAYOUT.pack(MAGIC, *head, *found.values())
+    image.puts(block.offset, content + _CRC.pack(crc16(content)))
     text = io.StringIO()
     image.write_hex_file(text)
     return text.getvalue().encode("ascii")

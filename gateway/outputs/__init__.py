@@ -1,7 +1,7 @@
 """Endpoints that are not MAVLink: NMEA 0183, Cursor on Target, MQTT, GDL90, antenna rotators.
 
 They are added in the way other packages add kinds of endpoints; see docs/extend.md. Each kind has a
-module of the same name, which is imported when an endpoint of the kind is used.
+module of its name, with a class of its name, which is imported when an endpoint of it is used.
 """
 
 from functools import partial
@@ -23,7 +23,7 @@ KINDS: Final = {
 
 
 def _output_class(kind: str) -> Any:
-    return import_module(f"gateway.outputs.{kind}").OUTPUT
+    return getattr(import_module(f"gateway.outputs.{kind}"), f"{kind.capitalize()}Output")
 
 
 def _make(context: HubContext, client_id: int, endpoint: Endpoint) -> Client:

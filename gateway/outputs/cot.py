@@ -131,6 +131,3 @@ def _known(value_m: float) -> str:
 
 def _written(at: datetime) -> str:
     return f"{at:%Y-%m-%dT%H:%M:%S}.{at.microsecond // 1000:03d}Z"
-
-
-OUTPUT: Final = CotOutput

@@ -22,15 +22,13 @@ from gateway.geometry.atmosphere import pressure_altitude_m
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.endpoint import Endpoint, EndpointKind
 from gateway.outputs.output import Output
-from gateway.units import PA_PER_HPA, US_PER_S
+from gateway.units import FEET_PER_M, KNOTS_PER_MPS, PA_PER_HPA, US_PER_S
 from gateway.vehicle_state.newest import POSITION_OLD_US, STATE_IDS, NewestState
 from gateway.vehicle_state.positions import Position
 from gateway.wire.mavlink_messages import ids_of
 
 FLAG: Final = b"\x7e"
 HEARTBEAT, OWNSHIP, GEOMETRIC_ALTITUDE, TRAFFIC, EXTENDED = 0, 10, 11, 20, 0x65
-FEET_PER_M: Final = 1 / 0.3048
-KNOTS_PER_MPS: Final = 3600 / 1852
 FPM_PER_MPS: Final = 60 * FEET_PER_M
 UNKNOWN_U12, UNKNOWN_CLIMB = 0xFFF, 0x800
 UNKNOWN_ANGLE, UNKNOWN_U16 = 0x7FFF, 0xFFFF
@@ -185,6 +183,3 @@ def _accuracy(state: NewestState) -> int:
     found = state.fix()
     accuracy_m = found.h_acc_m if found else math.nan
     return next((category for bound_m, category in ACCURACIES_M if accuracy_m < bound_m), 0)
-
-
-OUTPUT: Final = Gdl90Output

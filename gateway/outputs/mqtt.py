@@ -213,6 +213,3 @@ async def _watch(client: Any) -> None:
     """Raise MqttError when the connection ends."""
     async for _ in client.messages:
         pass
-
-
-OUTPUT: Final = MqttOutput

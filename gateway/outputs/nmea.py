@@ -12,21 +12,18 @@ References
 import math
 from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
-from functools import reduce
-from operator import xor
 from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.hub.endpoint import Endpoint, EndpointKind
+from gateway.hub.endpoint import EndpointKind
 from gateway.outputs.output import Output, station_of
-from gateway.units import FIX_2D, US_PER_S
+from gateway.units import FIX_2D, KMH_PER_MPS, KNOTS_PER_MPS, US_PER_S
 from gateway.vehicle_state.antenna import Pointing, pointing_of
 from gateway.vehicle_state.newest import NewestState
 from gateway.vehicle_state.positions import Position
+from gateway.wire.framing import xor_of
 
-KNOTS_PER_MPS: Final = 3600 / 1852
-KMH_PER_MPS: Final = 3.6
 MINUTE_PARTS: Final = 10**5
 """Units per minute in written coordinates; one is 2 cm."""
 QUALITIES: Final = {
@@ -41,7 +38,7 @@ ESTIMATED: Final = (6, "E")
 
 def sentence(body: str) -> str:
     """Return a sentence with its checksum and line end."""
-    return f"${body}*{reduce(xor, body.encode('ascii')):02X}\r\n"
+    return f"${body}*{xor_of(body.encode('ascii')):02X}\r\n"
 
 
 class NmeaOutput(Output):
@@ -56,12 +53,6 @@ class NmeaOutput(Output):
         EndpointKind.SERIAL,
     )
     default_rate_hz = 1.0
-
-    @classmethod
-    def check(cls, endpoint: Endpoint) -> None:
-        """Raise ValueError if the endpoint is invalid."""
-        super().check(endpoint)
-        station_of(endpoint)
 
     def compose(self, now_us: int) -> Iterable[bytes]:
         """Return the sentences for the present state as one datagram."""
@@ -131,6 +122,3 @@ def _angle(angle_deg: float, digits: int, signs: str) -> str:
     degrees, parts = divmod(round(abs(angle_deg) * 60 * MINUTE_PARTS), 60 * MINUTE_PARTS)
     minutes = f"{parts // MINUTE_PARTS:02d}.{parts % MINUTE_PARTS:05d}"
     return f"{degrees:0{digits}d}{minutes},{signs[angle_deg < 0]}"
-
-
-OUTPUT: Final = NmeaOutput

@@ -50,6 +50,7 @@ class Output(Client):
         target_of(endpoint.host, cls.carriers)
         _rate_hz(endpoint, cls.default_rate_hz)
         _vehicle_id(endpoint)
+        station_of(endpoint)
 
     def configure(self) -> None:
         """Read the options of the endpoint."""

@@ -21,23 +21,12 @@ from gateway.vehicle_state.antenna import Pointing, pointing_of
 MAX_ELEVATION_DEG: Final = 90.0
 
 
-def _gs232(azimuth_deg: float, elevation_deg: float) -> str:
-    return f"W{round(azimuth_deg) % 360:03d} {elevation_deg:03.0f}\r"
-
-
-def _easycomm(azimuth_deg: float, elevation_deg: float) -> str:
-    return f"AZ{round(azimuth_deg, 1) % 360.0:.1f} EL{elevation_deg:.1f}\n"
-
-
-def _rotctld(azimuth_deg: float, elevation_deg: float) -> str:
-    return f"P {round(azimuth_deg, 1) % 360.0:.1f} {elevation_deg:.1f}\n"
-
-
 PROTOCOLS: Final[dict[str, Callable[[float, float], str]]] = {
-    "gs232": _gs232,
-    "easycomm": _easycomm,
-    "rotctld": _rotctld,
+    "gs232": lambda azimuth, elevation: f"W{round(azimuth) % 360:03d} {elevation:03.0f}\r",
+    "easycomm": lambda azimuth, elevation: f"AZ{_tenths(azimuth)} EL{elevation:.1f}\n",
+    "rotctld": lambda azimuth, elevation: f"P {_tenths(azimuth)} {elevation:.1f}\n",
 }
+"""Commands by protocol for azimuth and elevation in degrees."""
 
 
 class RotatorOutput(Output):
@@ -50,7 +39,6 @@ class RotatorOutput(Output):
     def check(cls, endpoint: Endpoint) -> None:
         """Raise ValueError if the endpoint is invalid."""
         super().check(endpoint)
-        station_of(endpoint)
         protocol = endpoint.added.get("protocol", "gs232")
         if protocol not in PROTOCOLS:
             raise ValueError(unknown_choice("protocol", protocol, sorted(PROTOCOLS)))
@@ -66,10 +54,11 @@ class RotatorOutput(Output):
         return [] if pointing is None else [command(protocol, pointing)]
 
 
+def _tenths(azimuth_deg: float) -> str:
+    return f"{round(azimuth_deg, 1) % 360.0:.1f}"
+
+
 def command(protocol: str, pointing: Pointing) -> bytes:
     """Return the command in a protocol; an antenna is not pointed below the horizon."""
     elevation_deg = min(max(pointing.elevation_deg, 0.0), MAX_ELEVATION_DEG)
     return PROTOCOLS[protocol](pointing.azimuth_deg, elevation_deg).encode("ascii")
-
-
-OUTPUT: Final = RotatorOutput

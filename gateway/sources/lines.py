@@ -9,7 +9,6 @@
 """
 
 import json
-import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -19,7 +18,7 @@ from gateway.sources.nmea import NmeaReader
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import MAX_VEHICLE, SourceUrl
 from gateway.sources.source import SourceRecord, unusable
-from gateway.units import STANDARD_GRAVITY_MPS2
+from gateway.units import PA_PER_HPA, RAD_PER_DEG, STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
 from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
 
@@ -27,42 +26,29 @@ MAX_LINE: Final = 4096
 PACKETS: Final = ("udp", "receiver")
 """Transports that preserve message boundaries."""
 
-DEG_PER_RAD: Final = math.degrees(1.0)
 VECTORS: Final = {
     "accel_mps2": ("accel", 1.0),
     "accel_g": ("accel", STANDARD_GRAVITY_MPS2),
     "gyro_dps": ("gyro", 1.0),
-    "gyro_radps": ("gyro", DEG_PER_RAD),
+    "gyro_radps": ("gyro", 1.0 / RAD_PER_DEG),
     "mag_ut": ("mag", 1.0),
-    "mag_gauss": ("mag", 100.0),
+    "mag_gauss": ("mag", UT_PER_GAUSS),
     "vel_n_mps": ("vel", 1.0),
-    "attitude_deg": ("attitude", math.radians(1.0)),
+    "attitude_deg": ("attitude", RAD_PER_DEG),
 }
 """Quantity and factor by key, for keys with three numbers."""
 NUMBERS: Final = {
-    "pressure_pa": ("pressure", 1.0),
-    "pressure_hpa": ("pressure", 100.0),
-    "temperature_degc": ("temperature", 1.0),
-    "lat": ("lat", 1.0),
-    "lon": ("lon", 1.0),
-    "alt_m": ("alt", 1.0),
-    "speed_mps": ("speed", 1.0),
-    "course_deg": ("course", 1.0),
-    "climb_mps": ("climb", 1.0),
-    "satellites": ("satellites", 1.0),
-    "h_acc_m": ("h_acc", 1.0),
-    "v_acc_m": ("v_acc", 1.0),
-    "heading_deg": ("heading", math.radians(1.0)),
-    "airspeed_mps": ("airspeed", 1.0),
-    "battery_v": ("battery_v", 1.0),
-    "battery_a": ("battery_a", 1.0),
-    "battery_mah": ("battery_mah", 1.0),
-    "battery_percent": ("battery_percent", 1.0),
-    "rssi_dbm": ("rssi", 1.0),
-    "snr_db": ("snr", 1.0),
-    "link_percent": ("link", 1.0),
-    "t_ms": ("t_ms", 1.0),
-    "id": ("id", 1.0),
+    **{
+        key: (key, 1.0)
+        for key in (
+            *("pressure_pa", "temperature_degc", "lat", "lon", "alt_m", "speed_mps", "course_deg"),
+            *("climb_mps", "satellites", "h_acc_m", "v_acc_m", "airspeed_mps", "battery_v"),
+            *("battery_a", "battery_mah", "battery_percent", "rssi_dbm", "snr_db", "link_percent"),
+            *("t_ms", "id"),
+        )
+    },
+    "pressure_hpa": ("pressure_pa", PA_PER_HPA),
+    "heading_deg": ("heading_rad", RAD_PER_DEG),
 }
 """Quantity and factor by key, for keys with one number."""
 TEXTS: Final = ("mode", "text")
@@ -70,7 +56,7 @@ KEYS: Final = (*VECTORS, *NUMBERS, *TEXTS, "armed")
 _NOTICE: Final = 5
 """MAV_SEVERITY_NOTICE."""
 REPORTED: Final = frozenset(
-    {"attitude", "heading", "airspeed", "mode", "text", "armed", "rssi", "link"}
+    {"attitude", "heading_rad", "airspeed_mps", "mode", "text", "armed", "rssi_dbm", "link_percent"}
     | {"battery_v", "battery_a", "battery_mah", "battery_percent"}
 )
 
@@ -208,13 +194,12 @@ def records_of(
     """Make records from the quantities of one moment."""
     found: list[SourceRecord | None] = []
     get: Any = values.get
-    if "pressure" in values:
-        degc = get("temperature", NAN)
-        found.append(BaroRaw(time_us, node, time_us & WRAP_MASK, get("pressure"), degc))
+    degc = get("temperature_degc", NAN)
+    if "pressure_pa" in values:
+        found.append(BaroRaw(time_us, node, time_us & WRAP_MASK, get("pressure_pa"), degc))
     if "lat" in values and "lon" in values:
         found.append(_fix(values, node, time_us))
     if "accel" in values and "gyro" in values:
-        degc = get("temperature", NAN)
         found.append(imu_raw(time_us, node, get("accel"), get("gyro"), get("mag"), degc))
     found.append(_report(values, node, time_us))
     return [record for record in found if record is not None]
@@ -224,17 +209,17 @@ def _fix(values: Mapping[str, Any], node: NodeId, time_us: int) -> SourceRecord 
     get = values.get
     vel = get("vel")
     if vel is None:
-        vel = velocity(get("speed", NAN), get("course", NAN), get("climb", NAN))
+        vel = velocity(get("speed_mps", NAN), get("course_deg", NAN), get("climb_mps", NAN))
     return fix_at(
         time_us,
         node,
         values["lat"],
         values["lon"],
-        get("alt", NAN),
+        get("alt_m", NAN),
         vel_n_mps=vel,
         satellites=round(get("satellites", 0.0)),
-        h_acc_m=get("h_acc", NAN),
-        v_acc_m=get("v_acc", NAN),
+        h_acc_m=get("h_acc_m", NAN),
+        v_acc_m=get("v_acc_m", NAN),
     )
 
 
@@ -250,18 +235,17 @@ def _report(values: Mapping[str, Any], node: NodeId, time_us: int) -> VehicleRep
             used_mah=get("battery_mah", NAN),
             remaining_percent=get("battery_percent", NAN),
         )
-    rssi = get("rssi")
-    text = get("text")
+    rssi, text = get("rssi_dbm"), get("text")
     return VehicleReport(
         time_us=time_us,
         node=node,
         attitude_rad=get("attitude"),
-        heading_rad=get("heading", NAN),
-        airspeed_mps=get("airspeed", NAN),
+        heading_rad=get("heading_rad", NAN),
+        airspeed_mps=get("airspeed_mps", NAN),
         battery=battery,
         mode=get("mode", ""),
         armed=get("armed"),
         text=None if text is None else (_NOTICE, text),
-        link_quality_percent=get("link", NAN),
-        signal=None if rssi is None else RadioSignal(round(rssi), get("snr", NAN)),
+        link_quality_percent=get("link_percent", NAN),
+        signal=None if rssi is None else RadioSignal(round(rssi), get("snr_db", NAN)),
     )

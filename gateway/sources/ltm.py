@@ -9,8 +9,6 @@ send `O` every second, and alternate `G` and `S` between their `A`.
 """
 
 import struct
-from functools import reduce
-from operator import xor
 from typing import Any, Final
 
 from msgspec.structs import replace
@@ -27,7 +25,7 @@ from gateway.sources.sampling import fix_at, velocity
 from gateway.sources.settings import SourceUrl
 from gateway.sources.source import CheckedFrames
 from gateway.units import DEG_PER_DEGE7, M_PER_CM, RAD_PER_DEG
-from gateway.wire.framing import Fault
+from gateway.wire.framing import Fault, xor_of
 
 START: Final = b"$T"
 SIZES: Final = {b"G": 14, b"A": 6, b"S": 7, b"O": 14, b"N": 6, b"X": 6}
@@ -61,17 +59,11 @@ class LtmDecoder(CheckedFrames):
         self._newest = b""
         """Types of the newest frames."""
         self._successions = 0
+        """Successions of types that only ArduPilot sends."""
 
     @property
     def _is_ardupilot(self) -> bool:
         return self._successions >= ENOUGH
-
-    def _identify(self, kind: bytes) -> None:
-        """Count the successions of types that only ArduPilot sends."""
-        self._newest = (self._newest + kind)[-len(OF_ARDUPILOT) :]
-        if kind in NEVER_OF_ARDUPILOT:
-            self._successions = 0
-        self._successions += self._newest == OF_ARDUPILOT
 
     def size_at(self, data: bytes, at: int) -> int:
         """Return the size of a frame that begins here, complete or not; 0 if there is none."""
@@ -79,14 +71,17 @@ class LtmDecoder(CheckedFrames):
         if size is None or not data.startswith(START, at):
             return 0
         end = at + 4 + size
-        wrong = end <= len(data) and reduce(xor, data[at + 3 : end], 0)
+        wrong = end <= len(data) and xor_of(data[at + 3 : end])
         return 0 if wrong else 4 + size
 
     def read(self, frame: bytes, time_us: int) -> list[Any]:
         """Return the records and faults in a frame."""
         kind, payload = frame[2:3], frame[3:-1]
         parts: dict[str, Any] = {}
-        self._identify(kind)
+        self._newest = (self._newest + kind)[-len(OF_ARDUPILOT) :]
+        if kind in NEVER_OF_ARDUPILOT:
+            self._successions = 0
+        self._successions += self._newest == OF_ARDUPILOT
         if kind == b"G":
             return self._gps(payload, time_us)
         if kind == b"A":

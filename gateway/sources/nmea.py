@@ -8,19 +8,15 @@ content of the other sentences is added to the next fix.
 import math
 import re
 from datetime import UTC, datetime
-from functools import reduce
-from operator import xor
 from typing import Final
 
 from gateway.records import NAN, GpsFix, GpsFixType, NodeId, VehicleReport
 from gateway.sources.sampling import fix_at, velocity
 from gateway.sources.source import unusable
-from gateway.units import US_PER_S
-from gateway.wire.framing import Fault
+from gateway.units import KMH_PER_MPS, KNOTS_PER_MPS, US_PER_S
+from gateway.wire.framing import Fault, xor_of
 
 SENTENCE: Final = re.compile(r"[$!](\w{2})(\w{3})((?:,[^*]*)?)(?:\*([0-9A-Fa-f]{2}))?")
-KNOTS_MPS: Final = 1852.0 / 3600.0
-KMH_MPS: Final = 1.0 / 3.6
 DEG_MIN: Final = re.compile(r"(\d{0,3}?)(\d{1,2}(?:\.\d*)?)")
 LIMITS_DEG: Final = {"N": 90.0, "S": 90.0, "E": 180.0, "W": 180.0}
 FIRST_CENTURY: Final = 80
@@ -31,11 +27,6 @@ MAX_AGE_US: Final = 3 * US_PER_S
 """Maximum age of VTG, GSA and GST, to be used with a fix."""
 FIX_TYPES: Final = {"1": GpsFixType.NONE, "2": GpsFixType.FIX_2D, "3": GpsFixType.FIX_3D}
 IGNORED: Final = frozenset({"GSV", "GLL", "TXT", "ZDA", "GNS", "GBS", "GRS", "DTM", "VLW"})
-
-
-def checksum(text: str) -> int:
-    """Return the checksum of the characters between `$` and `*`."""
-    return reduce(xor, text.encode("latin-1", "replace"), 0)
 
 
 class NmeaReader:
@@ -58,7 +49,8 @@ class NmeaReader:
         if found is None:
             return [unusable("nmea", line, "not an NMEA sentence")]
         _, kind, fields, check = found.groups()
-        if check is not None and int(check, 16) != checksum(line[1:].partition("*")[0]):
+        content = line[1:].partition("*")[0].encode("latin-1", "replace")
+        if check is not None and int(check, 16) != xor_of(content):
             return [unusable("nmea checksum", line, "wrong checksum")]
         try:
             return self._sentence(kind, fields.split(",")[1:], arrival_us)
@@ -126,9 +118,9 @@ class NmeaReader:
     def _motion(self, rmc: list[str], arrival_us: int) -> tuple[float, float]:
         """Return ground speed in m/s and course in degrees."""
         if rmc:
-            return _number(rmc[6]) * KNOTS_MPS, _number(rmc[7])
+            return _number(rmc[6]) / KNOTS_PER_MPS, _number(rmc[7])
         vtg = self._newest("VTG", arrival_us)
-        return (_number(vtg[6]) * KMH_MPS, _number(vtg[0])) if len(vtg) > 6 else (NAN, NAN)
+        return (_number(vtg[6]) / KMH_PER_MPS, _number(vtg[0])) if len(vtg) > 6 else (NAN, NAN)
 
     def _accuracies(self, hdop: float, pdop: float, arrival_us: int) -> tuple[float, float]:
         gst = self._newest("GST", arrival_us)

@@ -144,7 +144,11 @@ class SourceTrial:
             lines += self._missing()
         else:
             what = NAMES.get(self._url.kind, self._url.kind)
-            lines.append(f"{self._bytes} bytes arrive, none is {what}: {self._likely_causes()}")
+            causes = "does the sender use another protocol?"
+            if self._url.transport == "serial" and self._url.endpoint is not None:
+                baud = self._url.endpoint.port
+                causes = f"baud rate {baud} (?baud=)? inverted signal? another protocol?"
+            lines.append(f"{self._bytes} bytes arrive, none is {what}: {causes}")
         if self._url.kind == "lines" and self._header and not self.counts[KINDS[ImuRaw]]:
             lines += ["a map for ?columns=FILE; check its units:", *suggested_map(self._header)]
         return lines
@@ -158,14 +162,6 @@ class SourceTrial:
             rate = f"baud rate {endpoint.port} (?baud=)"
             return f"check port {endpoint.host}, {rate} and wiring ({WIRING})"
         return f"check that the sender uses {endpoint.address} of this machine, and the firewall"
-
-    def _likely_causes(self) -> str:
-        """Name what may be wrong if only other bytes arrive."""
-        if self._url.transport == "serial" and self._url.endpoint is not None:
-            return (
-                f"baud rate {self._url.endpoint.port} (?baud=)? inverted signal? another protocol?"
-            )
-        return "does the sender use another protocol?"
 
     def _missing(self) -> list[str]:
         """Name the data that attitude, heading and position lack."""

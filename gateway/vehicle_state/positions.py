@@ -165,7 +165,10 @@ def position_of(
     source = POSITION_SOURCES[message_id]
     unit = source.velocity_unit_mps
     velocity = (fields["vx"] * unit, fields["vy"] * unit, fields["vz"] * unit) if unit else None
-    speed_mps = _speed_mps(source, fields) if velocity is None else math.hypot(*velocity[:2])
+    name, unit_mps, unknown = source.speed
+    speed_mps = NAN if velocity is None else math.hypot(*velocity[:2])
+    if name and fields[name] != unknown:
+        speed_mps = float(fields[name] * unit_mps)
     alt_home_m = fields["relative_alt"] * M_PER_MM if "relative_alt" in fields else NAN
     if message_id != LOCAL_POSITION_NED_ID:
         lat_deg, lon_deg = (fields[name] * DEG_PER_DEGE7 for name in (source.lat, source.lon))
@@ -182,11 +185,6 @@ def position_of(
             return None
         alt_m = origin.alt_amsl_m - fields["z"]
     return Position(lat_deg, lon_deg, alt_m, alt_home_m, speed_mps, velocity or UNKNOWN_VEC3)
-
-
-def _speed_mps(source: PositionSource, fields: Mapping[str, Any]) -> float:
-    name, unit_mps, unknown = source.speed
-    return NAN if not name or fields[name] == unknown else float(fields[name] * unit_mps)
 
 
 def named_position(fields: Mapping[str, Any]) -> Position | None:

@@ -157,21 +157,17 @@ class Senders:
                     self.heartbeats[origin] = (kind, autopilot)
 
     def _vehicle_of(self, components: list[int]) -> int:
-        autopilots = [one for one in components if self._is_autopilot(one)]
+        none = (0, mavlink.MAV_AUTOPILOT_INVALID)
+        autopilots = [one for one in components if self.heartbeats.get(one, none)[1] != none[1]]
         first = components[0] & ~0xFF | AUTOPILOT
         for candidates in (autopilots, components):
             if first in candidates:
                 return first
             if candidates:
-                return max(candidates, key=self._positions_of)
+                return max(
+                    candidates, key=lambda one: max(self.seconds[one, k] for k in POSITION_SOURCES)
+                )
         raise ValueError("a system without a component")
-
-    def _is_autopilot(self, origin: int) -> bool:
-        _, autopilot = self.heartbeats.get(origin, (0, mavlink.MAV_AUTOPILOT_INVALID))
-        return bool(autopilot != mavlink.MAV_AUTOPILOT_INVALID)
-
-    def _positions_of(self, origin: int) -> int:
-        return max(self.seconds[origin, message_id] for message_id in POSITION_SOURCES)
 
 
 def _best(seconds: dict[int, int]) -> int | None:

@@ -11,6 +11,8 @@ The first frame after opening a port is usually incomplete, which gives one faul
 import binascii
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import reduce
+from operator import xor
 from typing import Final
 
 from cobs import cobs
@@ -47,6 +49,11 @@ class Fault:
     size: int
     detail: str = ""
     """Text for users; empty if only the kind is known."""
+
+
+def xor_of(data: bytes) -> int:
+    """Return the exclusive or of all bytes: the checksum of NMEA 0183 and LTM."""
+    return reduce(xor, data, 0)
 
 
 def crc16(content: bytes) -> int:

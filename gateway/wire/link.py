@@ -170,12 +170,15 @@ class Link:
                 continue
             restarts = clock.restarts
             received_us = clock.observe(frame.receiver_time_us, arrival_us)
-            if frame.frame_seq != self._next_frame_seq:
-                self._count_gap(frame.frame_seq, is_known=clock.restarts == restarts)
+            # After a restart of the receiver nothing is known to be missing.
+            if self._next_frame_seq is not None and clock.restarts == restarts:
+                self._frames_lost += frame.frame_seq - self._next_frame_seq & FRAME_SEQ_MASK
             self._next_frame_seq = frame.frame_seq + 1 & FRAME_SEQ_MASK
             self._frames += 1
             if isinstance(frame, payloads.ReceiverStatusFrame):
-                self._receiver_status = _receiver_status(frame, received_us)
+                fields = msgspec.structs.asdict(frame)
+                del fields["frame_seq"]
+                self._receiver_status = ReceiverStatus(time_us=received_us, **fields)
             elif isinstance(frame, payloads.ForeignFrame):
                 self._foreign += 1
                 self.packets.append(frame)
@@ -185,11 +188,6 @@ class Link:
                 records.append(record)
         return records
 
-    def _count_gap(self, frame_seq: int, *, is_known: bool) -> None:
-        """Count the missing frames before this one, unless the receiver has restarted."""
-        if self._next_frame_seq is not None and is_known:
-            self._frames_lost += frame_seq - self._next_frame_seq & FRAME_SEQ_MASK
-
     def reopened(self) -> None:
         """Discard the incomplete frame and the frame sequence after the port was opened again."""
         self._decoder.reset()
@@ -197,6 +195,8 @@ class Link:
 
     def report(self, now_us: int, *, connected: bool, port: str) -> LinkReport:
         """Sum up the line and every node behind it."""
+        nodes = [*self._nodes.values(), *(node for node, _ in self._unproven.values())]
+        faults = sum((node.faults for node in nodes), self._faults)
         return LinkReport(
             time_us=now_us,
             connected=connected,
@@ -204,15 +204,11 @@ class Link:
             bytes_received=self._bytes_received,
             frames=self._frames,
             frames_lost=self._frames_lost,
-            faults=tuple(sorted(self._all_faults().items())),
+            faults=tuple(sorted(faults.items())),
             nodes=tuple(_node_link(node_id, n, now_us) for node_id, n in self._nodes.items()),
             receiver=self._receiver_status,
             foreign=self._foreign,
         )
-
-    def _all_faults(self) -> Counter[str]:
-        nodes = [*self._nodes.values(), *(node for node, _ in self._unproven.values())]
-        return sum((node.faults for node in nodes), self._faults)
 
     def _receive_new_node(
         self, frame: payloads.RadioFrame, received_us: int, arrival_us: int
@@ -243,7 +239,9 @@ def _receive(
         node.begin_run()
     # A late payload is counted but not used: all later stages rely on growing times.
     if node.sequence.count(header.seq) is not Arrival.NEW:
-        node.faults["sequence"] += _is_later(stamp_us, node.last_stamp_us)
+        # A payload newer than the newest must have a higher number.
+        last_us = stamp_us if node.last_stamp_us is None else node.last_stamp_us
+        node.faults["sequence"] += 0 < (stamp_us - last_us) % WRAP_US < WRAP_US // 2
         return None
     node.pipe, node.signal = frame.pipe, frame.signal
     node.arrivals_us.append(arrival_us)
@@ -264,11 +262,6 @@ def _receive(
         payloads.MAG_LSB_PER_GAUSS[payload.mag_gain],
         payload.flags,
     )
-
-
-def _is_later(stamp_us: int, last_us: int | None) -> bool:
-    """Return whether a payload is newer than the newest, so that its number must be higher."""
-    return last_us is not None and 0 < (stamp_us - last_us) % WRAP_US < WRAP_US // 2
 
 
 def _never_back(node: _Node, stamp_us: int, time_us: int) -> int:
@@ -310,7 +303,11 @@ def _to_record(
             node.faults["gps_date"] += payload.utc is not None and payload.utc.year < FIRST_YEAR
             return None
         case payloads.NodeStatusPayload():
-            return _node_status(header, payload, node.last_time_us)
+            # The fields have the same names, except for the chips.
+            fields = msgspec.structs.asdict(payload)
+            chips = chip_names(fields.pop("chips"), payload.sensors_present)
+            stamps = (node.last_time_us, header.node, header.node_time_us)
+            return NodeStatus(*stamps, chips=chips, **fields)
 
 
 def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) -> GpsFix:
@@ -349,28 +346,6 @@ def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) 
 def _unless_saturated(value: float, scale: float) -> float:
     """Scale a 16-bit value; NaN for a saturated one, which means only "bad"."""
     return NAN if value == UINT16_MAX else value * scale
-
-
-def _node_status(
-    header: payloads.Header, status: payloads.NodeStatusPayload, time_us: int
-) -> NodeStatus:
-    """Convert a node's status; the fields have the same names, except for the chips."""
-    fields = msgspec.structs.asdict(status)
-    chips = fields.pop("chips")
-    return NodeStatus(
-        time_us=time_us,
-        node=header.node,
-        node_time_us=header.node_time_us,
-        chips=chip_names(chips, status.sensors_present),
-        **fields,
-    )
-
-
-def _receiver_status(frame: payloads.ReceiverStatusFrame, time_us: int) -> ReceiverStatus:
-    """Convert a receiver's status; the fields have the same names."""
-    fields = msgspec.structs.asdict(frame)
-    del fields["frame_seq"]
-    return ReceiverStatus(time_us=time_us, **fields)
 
 
 def _node_link(node_id: NodeId, node: _Node, now_us: int) -> NodeLink:

@@ -90,7 +90,7 @@ def from_json(fields: Any) -> Any:
             try:
                 given[name] = _in(kind, name, fields[key])
             except (ValueError, TypeError, OverflowError) as error:
-                raise BadMessageError(f"{kind.msgname}.{key}: {_words(error)}") from None
+                raise BadMessageError(f"{kind.msgname}.{key}: {error}") from None
         elif name in TARGETS:
             given[name] = 0
         elif parameter.default is inspect.Parameter.empty:
@@ -265,7 +265,3 @@ def _length(kind: Any, name: str) -> int:
 
 def _is_bitmask(kind: Any, name: str) -> bool:
     return bool(kind.fielddisplays_by_name.get(name) == BITMASK)
-
-
-def _words(error: Exception) -> str:
-    return str(error.args[0]) if error.args else str(error)

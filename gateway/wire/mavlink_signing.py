@@ -75,11 +75,6 @@ def key_from_passphrase(passphrase: str) -> bytes:
     return hashlib.sha256(passphrase.encode()).digest()
 
 
-def key_id_of(key: bytes) -> str:
-    """Return an identifier of a key that does not reveal it."""
-    return hashlib.sha256(b"mavgate key" + key).hexdigest()[:16]
-
-
 def signature(key: bytes, link: int, timestamp: int, content: bytes) -> bytes:
     """Return the signature that follows the content of a frame, which ends with the checksum."""
     begin = bytes((link,)) + timestamp.to_bytes(_TIMESTAMP_BYTES, "little")
@@ -226,13 +221,10 @@ class Verifier:
         if len(key) != KEY_BYTES:
             raise ValueError(f"signing key of {len(key)} bytes; it must have {KEY_BYTES}")
         self._key = key
-        self._key_id = key_id_of(key)
+        self._key_id = hashlib.sha256(b"mavgate key" + key).hexdigest()[:16]
+        """Identifier of the key that does not reveal it."""
         self._clock = clock
         self._timestamps = SigningTimestamps() if timestamps is None else timestamps
-
-    def accepts(self, data: bytes, now_us: int) -> bool:
-        """Return whether a complete frame is signed by a holder of the key, and not a replay."""
-        return not self.rejection(data, now_us)
 
     def rejection(self, data: bytes, now_us: int) -> str:
         """Return the reason why a signed frame is rejected; empty if it is accepted."""

@@ -292,11 +292,9 @@ def encode_radio(
     """Build the content of the serial frame that carries one radio payload."""
     kind = FrameKind.RADIO if signal is None else FrameKind.RADIO_SIGNAL
     head = _FRAME_HEADER.pack(PROTOCOL_VERSION << 4 | kind, frame_seq, pipe, receiver_time_us)
-    return head + (b"" if signal is None else _encode_signal(signal)) + payload
-
-
-def _encode_signal(signal: RadioSignal) -> bytes:
-    return _SIGNAL.pack(-signal.rssi_dbm, round(signal.snr_db * _SNR_PER_DB))
+    if signal is not None:
+        head += _SIGNAL.pack(-signal.rssi_dbm, round(signal.snr_db * _SNR_PER_DB))
+    return head + payload
 
 
 def encode_receiver_status(status: ReceiverStatusFrame) -> bytes:
@@ -420,7 +418,10 @@ def _encode_body(payload: Payload) -> tuple[PayloadKind, bytes]:
         case GpsQualityPayload():
             return PayloadKind.GPS_QUALITY, _encode_quality(payload)
         case NodeStatusPayload():
-            return PayloadKind.NODE_STATUS, _encode_node_status(payload)
+            version, cause, *counts, radio, chips = msgspec.structs.astuple(payload)
+            values = (*version, cause | radio << _RADIO_SHIFT, *counts)
+            body = _NODE_STATUS.pack(*values, *msgspec.structs.astuple(chips))
+            return PayloadKind.NODE_STATUS, body
 
 
 def _encode_quality(payload: GpsQualityPayload) -> bytes:
@@ -434,18 +435,10 @@ def _encode_quality(payload: GpsQualityPayload) -> bytes:
     return _GPS_QUALITY.pack(*words, utc is not None, *moment)
 
 
-def _encode_node_status(payload: NodeStatusPayload) -> bytes:
-    version, cause, *counts, radio, chips = msgspec.structs.astuple(payload)
-    values = (*version, cause | radio << _RADIO_SHIFT, *counts)
-    return _NODE_STATUS.pack(*values, *msgspec.structs.astuple(chips))
-
-
 def _read_imu(words: tuple[int, ...]) -> ImuPayload:
     ax, ay, az, gx, gy, gz, mx, my, mz, temperature, flags, ranges = words
-    accel_range, gyro_range, mag_gain = _RANGES[ranges]
     accel, gyro, mag = (ax, ay, az), (gx, gy, gz), (mx, my, mz)
-    ranges_of_all = (accel_range, gyro_range, mag_gain)
-    return ImuPayload(accel, gyro, mag, temperature, _imu_flags(flags), *ranges_of_all)
+    return ImuPayload(accel, gyro, mag, temperature, _imu_flags(flags), *_RANGES[ranges])
 
 
 def _read_gps_fix(words: tuple[int, ...]) -> GpsFixPayload:
@@ -472,10 +465,8 @@ def _read_gps_quality(words: tuple[int, ...]) -> GpsQualityPayload:
 def _read_node_status(words: tuple[int, ...]) -> NodeStatusPayload:
     major, minor, cause, present, failed, bus, unsent, resent, loop, rate, supply = words[:11]
     counts = (present, failed, bus, unsent, resent, loop, rate, supply)
-    radio = RadioState(cause >> _RADIO_SHIFT)
-    return NodeStatusPayload(
-        (major, minor), cause & _RESET_MASK, *counts, radio, Chips(*words[11:])
-    )
+    states = (RadioState(cause >> _RADIO_SHIFT), Chips(*words[11:]))
+    return NodeStatusPayload((major, minor), cause & _RESET_MASK, *counts, *states)
 
 
 _KINDS: Final = frozenset(PayloadKind)

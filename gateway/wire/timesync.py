@@ -74,10 +74,8 @@ class ClockTracker:
 
     def __init__(self) -> None:
         self.restarts = 0
-        self.resumptions = 0
-        """Number of times that the remote clock continued after it had been halted."""
         self.runs = 0
-        """Number of lines begun: the start, restarts and resumptions."""
+        """Number of lines begun: the start, restarts, and resumptions of a halted clock."""
         self._reset()
 
     def _reset(self) -> None:
@@ -128,9 +126,10 @@ class ClockTracker:
             self._suspect_us = self._late_since_us = None
         elif late_us > RESTART_JUMP_US:
             self._suspect_us = None
-            if self._is_stale(arrival_us):
+            # Times that have been too late for longer than buffers explain.
+            self._late_since_us = self._late_since_us or arrival_us
+            if arrival_us - self._late_since_us > DRAIN_US:
                 self._reset()
-                self.resumptions += 1
                 remote_us, local_us = remote_u32, arrival_us
         elif self._is_unconfirmed(arrival_us - remote_us):
             return arrival_us
@@ -166,12 +165,6 @@ class ClockTracker:
         """Return whether a time continues the last one on the known line, though read late."""
         late_us = arrival_us - self._to_local(remote_us)
         return remote_us > self._last_us and -slack_us <= late_us <= MAX_STALL_US
-
-    def _is_stale(self, arrival_us: int) -> bool:
-        """Return whether times have been too late for longer than buffers explain."""
-        if self._late_since_us is None:
-            self._late_since_us = arrival_us
-        return arrival_us - self._late_since_us > DRAIN_US
 
     def _is_least_delayed(self, remote_us: int, delta_us: int) -> bool:
         """Return whether a point is the least delayed of its bucket so far, drift removed."""

@@ -15,7 +15,7 @@ from tests.firmware.harness import Bench, MakeBench
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 RUNNING_S = 1.0
-RUN_S = 5.0
+RUN_S = 6.0
 CHANNEL = (868_300, 7, 250, 5, 0x12)
 """Frequency, spreading factor, bandwidth, coding and sync word of the default settings."""
 
@@ -42,7 +42,7 @@ def test_two_nodes_share_the_channel(lora: MakeBench) -> None:
     # Two nodes that begin at one moment lose some 3 %, and more of the weaker one.
     assert max(rig.lost(node_id, RUNNING_S) for node_id in (0, 1)) <= 5
     for kind, rate_hz in ((ImuPayload, 10), (BaroPayload, 2), (GpsFixPayload, 1)):
-        assert 0.7 * rate_hz * RUN_S <= len(rig.payloads(kind, RUNNING_S)) <= rate_hz * RUN_S + 2
+        assert 0.6 * rate_hz * RUN_S <= len(rig.payloads(kind, RUNNING_S)) <= rate_hz * RUN_S + 2
     assert not rig.faults
     assert rig.statuses[-1].radio is RadioState.OK
     assert max(status.noise_percent for status in rig.statuses) <= 5
@@ -64,10 +64,10 @@ def test_four_nodes_that_sample_together_lose_a_tenth_at_most(
         rig.imu_node(clock_ppm=40.0 - 15.0 * vehicle)
         rig.gps_node(clock_ppm=-30.0 + 10.0 * vehicle)
     rig.run(RUNNING_S + RUN_S)
-    assert rig.setup.air.sent > 25 * RUN_S
+    assert rig.setup.air.sent > 24 * RUN_S
     pipes = rig.statuses[-1].pipes
     received, lost = sum(p.received for p in pipes), sum(p.lost for p in pipes)
-    assert received > 23 * RUN_S
+    assert received > 22 * RUN_S
     assert lost < 0.1 * received
 
 

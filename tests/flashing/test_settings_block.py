@@ -1,9 +1,14 @@
 """The settings block: found, decoded, patched and refused."""
 
+import io
 import itertools
+from typing import Any
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from intelhex import IntelHex
 
 from gateway.flashing.boards import (
     MAGIC,
@@ -14,8 +19,8 @@ from gateway.flashing.boards import (
     Program,
     default_pipe,
     find_block,
-    patch,
     used_by,
+    with_settings,
 )
 from gateway.wire.framing import crc16
 
@@ -66,18 +71,27 @@ def test_block_is_found_and_every_field_decoded() -> None:
     assert found.settings == SETTINGS
 
 
-def test_patch_changes_the_block_alone_and_reads_back() -> None:
-    image = image_with(with_crc(BLOCK))
-    for settings in (
-        BoardSettings(),
-        BoardSettings(vehicle_id=31, radio_channel=125, radio_address=0xFFFFFFFF),
-        BoardSettings(radio_kbps=2000, radio_power_dbm=-18, accel_range_g=2, gyro_range_dps=2000),
-    ):
-        offset, block = patch(image, settings)
-        assert len(block) == SIZE
-        patched = image[:offset] + block + image[offset + SIZE :]
-        assert find_block(patched).settings == settings
-        assert find_block(patched).firmware_version == (1, 2)
+def values_of(kind: Any) -> st.SearchStrategy[Any]:
+    """Return the valid values of a field."""
+    kind = getattr(kind, "type", kind)
+    if isinstance(kind, msgspec.inspect.LiteralType):
+        return st.sampled_from(kind.values)
+    is_number = isinstance(kind, msgspec.inspect.IntType)
+    return st.integers(kind.ge, kind.le) if is_number else st.booleans()
+
+
+FIELDS = msgspec.inspect.type_info(BoardSettings).fields
+
+
+@given(st.builds(BoardSettings, **{each.name: values_of(each.type) for each in FIELDS}))
+def test_any_settings_change_the_block_alone_and_read_back(settings: BoardSettings) -> None:
+    before = image_with(with_crc(BLOCK))
+    image = IntelHex()
+    image.frombytes(before)
+    written = IntelHex(io.StringIO(with_settings(image, settings).decode())).tobinstr()
+    assert (written[:104], written[104 + SIZE :]) == (before[:104], before[104 + SIZE :])
+    found = find_block(written)
+    assert (found.settings, found.firmware_version) == (settings, (1, 2))
 
 
 def test_any_damaged_byte_is_detected() -> None:

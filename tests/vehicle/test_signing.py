@@ -139,7 +139,7 @@ def test_changed_passphrase_takes_effect_at_once(station: GroundStation) -> None
 def test_number_of_streams_is_bounded() -> None:
     verifier = signing.Verifier(KEY, signing.SigningClock(NOW_UNIX_US))
     senders = [(number % 256, 1 + number // 256) for number in range(2 * signing.MAX_STREAMS)]
-    accepted = sum(verifier.accepts(ping(sender=sender), 0) for sender in senders)
+    accepted = sum(not verifier.rejection(ping(sender=sender), 0) for sender in senders)
     assert accepted == signing.MAX_STREAMS
 
 
@@ -159,21 +159,21 @@ def test_frame_is_not_accepted_again_after_a_restart(orderly: bool) -> None:
     verifier, kept = signing.Verifier(KEY, clock, timestamps), timestamps.to_keep()
     taken = [ping(NOW_UNIX_US + n * 100_000) for n in range(100)]
     for frame in taken:
-        assert verifier.accepts(frame, 0)
+        assert not verifier.rejection(frame, 0)
         if timestamps.is_due:
             kept = timestamps.to_keep()
     again = signing.SigningTimestamps(timestamps.exact() if orderly else kept)
     verifier = signing.Verifier(KEY, signing.SigningClock(NOW_UNIX_US - 86_400_000_000), again)
-    assert not any(verifier.accepts(frame, 0) for frame in taken)
+    assert not any(not verifier.rejection(frame, 0) for frame in taken)
     reserve_us = 0 if orderly else signing.RESERVE_TICKS * 10
-    assert verifier.accepts(ping(NOW_UNIX_US + 10_000_000 + reserve_us), 0)
+    assert not verifier.rejection(ping(NOW_UNIX_US + 10_000_000 + reserve_us), 0)
 
 
 def test_timestamps_of_a_busy_stream_are_written_every_few_seconds() -> None:
     timestamps = signing.SigningTimestamps()
     verifier, written = signing.Verifier(KEY, signing.SigningClock(NOW_UNIX_US), timestamps), 0
     for n in range(600):
-        assert verifier.accepts(ping(NOW_UNIX_US + n * 100_000), 0)
+        assert not verifier.rejection(ping(NOW_UNIX_US + n * 100_000), 0)
         if timestamps.is_due:
             written += 1
             timestamps.to_keep()
@@ -183,10 +183,10 @@ def test_timestamps_of_a_busy_stream_are_written_every_few_seconds() -> None:
 def test_old_recording_is_rejected_once_gps_time_is_known() -> None:
     day_us = 86_400_000_000
     clock = signing.SigningClock(NOW_UNIX_US - day_us)
-    assert signing.Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)
+    assert not signing.Verifier(KEY, clock).rejection(ping(NOW_UNIX_US - day_us), 0)
     clock.set_gps_time(NOW_UNIX_US)
-    assert not signing.Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)
-    assert signing.Verifier(KEY, clock).accepts(ping(NOW_UNIX_US), 0)
+    assert signing.Verifier(KEY, clock).rejection(ping(NOW_UNIX_US - day_us), 0)
+    assert not signing.Verifier(KEY, clock).rejection(ping(NOW_UNIX_US), 0)
 
 
 def test_oldest_key_is_discarded_beyond_the_limit() -> None:

@@ -16,7 +16,7 @@ from gateway.analysis.pilot import PilotFlight
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Fact, Picture, ReportTable, Section
 from gateway.printable import figure
-from gateway.units import US_PER_S
+from gateway.units import FEET_PER_M, KNOTS_PER_MPS, US_PER_S
 from gateway.vehicle_state.positions import IntArray
 
 COLOUR_MAP: Final = "viridis"
@@ -25,8 +25,6 @@ EVENT_COLOURS: Final = {
     "flight": style.GREEN, "mode": style.BLUE, "gps": style.ORANGE, "link": style.RED,
 }  # fmt: skip
 EVENT_NAMES: Final = {"flight": "flight", "mode": "mode", "gps": "GPS lost", "link": "link lost"}
-KNOTS_PER_MPS: Final = 1.943844
-FEET_PER_M: Final = 3.28084
 FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
 """The year 2000; an earlier begin is not civil time."""
 
