@@ -97,11 +97,20 @@ def test_broken_imu_is_not_used_but_the_compass_is(
     assert rig.sensors == (present, IMU)
 
 
-@pytest.mark.parametrize("name", ["QMC5883L", "QMC5883P"])
-def test_field_beyond_the_compass_range_is_marked(imu_rig: MakeRig, name: str) -> None:
-    world = still(mag_ut=(20.0, 850.0, 40.0))
+@pytest.mark.parametrize(
+    ("name", "east_ut", "counts"),
+    [
+        ("HMC5883L", 500.0, (218, -4096, 436)),
+        ("QMC5883L", 850.0, (-4096, -4096, -4096)),
+        ("QMC5883P", 850.0, (-4096, -4096, -4096)),
+    ],
+)
+def test_field_beyond_the_compass_range_is_marked(
+    imu_rig: MakeRig, name: str, east_ut: float, counts: tuple[int, ...]
+) -> None:
+    world = still(mag_ut=(20.0, east_ut, 40.0))
     rig, _ = imu_rig(START_S + 0.15, world=world, parts=Parts(compass=name))
-    assert rig.last(ImuPayload).mag == (-4096, -4096, -4096)
+    assert rig.last(ImuPayload).mag == counts
 
 
 @pytest.mark.parametrize("name", ["HMC5883L", "DA5883", "QMC5883L", "QMC5883P"])
@@ -239,12 +248,13 @@ def test_nmea_accuracy_comes_from_the_dilution_of_precision(gps_rig: MakeRig) ->
     assert quality.course_acc_cdeg == 65_535
 
 
-def test_nmea_receiver_without_a_fix_reports_none(gps_rig: MakeRig) -> None:
-    blind = always(fix_type=0, fix_ok=False, satellites=2)
-    rig, _ = gps_rig(FOUND_S, world=blind, parts=Parts(gps="NMEA"))
+@pytest.mark.parametrize("name", ["u-blox M8", "NMEA"])
+def test_no_fix_is_reported_and_sent_on(gps_rig: MakeRig, name: str) -> None:
+    blind = always(fix_type=0, fix_ok=False, satellites=2, time_valid=False, h_acc_m=4e6)
+    rig, _ = gps_rig(FOUND_S, world=blind, parts=Parts(gps=name))
     fix, quality = rig.last(GpsFixPayload), rig.last(GpsQualityPayload)
     assert (fix.fix_type, fix.fix_ok, fix.satellites) == (GpsFixType.NONE, False, 2)
-    assert quality.h_acc_cm == 65_535
+    assert (quality.h_acc_cm, quality.utc, rig.sensors[1]) == (65_535, None, 0)
 
 
 WORKING_RADIOS = ("nRF24L01+", "nRF24L01", "Si24R1", "clone with ACTIVATE")

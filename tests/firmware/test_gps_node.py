@@ -7,7 +7,7 @@ import pytest
 
 from firmware.rig.gps import ubx
 from gateway.records import GpsFixType
-from gateway.wire.payloads import GpsFixPayload, GpsQualityPayload, NodeStatusPayload, RadioFrame
+from gateway.wire.payloads import GpsFixPayload, GpsQualityPayload, NodeStatusPayload
 from tests.firmware.harness import GPS, MakeRig, always
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -38,8 +38,11 @@ def test_fix_and_quality_carry_the_solution(gps_rig: MakeRig) -> None:
     assert str(quality.utc).startswith("2026-11-19 00:00:0")
 
 
-def test_quality_comes_directly_before_its_fix(gps_rig: MakeRig) -> None:
+def test_quality_comes_directly_before_its_fix_and_every_payload_is_counted(
+    gps_rig: MakeRig,
+) -> None:
     rig, _ = gps_rig(CONFIGURED_S + 1.5, loss=0.2, seed=4)
+    assert all((b.seq - a.seq) % 65536 == 1 for a, b in pairwise(rig.headers(1)))
     frames = [f for _, f in rig.frames if not isinstance(f.payload, NodeStatusPayload)]
     assert len(frames) >= 14
     for quality, fix in zip(frames[::2], frames[1::2], strict=False):
@@ -55,16 +58,6 @@ def test_node_time_is_the_arrival_of_the_first_byte(gps_rig: MakeRig) -> None:
         if isinstance(frame.payload, GpsFixPayload):
             late_us = frame.header.node_time_us % 200_000 - 120_000
             assert -1000 < late_us < 1000
-
-
-def test_no_fix_is_reported_and_sent_on(gps_rig: MakeRig) -> None:
-    blind = always(fix_type=0, fix_ok=False, satellites=2, time_valid=False, h_acc_m=4e6)
-    rig, _ = gps_rig(CONFIGURED_S + 1.0, world=blind)
-    fix, quality = rig.last(GpsFixPayload), rig.last(GpsQualityPayload)
-    assert (fix.fix_type, fix.fix_ok, fix.satellites) == (GpsFixType.NONE, False, 2)
-    assert quality.utc is None
-    assert quality.h_acc_cm == 65_535
-    assert rig.sensors[1] == 0
 
 
 def test_restarted_node_uses_a_receiver_that_is_already_configured(gps_rig: MakeRig) -> None:
@@ -119,9 +112,3 @@ def test_ten_fixes_a_second_at_8_mhz(gps_rig: MakeRig, build: Callable[..., obje
     rig, node = gps_rig(CONFIGURED_S + 1.5, build=folder, frequency_hz=8_000_000)
     assert (node.gps.baud, node.gps.dynamic_model) == (38_400, 6)
     assert len(rig.payloads(GpsFixPayload, since_s=CONFIGURED_S)) == pytest.approx(15, abs=1)
-
-
-def test_sequence_counts_every_payload(gps_rig: MakeRig) -> None:
-    rig, _ = gps_rig(CONFIGURED_S + 1.0)
-    frames: list[RadioFrame] = [f for _, f in rig.frames]
-    assert all((b.header.seq - a.header.seq) % 65536 == 1 for a, b in pairwise(frames))

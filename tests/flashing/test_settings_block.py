@@ -80,10 +80,10 @@ def values_of(kind: Any) -> st.SearchStrategy[Any]:
     return st.integers(kind.ge, kind.le) if is_number else st.booleans()
 
 
-FIELDS = msgspec.inspect.type_info(BoardSettings).fields
+BLOCK_TYPE: Any = msgspec.inspect.type_info(BoardSettings)
 
 
-@given(st.builds(BoardSettings, **{each.name: values_of(each.type) for each in FIELDS}))
+@given(st.builds(BoardSettings, **{each.name: values_of(each.type) for each in BLOCK_TYPE.fields}))
 def test_any_settings_change_the_block_alone_and_read_back(settings: BoardSettings) -> None:
     before = image_with(with_crc(BLOCK))
     image = IntelHex()

@@ -12,7 +12,7 @@ from crsf_parser.payloads import PacketsTypes
 from fastcrc.crc8 import dvb_s2
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.records import GpsFix, GpsFixType, ImuFlags, NodeId, VehicleReport
+from gateway.records import GpsFixType, ImuFlags, NodeId, VehicleReport
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.sources.kinds import make_decoder
@@ -271,13 +271,6 @@ FLIGHT = frame(0x1E, ATTITUDE) + frame(0x02, GPS) + frame(0x21, b"ACRO*\0") + fr
 def test_any_address_is_accepted() -> None:
     for address in (0xC8, 0xEA, 0xEE, 0xEC, 0x00, 0x7F):
         assert len(decoder().feed(frame(0x1E, ATTITUDE, address), 0)) == 1, address
-
-
-@pytest.mark.parametrize("size", [1, 2, 3, 7, 1000])
-def test_any_chunking_gives_the_same_records(size: int) -> None:
-    stream, starts = decoder(), range(0, len(FLIGHT), size)
-    found = [each for at in starts for each in stream.feed(FLIGHT[at : at + size], 0)]
-    assert [type(each) for each in found] == [VehicleReport, GpsFix, VehicleReport, VehicleReport]
 
 
 @pytest.mark.parametrize("noise", [b"$TA", b"\x7e\x98\x10" * 9, b"\xff" * 40, b"$GPGGA,1,2*00\r\n"])

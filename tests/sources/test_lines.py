@@ -313,14 +313,6 @@ def test_endless_line_is_dropped_with_a_bound() -> None:
     assert sum(sizes) >= 100_000 - 4096, "what is not dropped is less than a line"
 
 
-def test_any_chunking_gives_the_same_records() -> None:
-    text = (gga() + rmc() + json_line(pressure_hpa=1000, t_ms=5) + "junk\n# note\n").encode()
-    whole = decode(text)
-    decoder = make_decoder(parse_source("lines:stdin"), NODE)
-    single = [e for k in range(len(text)) for e in decoder.feed(text[k : k + 1], 1_000_000)]
-    assert [repr(e) for e in single] == [repr(e) for e in whole]
-
-
 def test_datagram_needs_no_line_feed() -> None:
     line = json_line(pressure_hpa=1000).strip()
     assert decode(line) == []

@@ -250,16 +250,6 @@ def test_hyperimu_repeats_its_field_and_position_which_are_taken_once() -> None:
     assert len(with_field) == 1
 
 
-@pytest.mark.parametrize("size", [1, 7, 1000])
-def test_any_chunking_gives_the_same_records(size: int) -> None:
-    post, location = sensor_logger(turning(1.0, 20)), sensor_logger([(1.3, "location", LOCATION)])
-    data = post + b"junk\n" + location
-    whole, stream = decoder().feed(data, 0), decoder()
-    parts = [e for at in range(0, len(data), size) for e in stream.feed(data[at : at + size], 0)]
-    assert [repr(each) for each in parts] == [repr(each) for each in whole]
-    assert len(whole) == 22
-
-
 GYROSCOPE = '{"payload": [{"name": "gyroscope", "time": %s, "values": {}}]}'
 
 

@@ -1,0 +1,47 @@
+"""Every kind of source: any chunks give the same records, and damage costs only what it hits."""
+
+from functools import cache
+from itertools import islice
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.records import NodeId
+from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.source_bytes import SOURCE_BYTES
+from gateway.sources.kinds import make_decoder
+from gateway.sources.settings import parse_source
+from gateway.wire.framing import Fault
+
+KINDS = st.sampled_from(sorted(SOURCE_BYTES))
+
+
+@cache
+def flight(kind: str) -> bytes:
+    pieces = SOURCE_BYTES[kind](SimulatorSettings(), 1_790_000_000_000_000)
+    return b"".join(piece.data for piece in islice(pieces, 12))
+
+
+def decoded(kind: str, *chunks: bytes) -> list[Any]:
+    decoder = make_decoder(parse_source(f"{kind}:stdin"), NodeId(1, 8))
+    return [event for chunk in chunks for event in decoder.feed(chunk, 1_000_000)]
+
+
+@given(KINDS, st.integers(1, 100))
+def test_any_chunks_give_the_same_records(kind: str, size: int) -> None:
+    data = flight(kind)
+    chunks = [data[at : at + size] for at in range(0, len(data), size)]
+    assert [*map(repr, decoded(kind, *chunks))] == [*map(repr, decoded(kind, data))]
+
+
+@given(KINDS, st.floats(0.0, 0.999), st.integers(1, 255), st.binary(max_size=40))
+def test_damage_anywhere_costs_few_records(
+    kind: str, where: float, flip: int, noise: bytes
+) -> None:
+    data = bytearray(flight(kind))
+    at = int(where * len(data))
+    data[at] ^= flip
+    data[at:at] = noise
+    found = [each for each in decoded(kind, bytes(data)) if not isinstance(each, Fault)]
+    assert len(found) >= 0.7 * len(decoded(kind, flight(kind)))
