@@ -28,29 +28,6 @@ from gateway.printable import PrintableFormatter, printable, reason_of
 
 log = logging.getLogger(__name__)
 
-MODULES: Final = {
-    "live.run": ("run",),
-    "live.demo": ("demo",),
-    "live.panel": ("panel",),
-    "live.fleet": ("fleet",),
-    "live.first_start": ("setup",),
-    "live.calibrate": ("calibrate",),
-    "live.flash": ("flash",),
-    "live.doctor": ("doctor",),
-    "live.map": ("map",),
-    "live.source": ("source",),
-    "recorded.report": ("report",),
-    "recorded.sweep": ("sweep",),
-    "live.record": ("record",),
-    "recorded.play": ("play", "player"),
-    "recorded.convert": ("convert", "fuse"),
-    "recorded.extract": ("extract",),
-    "recorded.diff": ("diff",),
-    "recorded.info": ("info", "recover"),
-    "live.clients": ("status", "clients"),
-}
-"""Commands by module below `gateway.cli`; the module's `app` contains them."""
-
 HELP: Final = {"help_option_names": ["-h", "--help"]}
 GROUPS: Final = {
     "Fly": {
@@ -91,6 +68,11 @@ GROUPS: Final = {
     },
 }
 """Summaries of the commands, under the headings of the list."""
+MODULES: Final = {
+    "setup": "live.first_start", "record": "live.record", "status": "live.clients",
+    "player": "recorded.play", "fuse": "recorded.convert", "recover": "recorded.info",
+}  # fmt: skip
+"""Modules below `gateway.cli` that are not named after the command and its group."""
 COMMANDS: Final = {name: text for below in GROUPS.values() for name, text in below.items()}
 ALSO: Final = {
     "route": "run", "router": "run", "start": "run", "replay": "play", "log": "record",
@@ -100,7 +82,7 @@ ALSO: Final = {
 HOISTED: Final = frozenset({"--config", "-c", "--socket"})
 """Options of `mavgate` itself that may also follow the command."""
 EPILOG: Final = "`mavgate --help` lists the options of all commands: --config, --socket, --verbose."
-SMALL: Final = frozenset({"flash", "record", *MODULES["live.clients"]})
+SMALL: Final = frozenset({"flash", "record", "status", "clients"})
 """Commands that mostly send requests to a gateway; extensions are loaded only with settings."""
 ISO: Final = "%Y-%m-%d %H:%M:%S"
 GIT_S: Final = 5.0
@@ -111,8 +93,9 @@ def load_command(name: str) -> Any:
     """Import the file of a command, and return the command."""
     if name not in SMALL:
         extend()
-    module = next(module for module, names in MODULES.items() if name in names)
-    group = typer.main.get_group(import_module(f"gateway.cli.{module}").app)
+    folder = "recorded" if name in GROUPS["Recordings"] else "live"
+    module = import_module(f"gateway.cli.{MODULES.get(name, f'{folder}.{name}')}")
+    group = typer.main.get_group(module.app)
     gc.enable()
     return tidied(group.commands[name])
 
@@ -145,11 +128,6 @@ def hoisted(words: list[str]) -> list[str]:
         (moved if name in HOISTED else left).extend(words[at : at + size])
         at += size
     return [*moved, *left, *words[end:]]
-
-
-def group_of(name: str) -> str:
-    """Return the heading of a command in the list."""
-    return next(group for group, below in GROUPS.items() if name in below)
 
 
 class LazyGroup(TyperGroup):
@@ -188,7 +166,8 @@ class LazyGroup(TyperGroup):
         if summary is None:
             return None
         if self._listing:
-            return TyperCommand(cmd_name, help=summary, rich_help_panel=group_of(cmd_name))
+            heading = next(group for group, below in GROUPS.items() if cmd_name in below)
+            return TyperCommand(cmd_name, help=summary, rich_help_panel=heading)
         return load_command(cmd_name)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

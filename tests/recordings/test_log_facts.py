@@ -10,7 +10,7 @@ from gateway.analysis.reporting.estimators import estimators
 from gateway.analysis.sweep import with_value
 from gateway.batch.tasks import read_batch_flight
 from gateway.cli.support.options import read_options
-from gateway.cli.support.recording_options import load_flight
+from gateway.cli.support.recordings import load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.flown import open_flown

@@ -11,15 +11,16 @@ from contextlib import ExitStack, contextmanager, suppress
 from enum import StrEnum
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Protocol
+from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 import typer
 from rich.progress import BarColumn, Progress, TextColumn
 
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.control import ask, is_running
 from gateway.cli.support.options import CONFIG, folder_of, read_options, read_settings
-from gateway.cli.support.recording_options import files_of
+from gateway.cli.support.recordings import files_of
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import GatewayClock, unix_time_us
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
@@ -88,13 +89,8 @@ ATTITUDES_DEG: Final = {
 """Roll and pitch of a step's poses, deg; in other steps the aircraft is level."""
 
 
-class Capture(Protocol):
-    """Function that waits for samples."""
-
-    def __call__(self, seconds: float, *, turned: bool = False) -> NodeSamples:
-        """Return samples over a time, or until the compass was turned to most sides."""
-
-
+Capture = Callable[[float, bool], NodeSamples]
+"""Waits for samples over some seconds, or also until the compass was turned to most sides."""
 Poses = Callable[[Step], list[NodeSamples]]
 """Function that returns the samples of each pose of a step; raises CalibrationError with advice."""
 
@@ -110,9 +106,7 @@ def calibrate(
         Path | None,
         typer.Option("--log", help="Calibrate from a recording, by name or file, instead."),
     ] = None,
-    port: Annotated[
-        str | None, typer.Option("--port", "-p", help="Receiver's port, instead of the settings'.")
-    ] = None,
+    port: opt.Port = None,
     field_ut: Annotated[
         float | None,
         typer.Option("--field-strength", min=10.0, max=100.0, help="Of the field here, uT."),
@@ -120,9 +114,7 @@ def calibrate(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show the result, but do not save it.")
     ] = False,
-    simulated: Annotated[
-        bool, typer.Option("--simulated", help="Try it on the simulated receiver; saves nothing.")
-    ] = False,
+    simulated: opt.Simulated = False,
 ) -> None:
     """Calibrate an aircraft's sensors and save the result with its residuals.
 
@@ -136,15 +128,14 @@ def calibrate(
     is_other = simulated or log is not None or port is not None or CONFIG.get() is not None
     is_live = not is_other and is_running()
     if is_live:
-        found = ask("imu.calibration", {"vehicle_id": vehicle})
-        old = msgspec.convert(found, NodeCalibration)
+        old = msgspec.convert(ask("imu.calibration", vehicle_id=vehicle), NodeCalibration)
 
     def save(calibration: NodeCalibration) -> None:
         if dry_run or simulated:
             return
         if is_live:
             values = msgspec.to_builtins(calibration)
-            ask("imu.calibrate", {"vehicle_id": vehicle, "calibration": values})
+            ask("imu.calibrate", vehicle_id=vehicle, calibration=values)
             console.print("used and saved by the gateway")
             return
         changed = msgspec.structs.replace(aircraft, calibration=calibration)
@@ -204,16 +195,14 @@ def _solve(
     step: Step, poses: list[NodeSamples], calibration: NodeCalibration, field_ut: float | None
 ) -> NodeCalibration:
     match step:
-        case Step.GYRO:
-            return calibrating.calibrate_gyro(poses[0], calibration)
         case Step.ACCEL:
             return calibrating.calibrate_accelerometer(poses, calibration)
         case Step.MAG:
             return calibrating.calibrate_magnetometer(poses[0].mag, calibration, field_ut)
         case Step.MOUNTING:
             return calibrating.calibrate_mounting(poses[0], poses[1], calibration)
-        case Step.LEVEL:
-            return calibrating.calibrate_level(poses[0], calibration)
+    solve = calibrating.calibrate_gyro if step is Step.GYRO else calibrating.calibrate_level
+    return solve(poses[0], calibration)
 
 
 def poses_from(capture: Capture) -> Poses:
@@ -223,7 +212,7 @@ def poses_from(capture: Capture) -> Poses:
         match step:
             case Step.GYRO:
                 _ask("Lay the aircraft down and do not touch it.")
-                return [capture(REST_S)]
+                return [capture(REST_S, False)]
             case Step.ACCEL:
                 return _six_sides(capture)
             case Step.MAG:
@@ -231,12 +220,12 @@ def poses_from(capture: Capture) -> Poses:
                     "Away from steel, turn the aircraft slowly about all its axes, upside down "
                     "too, until most sides were measured."
                 )
-                return [capture(MAG_S, turned=True)]
+                return [capture(MAG_S, True)]
         _ask("Set the aircraft level, as it flies.")
-        level = [capture(POSE_S)]
+        level = [capture(POSE_S, False)]
         if step is Step.MOUNTING:
             _ask("Raise the nose by 30° or more and hold it there.")
-            level.append(capture(POSE_S))
+            level.append(capture(POSE_S, False))
         return level
 
     return poses
@@ -248,11 +237,11 @@ def poses_on(bench: Workbench, capture: Capture) -> Poses:
     def poses(step: Step) -> list[NodeSamples]:
         attitudes = cycle(ATTITUDES_DEG.get(step, ((0.0, 0.0),)))
 
-        def moved(seconds: float, *, turned: bool = False) -> NodeSamples:
+        def moved(seconds: float, turned: bool) -> NodeSamples:
             bench.lay(*(angle * RAD_PER_DEG for angle in next(attitudes)))
             if turned:
                 bench.turn()
-            return capture(seconds, turned=turned)
+            return capture(seconds, turned)
 
         return poses_from(moved)(step)
 
@@ -309,7 +298,7 @@ def _six_sides(capture: Capture) -> list[NodeSamples]:
             f"{done} of {len(SIDES)} sides are done. Lay the node on one of these and release "
             f"it: {', '.join(missing)}."
         )
-        samples = capture(POSE_S)
+        samples = capture(POSE_S, False)
         if not calibrating.still_windows(samples):
             console.print("It moved; trying again.")
         elif _missing([*held, samples]) == missing:
@@ -348,9 +337,9 @@ def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
     serial = msgspec.structs.replace(serial, port=device)
     shown: tuple[str, ...] = ()
 
-    def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
+    def capture(seconds: float, turned: bool) -> NodeSamples:
         nonlocal shown
-        collecting = _Collecting(vehicle, seconds, turned=turned)
+        collecting = _Collecting(vehicle, seconds, turned)
         limit_s = collecting.limit_s + SAMPLE_TIMEOUT_S
         with collecting.bar:
             _, is_done = asyncio.run(listen(serial, collecting.add, limit_s))
@@ -358,7 +347,7 @@ def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
             refuse(f"no samples of vehicle {vehicle}: is it on, and is the port right?")
         if collecting.chips not in ((), shown):
             shown = collecting.chips
-            _show_chips(shown)
+            console.print(f"sensors: {', '.join(shown)}")
         return node_samples(collecting.raws)
 
     return capture
@@ -387,7 +376,7 @@ async def listen(
 class _Collecting:
     """Collect one aircraft's samples over a time, or until most sides were measured."""
 
-    def __init__(self, vehicle: int, seconds: float, *, turned: bool) -> None:
+    def __init__(self, vehicle: int, seconds: float, turned: bool) -> None:
         self._vehicle, self._seconds, self._turned = vehicle, seconds, turned
         self.raws: list[ImuRaw] = []
         self.chips: tuple[str, ...] = ()
@@ -430,16 +419,16 @@ def _capture_live(vehicle: int) -> Capture:
         boards = aircraft["boards"] if aircraft["vehicle_id"] == vehicle else ()
         for board in boards:
             if board["chips"] and board["sensors_present"] & SENSOR_IMU:
-                _show_chips(board["chips"])
+                console.print(f"sensors: {', '.join(board['chips'])}")
 
-    def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
-        collecting, idle_s = _Collecting(vehicle, seconds, turned=turned), 0.0
-        ask("imu.samples", {"vehicle_id": vehicle})
+    def capture(seconds: float, turned: bool) -> NodeSamples:
+        collecting, idle_s = _Collecting(vehicle, seconds, turned), 0.0
+        ask("imu.samples", vehicle_id=vehicle)
         with collecting.bar:
             is_done = False
             while not is_done:
                 time.sleep(POLL_S)
-                found = ask("imu.samples", {"vehicle_id": vehicle})
+                found = ask("imu.samples", vehicle_id=vehicle)
                 idle_s = 0.0 if found else idle_s + POLL_S
                 if idle_s > SAMPLE_TIMEOUT_S:
                     refuse(f"no samples of vehicle {vehicle}: is it on?")
@@ -449,10 +438,6 @@ def _capture_live(vehicle: int) -> Capture:
     return capture
 
 
-def _show_chips(chips: Iterable[str]) -> None:
-    console.print(f"sensors: {', '.join(chips)}")
-
-
 def _ask(text: str) -> None:
     console.print(f"\n{text}", style="bold")
     typer.prompt("Enter when ready", default="", show_default=False)
@@ -460,19 +445,19 @@ def _ask(text: str) -> None:
 
 def _show(old: NodeCalibration, new: NodeCalibration) -> None:
     """Print the changes."""
-    table = table_of("setting", "before", "after", left=3)
+    rows = []
     for name in new.__struct_fields__:
         before, after = getattr(old, name), getattr(new, name)
         if before != after:
             is_rate = name.endswith("_radps")
             shown = name.removesuffix("_radps") + ", °/s" if is_rate else name
             scale = 1.0 / RAD_PER_DEG if is_rate else 1.0
-            table.add_row(shown, _text(before, scale), _text(after, scale))
-    console.print(table if table.row_count else "nothing changed")
+            rows.append((shown, _text(before, scale), _text(after, scale)))
+    columns = ("setting", "before", "after")
+    console.print(table_of(*columns, left=3, rows=rows) if rows else "nothing changed")
 
 
 def _text(value: object, scale: float) -> str:
     if isinstance(value, tuple):
-        inner = ", ".join(_text(item, scale) for item in value)
-        return f"({inner})"
+        return f"({', '.join(_text(item, scale) for item in value)})"
     return figure(value * scale, ".5g") if isinstance(value, float) else str(value)

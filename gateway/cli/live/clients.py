@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gateway.cli.support.control import ask
-from gateway.cli.support.options import CONFIG, SOCKET, USER_CONFIG
+from gateway.cli.support.options import SOCKET, settings_file
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
     JsonOption,
@@ -73,21 +73,16 @@ def status(
         return
     console.print(_summary(snapshot))
     if nodes := snapshot["report"]["nodes"]:
-        console.print()
-        console.print(_nodes(nodes, snapshot))
+        console.print("", _nodes(nodes, snapshot), sep="\n")
     if snapshot["vehicles"]:
-        console.print()
-        console.print(_vehicles(snapshot["vehicles"]))
+        console.print("", _vehicles(snapshot["vehicles"]), sep="\n")
     _print_clients(console, snapshot)
 
 
 @group.command("list")
 def list_clients(*, json: JsonOption = False) -> None:
     """List the clients, with the frames sent to them and dropped by the gateway."""
-    if json:
-        print_json(ask("clients.list"))
-        return
-    _print_clients(console_of(), ask("status"))
+    print_json(ask("clients.list")) if json else _print_clients(console_of(), ask("status"))
 
 
 @group.command()
@@ -99,9 +94,9 @@ def add(
     ] = False,
 ) -> None:
     """Add a client or a source, until the gateway ends or permanently."""
-    ask("clients.add", {"url": url})
+    ask("clients.add", url=url)
     if save:
-        _save(CONFIG.get() or USER_CONFIG.expanduser(), url)
+        _save(settings_file(), url)
     snapshot = ask("status")
     every = (*snapshot["listeners"], *snapshot["clients"])
     added = next((one for one in every if one["endpoint"] == url), {"name": url, "reason": ""})
@@ -123,7 +118,7 @@ def _save(file: Path, url: str) -> None:
 @group.command()
 def remove(name: Annotated[str, typer.Argument(help="Name or URL of the client.")]) -> None:
     """Remove a client, a source or a listening port."""
-    ask("clients.remove", {"name": name})
+    ask("clients.remove", name=name)
     print(f"removed {name}")
 
 
@@ -143,13 +138,8 @@ def mark(
             refuse(
                 f"{name} {value}: write a number; without LAT_DEG and LON_DEG the mark is cleared"
             )
-    location = {
-        "lat_deg": lat_deg,
-        "lon_deg": lon_deg,
-        "alt_amsl_m": alt_amsl_m,
-        "vehicle_id": vehicle,
-    }
-    print(ask("mark", location))
+    location: dict[str, Any] = {"lat_deg": lat_deg, "lon_deg": lon_deg, "alt_amsl_m": alt_amsl_m}
+    print(ask("mark", vehicle_id=vehicle, **location))
 
 
 @group.command()
@@ -159,31 +149,35 @@ def reload() -> None:
 
 
 def _gateways(found: Sequence[Gateway]) -> Table:
-    table = table_of("running", "pid", "since", "vehicles", "endpoints", "socket", left=6)
-    for one in found:
-        vehicles = ", ".join(map(str, one.systems)) or UNKNOWN
-        listed = "\n".join(one.endpoints) or UNKNOWN
-        process = UNKNOWN if one.pid is None else str(one.pid)
-        table.add_row(one.command, process, one.since, vehicles, listed, one.socket)
-    return table
+    rows = (
+        (
+            *(one.command, UNKNOWN if one.pid is None else str(one.pid), one.since),
+            *(", ".join(map(str, one.systems)) or UNKNOWN, "\n".join(one.endpoints) or UNKNOWN),
+            one.socket,
+        )
+        for one in found
+    )
+    columns = ("running", "pid", "since", "vehicles", "endpoints", "socket")
+    return table_of(*columns, left=6, rows=rows)
 
 
 def _summary(snapshot: Record) -> str:
     report = snapshot["report"]
-    up = duration_text(snapshot["time_us"] // US_PER_S)
-    received = report["bytes_received"], report["frames"]
-    receiver = receiver_state(report["port"], report["connected"], *received)
-    lines = [", ".join(filter(None, [f"up {up}", receiver]))]
+    keys = ("port", "connected", "bytes_received", "frames")
+    receiver = receiver_state(*(report[key] for key in keys))
+    up = f"up {duration_text(snapshot['time_us'] // US_PER_S)}"
+    lines = [", ".join(filter(None, [up, receiver]))]
     if receiver:
         payloads, lost = (
             sum(node[key] for node in report["nodes"]) for key in ("received", "lost")
         )
         serial = f"serial: {counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
         lines.append(f"{serial}; radio: {counted(payloads, 'payload')}, {lost} lost")
-    lines += _source_lines(snapshot)
-    if report["receiver"] is not None:
-        problem = RadioState(report["receiver"]["radio"]).problem
-        lines += [f"receiver: {problem}"] if problem else []
+    for source in report["sources"]:
+        newest = f" (last: {printable(source['newest_fault'])})" if source["newest_fault"] else ""
+        lines.append(source_state(source, snapshot["time_us"]) + newest)
+    if report["receiver"] and (problem := RadioState(report["receiver"]["radio"]).problem):
+        lines.append(f"receiver: {problem}")
     lines += [
         f"aircraft {_name_of(board, board)} board: {', '.join(board['chips'])}"
         for one in snapshot["aircraft"]
@@ -198,8 +192,7 @@ def _summary(snapshot: Record) -> str:
     hub = snapshot["hub"]
     counts = [f"{hub[key]} {key}" for key in hub if hub[key] or key == "published"]
     lines.append("MAVLink frames: " + ", ".join(counts))
-    requests = [f"{snapshot[key]} {key}" for key in ("refused", "forged") if snapshot[key]]
-    if requests:
+    if requests := [f"{snapshot[key]} {key}" for key in ("refused", "forged") if snapshot[key]]:
         lines.append("requests: " + ", ".join(requests) + "; see mavgate status --requests")
     return "\n".join(lines)
 
@@ -207,8 +200,8 @@ def _summary(snapshot: Record) -> str:
 def _aircraft_lines(snapshot: Record) -> list[str]:
     """Describe where each aircraft is, and with sources the origin of its attitude and position."""
     lines = [
-        f"aircraft {vehicle_id}: {_position(state['lat_deg'], state['lon_deg'])}, "
-        f"{figure(state['alt_amsl_m'], '.1f')} m"
+        f"aircraft {vehicle_id}: {figure(state['lat_deg'], '.6f')} "
+        f"{figure(state['lon_deg'], '.6f')}, {figure(state['alt_amsl_m'], '.1f')} m"
         for vehicle_id, state in snapshot["states"]
     ]
     lines += [
@@ -226,35 +219,22 @@ def _aircraft_lines(snapshot: Record) -> list[str]:
     return lines
 
 
-def _source_lines(snapshot: Record) -> list[str]:
-    """Describe the sources other than the receiver, with the newest fault of each."""
-    lines = []
-    for source in snapshot["report"]["sources"]:
-        newest = f" (last: {printable(source['newest_fault'])})" if source["newest_fault"] else ""
-        lines.append(source_state(source, snapshot["time_us"]) + newest)
-    return lines
-
-
 def _requests(found: Sequence[Record], now_us: int) -> Table:
-    table = table_of("aircraft", "sender", "request", "outcome", "count", "age s", left=4)
-    for entry in reversed(found):
-        table.add_row(
-            str(entry["vehicle_id"]),
-            f"{entry['system_id']}.{entry['component_id']}",
-            entry["request"],
-            entry["outcome"],
-            str(entry["count"]),
+    rows = (
+        (
+            *(str(entry["vehicle_id"]), f"{entry['system_id']}.{entry['component_id']}"),
+            *(entry["request"], entry["outcome"], str(entry["count"])),
             f"{(now_us - entry['time_us']) / US_PER_S:.1f}",
         )
-    return table
+        for entry in reversed(found)
+    )
+    columns = ("aircraft", "sender", "request", "outcome", "count", "age s")
+    return table_of(*columns, left=4, rows=rows)
 
 
 def _vehicles(rows: Sequence[Record]) -> Table:
     """Show all vehicles, own and foreign."""
-    table = table_of(*VEHICLE_HEADS, left=8)
-    for row in rows:
-        table.add_row(*vehicle_cells(VehicleRow(**row)))
-    return table
+    return table_of(*VEHICLE_HEADS, left=8, rows=(vehicle_cells(VehicleRow(**row)) for row in rows))
 
 
 def _nodes(nodes: Sequence[Record], snapshot: Record) -> Table:
@@ -289,23 +269,19 @@ def _board(board: Record | None, overruns: str) -> tuple[str, ...]:
 
 def _print_clients(console: Console, snapshot: Record) -> None:
     if listeners := snapshot["listeners"]:
-        console.print()
-        console.print(_listeners(listeners))
-    console.print()
-    console.print(_clients(snapshot["clients"], snapshot["time_us"]))
+        counts = ("clients", "turned_away")
+        rows = (
+            (port["name"], port["reason"] or port["state"], *(str(port[key]) for key in counts))
+            for port in listeners
+        )
+        table = table_of("listening", "state", "clients", "rejected", rows=rows)
+        console.print("", table, sep="\n")
+    console.print("", _clients(snapshot["clients"], snapshot["time_us"]), sep="\n")
     for client in snapshot["clients"]:
         for text in filter(None, (client["reason"], client["note"], client["hint"])):
             console.print(f"{client['name']}: {text}", style="yellow", soft_wrap=True)
         for text in client["cached"]:
             console.print(f"{client['name']}: cached answers of {text}", soft_wrap=True)
-
-
-def _listeners(listeners: Sequence[Record]) -> Table:
-    table = table_of("listening", "state", "clients", "rejected")
-    for port in listeners:
-        figures = (str(port[key]) for key in ("clients", "turned_away"))
-        table.add_row(port["name"], port["reason"] or port["state"], *figures)
-    return table
 
 
 def _clients(clients: Sequence[Record], now_us: int) -> Table:
@@ -327,7 +303,3 @@ def _first_systems(systems: Sequence[tuple[int, int]]) -> list[str]:
     named = [f"{system}.{component}" for system, component in systems[:MOST_SYSTEMS]]
     more = len(systems) - len(named)
     return [*named, f"and {more} more"] if more else named
-
-
-def _position(lat_deg: float | None, lon_deg: float | None) -> str:
-    return f"{figure(lat_deg, '.6f')} {figure(lon_deg, '.6f')}"

@@ -9,11 +9,11 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Generator, Iterator
-from enum import StrEnum
+from contextlib import suppress
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal, cast
 
 import msgspec
 import typer
@@ -22,27 +22,21 @@ from msgspec.structs import replace
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import begin_copy
 from gateway.cli.live.panel import launched_panel
-from gateway.cli.live.run import (
-    DuplicateIdsOption,
-    EndpointOption,
-    PlainOption,
-    refuse_conflicts,
-    serve,
-    with_endpoints,
-)
+from gateway.cli.live.run import refuse_conflicts, serve, with_endpoints
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import (
     CONFIG,
-    RadioName,
     folder_of,
     read_options,
     read_settings,
     settings_file,
 )
-from gateway.cli.support.recording_options import files_of, progress_of
+from gateway.cli.support.recordings import files_of, progress_of
 from gateway.cli.support.terminal import refuse
 from gateway.clock import unix_time_us
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import GatewaySettings
+from gateway.flashing.boards import Radio
 from gateway.live.daemon import Daemon
 from gateway.live.service import run_event_loop
 from gateway.sensing.calibration import NodeCalibration
@@ -58,26 +52,22 @@ AT_ONCE: Final = 16
 CHECKOUT: Final = Path(__file__).resolve().parents[3]
 
 
-class TrackerName(StrEnum):
-    """Kinds of simulated trackers other than our boards."""
-
-    CRSF = "crsf"
-    LINES = "lines"
-    PHONE = "phone"
+TrackerName = Literal["crsf", "lines", "phone"]
+"""Kinds of simulated trackers other than our boards."""
 
 
 @app.command()
 def demo(
     *,
-    endpoint: EndpointOption = None,
-    plain: PlainOption = False,
+    endpoint: opt.Endpoint = None,
+    plain: opt.Plain = False,
     record: Annotated[bool, typer.Option("--record", help="Record it from the start.")] = False,
     flight: Annotated[
         Path | None,
         typer.Option("--flight", "-f", help="Fly a recording instead: by its name, or any file."),
     ] = None,
     firmware: Annotated[
-        RadioName | None,
+        Radio | None,
         typer.Option(
             "--firmware", help="Run the boards' own programs on simulated chips, with this radio."
         ),
@@ -87,19 +77,22 @@ def demo(
         typer.Option("--tracker", help="Fly it through the bytes of another kind of tracker."),
     ] = None,
     panel: Annotated[bool, typer.Option("--panel/--no-panel", help="Start the panel too.")] = True,
-    duplicate_ids: DuplicateIdsOption = False,
+    duplicate_ids: opt.DuplicateIds = False,
 ) -> None:
     """Fly the simulated tracker repeatedly until interrupted.
 
     The simulated receiver sends the real protocol on a pseudo-terminal, at true rates. A recording
     that is flown instead restarts at its end, with a message.
     """
-    file = CONFIG.get()  # Read here: a reload runs in another thread, without the context.
+    # Read here: a reload runs in another thread, without the context.
+    file = CONFIG.get()
 
     def read() -> GatewaySettings:
         return with_endpoints(read_settings(file), endpoint)
 
-    settings = _without_conflicts(read(), one=flight is not None, allowed=duplicate_ids)
+    settings = read()
+    first, count = settings.simulator.vehicle_id, 1 if flight else settings.simulator.vehicles
+    refuse_conflicts(range(first, first + count), settings, allowed=duplicate_ids)
     # First, as it takes seconds to load; the simulator is therefore imported later.
     page = launched_panel(wanted=panel)
     load_entry_points()
@@ -115,10 +108,10 @@ def demo(
             line, aircraft = recorded_line(settings, flight, report)
         else:
             one = settings.simulator
-            boards = firmware and firmware_line(one, unix_time_us(), firmware.value)
+            boards = firmware and firmware_line(one, unix_time_us(), firmware)
             line = made_ahead(boards or simulated_line(one, tracker))
             aircraft = calibrated_aircraft(settings)
-    except (BenchError, ValueError) as error:
+    except ValueError as error:
         refuse(str(error))
     # Parameters that a ground station stores in the demo must not affect the real aircraft's.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
@@ -136,27 +129,18 @@ def demo(
         run_event_loop(serve(daemon, plain=plain, panel=page), settings.hub.event_loop)
 
 
-def _without_conflicts(settings: GatewaySettings, *, one: bool, allowed: bool) -> GatewaySettings:
-    """Return the settings; refuse if another gateway sends the ids of the simulated aircraft."""
-    first, count = settings.simulator.vehicle_id, 1 if one else settings.simulator.vehicles
-    refuse_conflicts(range(first, first + count), settings, allowed=allowed)
-    return settings
-
-
 def simulated_line(settings: SimulatorSettings, source: TrackerName | None) -> Iterator[TimedFrame]:
     """Simulate the aircraft, as frames of the receiver or bytes of another source."""
     from gateway.simulator.receiver import simulate
     from gateway.simulator.source_bytes import SOURCE_BYTES
 
     if source is not None:
-        return SOURCE_BYTES[source.value](settings, unix_time_us())
+        return SOURCE_BYTES[source](settings, unix_time_us())
     return simulate(settings, unix_time_us()).frames()
 
 
 def recorded_line(
-    settings: GatewaySettings,
-    name: Path,
-    report: Callable[[str], None] = log.info,
+    settings: GatewaySettings, name: Path, report: Callable[[str], None] = log.info
 ) -> tuple[Iterator[TimedFrame], dict[int, AircraftSettings]]:
     """Send a recording as its nodes would have sent it, with unchanged calibrated values."""
     from gateway.recordings.flown import open_flown
@@ -195,15 +179,11 @@ def made_ahead(frames: Iterator[TimedFrame]) -> Generator[TimedFrame]:
 
 
 def _take(receiver: Connection) -> Generator[TimedFrame]:
-    with receiver:
+    with receiver, suppress(EOFError):
         while True:
-            try:
-                made = receiver.recv()
-            except EOFError:
-                log.warning("the simulated receiver has ended")
-                return
-            for time_s, data, damaged in made:
-                yield TimedFrame(time_s, data, damaged)
+            for made in receiver.recv():
+                yield TimedFrame(*made)
+    log.warning("the simulated receiver has ended")
 
 
 def _make(frames: Iterator[TimedFrame], sender: Connection) -> None:
@@ -214,21 +194,16 @@ def _make(frames: Iterator[TimedFrame], sender: Connection) -> None:
         sender.send(made)
 
 
-class BenchError(RuntimeError):
-    """The bench is missing, or cannot be built."""
-
-
 def firmware_line(
     settings: SimulatorSettings, start_unix_us: int, radio: str
 ) -> Iterator[TimedFrame]:
-    """Fly the simulated aircraft with the firmware on simulated chips, or raise `BenchError`."""
+    """Fly the simulated aircraft with the firmware on simulated chips."""
     if not (CHECKOUT / "firmware" / "rig").is_dir():
-        raise BenchError("--firmware needs a checkout of the project, not an installed package")
+        refuse("--firmware needs a checkout of the project, not an installed package")
     if str(CHECKOUT) not in sys.path:
         sys.path.append(str(CHECKOUT))
     line = importlib.import_module("firmware.rig.line")
     try:
-        frames: Iterator[TimedFrame] = line.frames(settings, start_unix_us, radio)
+        return cast(Iterator[TimedFrame], line.frames(settings, start_unix_us, radio))
     except (RuntimeError, OSError) as error:
-        raise BenchError(f"--firmware: {error}") from error
-    return frames
+        refuse(f"--firmware: {error}")

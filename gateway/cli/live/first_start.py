@@ -22,6 +22,7 @@ from gateway.cli.live.calibrate import (
     poses_on,
     simulated_receiver,
 )
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import read_settings, settings_file
 from gateway.cli.support.phone import guide_phone
 from gateway.cli.support.terminal import console_of, refuse, table_of
@@ -77,12 +78,8 @@ def setup(
         int | None,
         typer.Option("--vehicle", min=1, max=31, help="Its id, if several send."),
     ] = None,
-    port: Annotated[
-        str | None, typer.Option("--port", "-p", help="Receiver's port, instead of the settings'.")
-    ] = None,
-    simulated: Annotated[
-        bool, typer.Option("--simulated", help="Try it on the simulated receiver; saves nothing.")
-    ] = False,
+    port: opt.Port = None,
+    simulated: opt.Simulated = False,
 ) -> None:
     """Guide through the first start: receiver, sensors, radio, GPS, calibration.
 
@@ -188,27 +185,23 @@ def _check_nodes(
     report: LinkReport, statuses: dict[tuple[int, int], NodeStatus], vehicle: int
 ) -> None:
     """Print the boards of the aircraft, and their faults."""
-    table = table_of(
-        "node", "firmware", "sensors", "missing", "payloads/s", "lost %", "supply V", left=4
-    )
-    hints = []
+    rows, hints = list[tuple[str, ...]](), list[str]()
     for link in report.nodes:
         if link.node.vehicle_id != vehicle:
             continue
         node = link.node.node_id
         status = statuses.get((vehicle, node))
         share = 100.0 * link.lost / max(link.received + link.lost, 1)
+        received = (f"{link.rate_hz:.0f}", f"{share:.1f}")
         if status is None:
-            table.add_row(str(node), "no report", "", "", f"{link.rate_hz:.0f}", f"{share:.1f}", "")
+            rows.append((str(node), "no report", "", "", *received, ""))
             continue
         failed = _sensors(status.sensors_failed)
         version = "{}.{}".format(*status.firmware_version)
         volts = f"{status.supply_mv / MV_PER_V:.2f}" if status.supply_mv else ""
         present = _sensors(status.sensors_present & ~status.sensors_failed)
         found = ", ".join(status.chips) or present
-        table.add_row(
-            str(node), version, found, failed, f"{link.rate_hz:.0f}", f"{share:.1f}", volts
-        )
+        rows.append((str(node), version, found, failed, *received, volts))
         if status.radio.problem:
             hints.append(f"Node {node}: {status.radio.problem}; try another module")
         if failed:
@@ -218,7 +211,8 @@ def _check_nodes(
                 f"Node {node}: {share:.0f} % of the payloads are lost: upright antennas, 10 uF "
                 "across the radio's supply, or `--air-rate 250` on all boards for range"
             )
-    console.print(table)
+    columns = ("node", "firmware", "sensors", "missing", "payloads/s", "lost %", "supply V")
+    console.print(table_of(*columns, left=4, rows=rows))
     for hint in hints:
         _hint(hint)
     if not hints:

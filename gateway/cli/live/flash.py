@@ -1,14 +1,13 @@
 """`mavgate flash`: programs and settings of boards."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Final, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
 import msgspec
 import typer
 from intelhex import IntelHex
 
-from gateway.cli.support.options import RadioName, output_file
+from gateway.cli.support.options import output_file
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.flashing import airtime, boards
 from gateway.flashing.boards import (
@@ -19,7 +18,7 @@ from gateway.flashing.boards import (
     SettingsBlock,
     used_by,
 )
-from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports
+from gateway.live.serial_port import Port, PortNotFoundError, find_port, list_serial_ports
 from gateway.output import write_new
 from gateway.printable import reason_of
 from gateway.settings import Field, fields_of
@@ -52,14 +51,6 @@ console = console_of()
 app = typer.Typer()
 
 
-class Board(StrEnum):
-    """The programs by their names on the command line."""
-
-    IMU = "imu"
-    GPS = "gps"
-    RECEIVER = "receiver"
-
-
 def _allowed(field: Field) -> str:
     literals = ", ".join(map(str, get_args(field.type.__origin__)))
     return f"{literals or field.range} {field.unit}".strip()
@@ -86,7 +77,8 @@ def _option(name: str) -> Any:
 @app.command()
 def flash(
     board: Annotated[
-        Board | None, typer.Argument(help="Program to write; without it, list the boards.")
+        Literal["imu", "gps", "receiver"] | None,
+        typer.Argument(help="Program to write; without it, list the boards."),
     ] = None,
     *,
     port: Annotated[
@@ -105,8 +97,8 @@ def flash(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     radio: Annotated[
-        RadioName, typer.Option("--radio", help="The radio of all boards: nRF24L01+ or LoRa.")
-    ] = RadioName.NRF24,
+        Radio, typer.Option("--radio", help="The radio of all boards: nRF24L01+ or LoRa.")
+    ] = "nrf24",
     power: Annotated[
         int | None,
         typer.Option("--power", help="Transmit power: -18, -12, -6, 0 dBm; with LoRa 2 to 20."),
@@ -150,7 +142,7 @@ def flash(
     Needs avrdude, and no compiler. Listing, reading and writing restart the board.
     """
     khz = None if frequency is None else round(1000 * frequency)
-    nrf24_power, lora_power = (power, None) if radio is RadioName.NRF24 else (None, power)
+    nrf24_power, lora_power = (power, None) if radio == "nrf24" else (None, power)
     given: tuple[object, ...] = (
         *(vehicle, node, pipe, channel, air_rate, nrf24_power, _address(address)),
         *(send_rate, raw, accel_range, gyro_range, gps_rate, gps_model),
@@ -159,7 +151,6 @@ def flash(
     changes = {n: v for n, v in zip(OPTIONS, given, strict=True) if v is not None}
     if clock not in boards.CLOCKS_MHZ:
         refuse(f"--clock {clock}: 16 or 8")
-    of_board: Radio = "nrf24" if radio is RadioName.NRF24 else "sx1276"
     try:
         if show:
             device = find_port(port, list_serial_ports())
@@ -169,9 +160,9 @@ def flash(
         elif board is None:
             _list()
         else:
-            program = Program[board.name]
-            _check(program, of_board, changes)
-            image = boards.read_image(boards.image_path(program, clock, of_board))
+            program = Program[board.upper()]
+            _check(program, radio, changes)
+            image = boards.read_image(boards.image_path(program, clock, radio))
             if output is None:
                 _write(program, image, changes, port=port, keep=keep, duty=duty)
             else:
@@ -197,20 +188,19 @@ def _list() -> None:
     found = list_serial_ports()
     if not any(port.usb_id for port in found):
         refuse("no USB adapter is connected: connect a board by USB, then list again")
-    table = table_of("device", "USB id", "adapter", "bootloader", left=4)
-    for port in found:
-        answer = _bootloader_text(port.device) if port.usb_id else "not tried"
-        table.add_row(port.device, port.usb_id, port.description, answer)
-    console.print(table)
+    rows = ((port.device, port.usb_id, port.description, _bootloader_text(port)) for port in found)
+    console.print(table_of("device", "USB id", "adapter", "bootloader", left=4, rows=rows))
     console.print("Next: `mavgate flash imu --port DEVICE`, or gps, or receiver")
 
 
-def _bootloader_text(device: str) -> str:
+def _bootloader_text(port: Port) -> str:
+    if not port.usb_id:
+        return "not tried"
     try:
-        with boards.reserved(device):
-            loader = boards.find_bootloader(device)
+        with boards.reserved(port.device):
+            loader = boards.find_bootloader(port.device)
     except FlashError as error:
-        return str(error).removeprefix(f"{device}: ")
+        return str(error).removeprefix(f"{port.device}: ")
     return "no response" if loader is None else f"{loader.name}, {loader.baud} baud"
 
 
@@ -289,9 +279,10 @@ def _print(device: str, block: SettingsBlock) -> None:
     major, minor = block.firmware_version
     name = block.program.name.lower()
     console.print(f"{device}: {name}, version {major}.{minor}, for {block.clock_mhz} MHz")
-    table = table_of("setting", "value", "unit", "option", left=4)
-    for field in ("radio", *used_by(block.program, block.settings.radio)):
-        value: object = getattr(block.settings, field)
-        text = f"{value:08x}" if field == "radio_address" else str(value)
-        table.add_row(field, text, FIELDS[field].unit, OPTIONS.get(field, ""))
-    console.print(table)
+    values = msgspec.to_builtins(block.settings)
+    values["radio_address"] = f"{values['radio_address']:08x}"
+    rows = (
+        (name, str(values[name]), FIELDS[name].unit, OPTIONS.get(name, ""))
+        for name in ("radio", *used_by(block.program, block.settings.radio))
+    )
+    console.print(table_of("setting", "value", "unit", "option", left=4, rows=rows))

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -10,7 +11,8 @@ import msgspec
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColumn
 
-from gateway.cli.live.run import EndpointOption, with_endpoints
+from gateway.cli.live.run import with_endpoints
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.control import ask, socket_of
 from gateway.cli.support.options import read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, refuse, table_of
@@ -57,7 +59,7 @@ def fleet(
     site: Annotated[
         list[str] | None, typer.Option("--site", help="Sites to show, such as 'field-*'.")
     ] = None,
-    endpoint: EndpointOption = None,
+    endpoint: opt.Endpoint = None,
 ) -> None:
     """Show the vehicles of many sites here, through a Zenoh router."""
     if context.invoked_subcommand is not None:
@@ -84,15 +86,11 @@ def status(*, json: JsonOption = False) -> None:
     role = "router at" if found["is_router"] else "connected to"
     lost = "" if found["is_linked"] else ", which does not respond"
     console.print(f"{role} {found['router']}{lost}")
-    table = table_of("site", "", "RTT ms", "system", "id here", "Hz", "age s", "lost", left=2)
-    for each in found["sites"]:
-        _add_site(table, each)
-    console.print(table)
-    if found["unmapped"]:
-        text = f"no id left for: {', '.join(found['unmapped'])}; give one by `mavgate fleet id`"
-        console.print(text)
-    if found["without_session"]:
-        names = ", ".join(found["without_session"])
+    columns = ("site", "", "RTT ms", "system", "id here", "Hz", "age s", "lost")
+    console.print(table_of(*columns, left=2, rows=chain.from_iterable(map(_rows, found["sites"]))))
+    if names := ", ".join(found["unmapped"]):
+        console.print(f"no id left for: {names}; give one by `mavgate fleet id`")
+    if names := ", ".join(found["without_session"]):
         console.print(f"without a session of their own, sharing the ids of one site: {names}")
     if found["left_out"]:
         console.print(f"excluded: {', '.join(found['left_out'])}")
@@ -100,12 +98,10 @@ def status(*, json: JsonOption = False) -> None:
         console.print(f"{counted(found['overflowed'], 'message')} dropped: they arrived too fast")
     for site in found["sites"]:
         # Frames rejected because of their signature.
-        counts = [f"{site[k]} {k}" for k in ("unsigned", "forged", "replayed") if site[k]]
-        if counts:
+        if counts := [f"{site[k]} {k}" for k in ("unsigned", "forged", "replayed") if site[k]]:
             console.print(f"frames of {site['name']} dropped: {', '.join(counts)}")
     ways = [*found["sites"], {"name": "clients here", "looped": found["looped"]}]
-    loops = [f"{way['looped']} through {way['name']}" for way in ways if way["looped"]]
-    if loops:
+    if loops := [f"{way['looped']} through {way['name']}" for way in ways if way["looped"]]:
         console.print(f"looped frames dropped: {', '.join(loops)}")
 
 
@@ -119,23 +115,24 @@ def set_id(
     if not name or not system.isdecimal():
         refuse(f"{vehicle!r} is not SITE/SYSTEM, as in field-1/1")
     params = {"site": name, "system_id": int(system), "own_id": own_id}
-    for line in ask("fleet.id", params, of="fleet", wait_s=DISK_S):
+    for line in ask("fleet.id", of="fleet", wait_s=DISK_S, **params):
         console_of().print(line)
 
 
-def _add_site(table: Any, site: Mapping[str, Any]) -> None:
+def _rows(site: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return a row for each vehicle of a site, or one for the site."""
     state = "here" if site["is_here"] else "gone"
     if site["sessions"] > 1:
         state = f"{site['sessions']} of this name"
     trip_s = site["round_trip_s"]
-    trip = "" if trip_s is None else f"{trip_s * 1000:.1f}"
-    if not site["vehicles"]:
-        table.add_row(site["name"], state, trip)
-    for vehicle in site["vehicles"]:
-        table.add_row(
-            site["name"], state, trip, str(vehicle["system_id"]), str(vehicle["id"] or "none"),
-            f"{vehicle['rate_hz']:.1f}", f"{vehicle['age_s']:.1f}", str(vehicle["lost"]),
-        )  # fmt: skip
+    head = (site["name"], state, "" if trip_s is None else f"{trip_s * 1000:.1f}")
+    return [
+        (
+            *(*head, str(vehicle["system_id"]), str(vehicle["id"] or "none")),
+            *(f"{vehicle['rate_hz']:.1f}", f"{vehicle['age_s']:.1f}", str(vehicle["lost"])),
+        )
+        for vehicle in site["vehicles"]
+    ] or [head]
 
 
 async def _serve(settings: Any, hub_settings: Any) -> None:
@@ -167,22 +164,22 @@ def recordings(
     """List the recordings of the sites, the newest last."""
     if context.invoked_subcommand is not None:
         return
-    found = ask("fleet.recordings", {"site": site}, of="fleet")
+    found = ask("fleet.recordings", of="fleet", site=site)
     if json:
         print_json(found)
         return
-    grid = table_of("site", "recording", "files", "MB", "last written (UTC)", left=2)
-    for name, listed in found.items():
-        for each in listed:
-            when = civil_time(each["modified_s"] * US_PER_S)
-            grid.add_row(
-                name,
-                each["name"],
-                str(len(each["files"])),
-                f"{_size_of(each) / 1e6:.2f}",
-                UNKNOWN if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
-            )
-    console_of().print(grid)
+    rows = (
+        (name, each["name"], str(len(each["files"])), f"{_size_of(each) / 1e6:.2f}", _when(each))
+        for name, listed in found.items()
+        for each in listed
+    )
+    columns = ("site", "recording", "files", "MB", "last written (UTC)")
+    console_of().print(table_of(*columns, left=2, rows=rows))
+
+
+def _when(recording: Mapping[str, Any]) -> str:
+    when = civil_time(recording["modified_s"] * US_PER_S)
+    return UNKNOWN if when is None else f"{when:%Y-%m-%d %H:%M:%S}"
 
 
 @recordings_group.command()
@@ -199,7 +196,7 @@ def get(
     """Fetch a recording of a site; an interrupted fetch is continued."""
     if not SITE_NAME.fullmatch(site):
         refuse(f"site {site!r}: letters, digits, . _ and - only")
-    listed = ask("fleet.recordings", {"site": site}, of="fleet").get(site)
+    listed = ask("fleet.recordings", of="fleet", site=site).get(site)
     if listed is None:
         refuse(f"site {site} does not serve recordings; see `mavgate fleet status`")
     recording = next((each for each in listed if each["name"] == name), None)
@@ -220,18 +217,14 @@ def get(
 
 def _fetch_all(fetch: RecordingFetch, recording: dict[str, Any], folder: Path) -> None:
     console = console_of(stderr=True)
-    columns = (BarColumn(), DownloadColumn(), TransferSpeedColumn())
-    lines = []
+    lines, columns = list[str](), (BarColumn(), DownloadColumn(), TransferSpeedColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task(recording["name"], total=_size_of(recording))
         for file in recording["files"]:
-            is_new = fetch.fetch(
-                file["name"], file["size"], lambda count: progress.advance(task, count)
-            )
-            state = "fetched" if is_new else "already complete"
-            lines.append(f"{folder / file['name']} {state}")
-    for line in lines:
-        console_of().print(line)
+            size = file["size"]
+            is_new = fetch.fetch(file["name"], size, lambda count: progress.advance(task, count))
+            lines.append(f"{folder / file['name']} {'fetched' if is_new else 'already complete'}")
+    console_of().print(*lines, sep="\n")
 
 
 def _size_of(recording: dict[str, Any]) -> int:

@@ -8,7 +8,7 @@ import typer
 from rich.progress import Progress
 
 from gateway.cli.support.options import folder_of, read_options, read_settings
-from gateway.cli.support.recording_options import files_of, name_of
+from gateway.cli.support.recordings import files_of, name_of
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of, refuse
 from gateway.extras import require
 

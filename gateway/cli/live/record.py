@@ -1,5 +1,6 @@
 """`mavgate record …`: control the recorder of a running gateway."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,9 +17,6 @@ from gateway.recordings.index import (
     rename_recording,
 )
 from gateway.units import counted
-
-NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
-
 
 app = typer.Typer()
 group = typer.Typer(
@@ -47,10 +45,7 @@ def stop() -> None:
 def status(*, json: JsonOption = False) -> None:
     """Show the status of the recorder."""
     found = ask("record.status")
-    if json:
-        print_json(found)
-    else:
-        _show(found)
+    print_json(found) if json else _show(found)
 
 
 @group.command()
@@ -63,28 +58,29 @@ def rename(
 ) -> None:
     """Rename a recording; nothing is ever overwritten."""
     if recording is None and is_running():
-        _show(ask("record.rename", {"name": name}))
+        _show(ask("record.rename", name=name))
         return
-    renamed = rename_recording(_folder(), recording or "last", name)
-    console_of().print(f"{renamed.name}: {counted(len(renamed.files), 'file')} in {_folder()}")
+    folder = folder_of(read_settings())
+    renamed = rename_recording(folder, recording or "last", name)
+    console_of().print(f"{renamed.name}: {counted(len(renamed.files), 'file')} in {folder}")
 
 
 @group.command()
 def delete(
-    name: NameArgument,
+    name: Annotated[str, typer.Argument(help="Name of a recording, or last.")],
     *,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")] = False,
 ) -> None:
     """Delete a recording, after asking."""
     running = is_running()
-    folder = Path(ask("record.status")["folder"]) if running else _folder()
+    folder = Path(ask("record.status")["folder"]) if running else folder_of(read_settings())
     # `last` may mean another recording after the user has answered.
     found = find_recording(folder, name)
     if not yes:
         what = f"{found.name!r}: {counted(len(found.files), 'file')}, {found.size / 1e6:.2f} MB"
         typer.confirm(f"Delete the recording {what}, for ever?", abort=True)
     if running:
-        deleted = ask("record.delete", {"name": found.name})["files"]
+        deleted = ask("record.delete", name=found.name)["files"]
     else:
         deleted = delete_recording(folder, found.name).files
     for path in deleted:
@@ -94,40 +90,30 @@ def delete(
 @group.command()
 def note(text: Annotated[str, typer.Argument(help="Text of the remark.")]) -> None:
     """Add a remark to the recording at this moment, and send it to the ground stations."""
-    _show(ask("record.note", {"text": text}))
-
-
-def _folder() -> Path:
-    return folder_of(read_settings())
+    _show(ask("record.note", text=text))
 
 
 def _show(status: dict[str, Any]) -> None:
     console = console_of()
     if status["held_s"] and status["state"] == SessionState.IDLE:
         console.print(f"waits for arming, with {status['held_s']:.0f} s in memory")
-    free = f"{status['free_bytes'] / 1e9:.1f} GB free"
+    size, free = status["part_bytes"], f"{status['free_bytes'] / 1e9:.1f} GB free"
     if status["state"] == SessionState.IDLE and status["name"]:
+        # That of its last part is all that is known if the files cannot be accessed.
+        with suppress(RecordingError, OSError):
+            size = find_recording(Path(status["folder"]), status["name"]).size
         length = duration_text(status["duration_s"]).removeprefix("0:").removeprefix("0")
         console.print(
             f"Stopped: {status['name']}, {length}, "
-            f"{_size(status) / 1e6:.1f} MB, in {status['folder']} ({free})"
+            f"{size / 1e6:.1f} MB, in {status['folder']} ({free})"
         )
         return
     line = status["state"]
     if status["name"]:
         line += f": {status['name']}, part {status['part']}"
-    if status["part_bytes"]:
-        line += f", {status['part_bytes'] / 1e6:.1f} MB"
+    if size:
+        line += f", {size / 1e6:.1f} MB"
     if status["reason"]:
         line += f" ({status['reason']})"
     console.print(line)
     console.print(f"{status['folder']}: {free}")
-
-
-def _size(status: dict[str, Any]) -> int:
-    """Return the size of a recording; only that of its last part if files cannot be accessed."""
-    try:
-        return find_recording(Path(status["folder"]), status["name"]).size
-    except (RecordingError, OSError):
-        size: int = status["part_bytes"]
-        return size

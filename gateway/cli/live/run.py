@@ -13,6 +13,7 @@ import msgspec
 import typer
 
 from gateway.cli.live.panel import PanelProcess, launched_panel
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import CONFIG, read_settings, settings_file
 from gateway.cli.support.terminal import refuse
 from gateway.compiled.entry_point import load_entry_points
@@ -37,25 +38,11 @@ VIEW_INTERVAL_S: Final = 0.5
 LOG_INTERVAL_S: Final = 10.0
 SWITCH_S: Final = 0.0001
 
-PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines instead of the live view.")]
-DuplicateIdsOption = Annotated[
-    bool,
-    typer.Option(
-        "--duplicate-ids", help="Send even if another gateway sends the same vehicle id there."
-    ),
-]
-EndpointOption = Annotated[
-    list[str] | None,
-    typer.Option("--endpoint", "-e", help="Endpoint for MAVLink, instead of the settings'."),
-]
-
 
 @app.command("run")
 def run_gateway(
     *,
-    port: Annotated[
-        str | None, typer.Option("--port", "-p", help="Receiver's port, instead of the settings'.")
-    ] = None,
+    port: opt.Port = None,
     source: Annotated[
         list[str] | None,
         typer.Option(
@@ -64,8 +51,8 @@ def run_gateway(
             help="A tracker, radio or phone, such as crsf:/dev/ttyACM0, instead of the settings'.",
         ),
     ] = None,
-    endpoint: EndpointOption = None,
-    plain: PlainOption = False,
+    endpoint: opt.Endpoint = None,
+    plain: opt.Plain = False,
     panel: Annotated[
         bool, typer.Option("--panel", help="Start the panel too, whatever the settings.")
     ] = False,
@@ -105,21 +92,18 @@ def run_gateway(
 
 def with_sources(settings: GatewaySettings, urls: list[str] | None) -> GatewaySettings:
     """Replace the sources in the settings by those of the command line."""
-    if not urls:
-        return settings
     try:
-        sources = tuple(SourceSettings(url=url) for url in urls)
-        return msgspec.structs.replace(settings, sources=sources)
+        sources = tuple(SourceSettings(url=url) for url in urls or ())
     except ValueError as error:
         refuse(f"--source: {error}")
+    return msgspec.structs.replace(settings, sources=sources or settings.sources)
 
 
 def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:
     """Replace the endpoints in the settings by those of the command line."""
-    if not endpoints:
-        return settings
+    hub = settings.hub
     try:
-        hub = msgspec.structs.replace(settings.hub, endpoints=tuple(endpoints))
+        hub = msgspec.structs.replace(hub, endpoints=tuple(endpoints or hub.endpoints))
     except ValueError as error:
         refuse(f"--endpoint: {error}")
     return msgspec.structs.replace(settings, hub=hub)

@@ -9,19 +9,9 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import CONFIG, output_file, read_options, read_settings
-from gateway.cli.support.recording_options import (
-    BesideOption,
-    ColumnsOption,
-    Files,
-    ForceOption,
-    FromOption,
-    FuseWithOption,
-    PositionOption,
-    SensorOption,
-    SmoothOption,
-    SystemOption,
-    ToOption,
+from gateway.cli.support.recordings import (
     print_remarks,
     progress_of,
     read_range,
@@ -68,13 +58,13 @@ def _option(name: str, text: str, **how: Any) -> Any:
 
 @app.command()
 def convert(
-    files: Files,
+    files: opt.Files,
     *,
     output: Annotated[Path, output_file("Output; its ending selects the format.", WRITERS)],
-    begin: FromOption = None,
-    end: ToOption = None,
-    columns: ColumnsOption = None,
-    sensor: SensorOption = None,
+    begin: opt.From = None,
+    end: opt.To = None,
+    columns: opt.Columns = None,
+    sensor: opt.Sensor = None,
     system: Annotated[
         list[int] | None,
         typer.Option(
@@ -141,7 +131,7 @@ def convert(
     keep_unknown: Annotated[
         bool, _option("--keep-unknown", "With --anonymise, keep messages that are not known here.")
     ] = False,
-    force: ForceOption = False,
+    force: opt.Force = False,
 ) -> None:
     """Convert, trim, join, merge and edit recordings.
 
@@ -282,7 +272,7 @@ def _known_estimator(name: str | None) -> str | None:
 
 @app.command("fuse")
 def fuse_log(
-    files: Files,
+    files: opt.Files,
     *,
     output: Annotated[Path, output_file("Output; its ending selects the format.", WRITERS)],
     estimator: Annotated[
@@ -293,16 +283,16 @@ def fuse_log(
         float | None,
         typer.Option("--gps-latency", min=0.0, max=2.0, help="Instead of the settings', s."),
     ] = None,
-    fuse_with: FuseWithOption = "recorded",
-    position: PositionOption = "causal",
-    smooth: SmoothOption = False,
-    both: BesideOption = False,
-    begin: FromOption = None,
-    end: ToOption = None,
-    columns: ColumnsOption = None,
-    sensor: SensorOption = None,
-    system: SystemOption = None,
-    force: ForceOption = False,
+    fuse_with: opt.FuseWith = "recorded",
+    position: opt.Placing = "causal",
+    smooth: opt.Smooth = False,
+    both: opt.Beside = False,
+    begin: opt.From = None,
+    end: opt.To = None,
+    columns: opt.Columns = None,
+    sensor: opt.Sensor = None,
+    system: opt.System = None,
+    force: opt.Force = False,
 ) -> None:
     """Re-run the estimator on recordings, and write them with the new states in any format.
 

@@ -9,15 +9,10 @@ import typer
 
 from gateway.aircraft import Aircraft
 from gateway.answers.log_answers import LogAnswers
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.control import ask
 from gateway.cli.support.options import output_file, read_options, read_settings
-from gateway.cli.support.recording_options import (
-    ForceOption,
-    SystemOption,
-    print_remarks,
-    progress_of,
-    recorded_files,
-)
+from gateway.cli.support.recordings import print_remarks, progress_of, recorded_files
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.output import check_output, write_new
 from gateway.recordings.recorded_table import ReadOptions
@@ -55,8 +50,8 @@ def diff(
     *,
     page: Annotated[Path | None, output_file("Page to write.", (".html",), "--html")] = None,
     json: JsonOption = False,
-    system: SystemOption = None,
-    force: ForceOption = False,
+    system: opt.System = None,
+    force: opt.Force = False,
 ) -> None:
     """Compare recordings, parameter files or running vehicles: parameters, missions, texts."""
     sides = [_files_of(name) for name in (first, second)]
@@ -101,7 +96,7 @@ def _read_live(name: str, vehicle_id: int) -> Contents:
     """Read the parameters, version and plans of an aircraft of the running gateway."""
     answers = LogAnswers()
     first, verb = 0, "vehicle.introduction"
-    while frames := ask(verb, {"vehicle_id": vehicle_id, "first": first}):
+    while frames := ask(verb, vehicle_id=vehicle_id, first=first):
         for frame in frames:
             answers.add_frame(b64decode(frame), 0)
         first += len(frames)
@@ -111,11 +106,9 @@ def _read_live(name: str, vehicle_id: int) -> Contents:
 def _show(found: Comparison) -> None:
     for section in SECTIONS:
         (first, *heads), rows = rows_of(found, section)
-        if not rows:
-            continue
-        table = table_of(first, *(Path(head).name for head in heads), left=5)
-        for name, *cells in rows:
-            table.add_row(name if section != "texts" else "", *cells)
-        console_of().print(table)
+        if rows:
+            shown = ((name if section != "texts" else "", *cells) for name, *cells in rows)
+            columns = (first, *(Path(head).name for head in heads))
+            console_of().print(table_of(*columns, left=5, rows=shown))
     if not (found.parameters or found.plans or found.texts):
         console_of().print("no differences of parameters, missions and texts")

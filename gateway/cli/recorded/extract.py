@@ -8,26 +8,15 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import output_file, read_options, read_settings
-from gateway.cli.support.recording_options import (
-    ForceOption,
-    SystemOption,
-    print_remarks,
-    progress_of,
-    recorded_files,
-)
+from gateway.cli.support.recordings import print_remarks, progress_of, recorded_files
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.output import check_output, write_new
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, iso_time, parse_moment, time_us_of
 from gateway.recordings.vehicle_recording import VehicleRecording
-from gateway.recordings.workshop.extracts import (
-    RecordedPlan,
-    param_file,
-    qgc_params,
-    qgc_plan,
-    waypoints,
-)
+from gateway.recordings.workshop.extracts import param_file, qgc_params, qgc_plan, waypoints
 from gateway.recordings.workshop.timed_extracts import (
     MAX_RATE_HZ,
     SUBTITLE_FIELDS,
@@ -45,7 +34,8 @@ from gateway.vehicle.plan import KINDS, RALLY
 app = typer.Typer()
 
 ITEMS: Final = (".waypoints", ".plan")
-ITEM_NAMES: Final = {**KINDS, RALLY: "rally points"}
+CONTENTS: Final = ((None, "parameters"), *(KINDS | {RALLY: "rally points"}).items())
+"""Names of the kinds of plan items, and of the parameters."""
 VIDEO_TIME: Final = re.compile(r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)")
 """Start time in the file name of a video, as cameras write it."""
 
@@ -91,8 +81,8 @@ def extract(
         typer.Option("--video", help="The video: it begins at the time (UTC) in its name, or else "
                      "at that of the file."),
     ] = None,
-    system: SystemOption = None,
-    force: ForceOption = False,
+    system: opt.System = None,
+    force: opt.Force = False,
 ) -> None:  # fmt: skip
     """Extract parameters, missions, texts, subtitles and geotags from a recording.
 
@@ -143,32 +133,17 @@ def _plans(
         return
     if not is_read:
         recording.read()
-    plan, (params, *items) = recording.plan(), paths
-    found = [("parameters", params, _params(params, plan) if params else ())]
-    for (kind, name), path in zip(ITEM_NAMES.items(), items, strict=True):
-        found.append((name, path, _items(path, plan, kind) if path else ()))
-    for name, path, pieces in found:
-        if path is not None and pieces:
-            yield path, pieces
-        elif path is not None:
+    plan = recording.plan()
+    for (kind, name), path in zip(CONTENTS, paths, strict=True):
+        if path is None:
+            continue
+        if kind is None and (parameters := plan.parameters()):
+            is_qgc = path.suffix == ".params"
+            yield path, qgc_params(parameters, plan) if is_qgc else param_file(parameters)
+        elif kind is not None and (items := plan.items(kind)):
+            yield path, [qgc_plan(plan)] if path.suffix == ".plan" else waypoints(items)
+        else:
             missing.append(f"the recording has no {name} of this vehicle; {path} is not written")
-
-
-def _params(path: Path, plan: RecordedPlan) -> Iterable[str]:
-    """Return the content of a parameter file; empty if there are no parameters."""
-    parameters = plan.parameters()
-    if not parameters:
-        return ()
-    if path.suffix == ".params":
-        return qgc_params(parameters, plan)
-    return param_file(parameters)
-
-
-def _items(path: Path, plan: RecordedPlan, kind: int) -> Iterable[str]:
-    items = plan.items(kind)
-    if not items:
-        return ()
-    return [qgc_plan(plan)] if path.suffix == ".plan" else waypoints(items)
 
 
 def _read_fields(text: str) -> list[str]:

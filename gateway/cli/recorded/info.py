@@ -4,22 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import msgspec
 import typer
 from pymavlink.dialects.v20 import all as mavlink
-from rich.table import Table
 
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.control import recordings_folder
 from gateway.cli.support.options import output_file, read_options, read_settings
-from gateway.cli.support.recording_options import (
-    ColumnsOption,
-    ForceOption,
-    progress_of,
-    recorded_files,
-    refuse_unused,
-)
+from gateway.cli.support.recordings import progress_of, recorded_files, refuse_unused
 from gateway.cli.support.terminal import (
     console_of,
     duration_text,
@@ -69,7 +63,7 @@ def info(
         ),
     ] = None,
     *,
-    columns: ColumnsOption = None,
+    columns: opt.Columns = None,
     where: Annotated[
         str,
         typer.Option(
@@ -122,7 +116,10 @@ def _list_all(*, json: bool) -> None:
     figures = _figures(found) if found else {}
     if json:
         listed = [
-            {"duration_s": _length_s(flown), "vehicles": sorted(flown)}
+            {
+                "duration_s": _length_s(flown),
+                "vehicles": sorted(flown),
+            }
             | msgspec.to_builtins(recording, enc_hook=str)
             for recording in found
             for flown in [figures.get(recording.name, {})]
@@ -142,7 +139,7 @@ def recover(
         Path | None,
         output_file("Output; by default NAME.recovered.EXT.", (".tlog", ".csv")),
     ] = None,
-    force: ForceOption = False,
+    force: opt.Force = False,
 ) -> None:
     """Write the intact part of a damaged recording to a new file, and list the damage.
 
@@ -162,11 +159,8 @@ def recover(
         )
         before = file.stat().st_size
     _print_some(left_out, "more place")
-    verdict = (
-        "nothing was damaged"
-        if not left_out
-        else f"{counted(max(before - size, 0), 'byte')} left out"
-    )
+    lost = f"{counted(max(before - size, 0), 'byte')} left out"
+    verdict = lost if left_out else "nothing was damaged"
     console.print(f"{target}: {size} of {before} bytes; {verdict}")
 
 
@@ -224,7 +218,8 @@ def _show(file: Path, found: FileInfo) -> None:
         console.print(f"{session}by mavgate {head.mavgate_version or UNKNOWN}")
     for vehicle in found.vehicles:
         console.print(f"\n{_heading(vehicle, found.kind)}", *_figures_of(vehicle), sep="\n")
-        console.print(_rates(vehicle))
+        rows = ((rate.name, str(rate.count), f"{rate.rate_hz:.2f}") for rate in vehicle.rates)
+        console.print(table_of("what", "count", "per s", rows=rows))
     begin_us = found.first_us or 0
     gaps = [(gap.duration_s, (gap.time_us - begin_us) / US_PER_S) for gap in found.gaps]
     _print_some([f"gap of {long_s:.1f} s at {_clock(at_s)}" for long_s, at_s in gaps], "more gap")
@@ -271,13 +266,6 @@ def _figures_of(vehicle: VehicleInfo) -> list[str]:
     )
     text = ", ".join(part for part in parts if part)
     return [text] if text else []
-
-
-def _rates(vehicle: VehicleInfo) -> Table:
-    grid = table_of("what", "count", "per s")
-    for rate in vehicle.rates:
-        grid.add_row(rate.name, str(rate.count), f"{rate.rate_hz:.2f}")
-    return grid
 
 
 def _enum_name(enum: str, value: int) -> str:
@@ -385,6 +373,10 @@ def _show_flights(rows: list[Row]) -> None:
     )
 
 
+def _length_s(flown: dict[int, FlightFigures]) -> float | None:
+    return max((figures.duration for figures in flown.values()), default=None)
+
+
 def _show_list(recordings: list[Recording], figures: dict[str, dict[int, FlightFigures]]) -> None:
     grid = table_of(
         "recording", "length", "vehicles", "km", "highest, m above", "loss", "MB",
@@ -392,36 +384,25 @@ def _show_list(recordings: list[Recording], figures: dict[str, dict[int, FlightF
     )  # fmt: skip
     for recording in recordings:
         flown = figures.get(recording.name, {})
-        each = [flown[system_id] for system_id in sorted(flown)]
-        when, length_s = civil_time(recording.modified_s * US_PER_S), _length_s(flown)
+        # A shell pattern that matches all files of the recording.
+        first, folder = str(recording.files[0]), recording.files[0].parent
+
+        def each(text: Callable[[FlightFigures], str], flown: Any = flown) -> str:
+            return " ".join(text(flown[system_id]) for system_id in sorted(flown)) or UNKNOWN
+
+        when, length_s = (
+            civil_time(recording.modified_s * US_PER_S),
+            _length_s(flown),
+        )
         grid.add_row(
             recording.name,
             UNKNOWN if length_s is None else duration_text(length_s),
             " ".join(map(str, sorted(flown))) or UNKNOWN,
-            _each(each, lambda f: figure(f.distance and f.distance / 1000, ".2f")),
-            _each(each, _height_text),
-            _each(each, lambda f: figure(f.loss, ".1%")),
+            each(lambda f: figure(f.distance and f.distance / 1000, ".2f")),
+            each(lambda f: figure(f.highest, ".0f", f.height_above or "")),
+            each(lambda f: figure(f.loss, ".1%")),
             f"{recording.size / 1e6:.2f}",
             UNKNOWN if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
-            _path(recording),
+            first if len(recording.files) == 1 else f"{folder / recording.name}_*",
         )
     console_of().print(grid)
-
-
-def _length_s(flown: dict[int, FlightFigures]) -> float | None:
-    """Return the length of a recording from the figures of its vehicles; None if unknown."""
-    return max((figures.duration for figures in flown.values()), default=None)
-
-
-def _height_text(figures: FlightFigures) -> str:
-    return figure(figures.highest, ".0f", figures.height_above or "")
-
-
-def _each(figures: list[FlightFigures], text: Callable[[FlightFigures], str]) -> str:
-    return " ".join(map(text, figures)) or UNKNOWN
-
-
-def _path(recording: Recording) -> str:
-    """Return a shell pattern that matches all files of a recording."""
-    first = str(recording.files[0])
-    return first if len(recording.files) == 1 else f"{recording.files[0].parent / recording.name}_*"

@@ -12,26 +12,11 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-from gateway.cli.live.run import (
-    DuplicateIdsOption,
-    EndpointOption,
-    refuse_conflicts,
-    with_endpoints,
-)
+from gateway.cli.live.run import refuse_conflicts, with_endpoints
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.control import ask
 from gateway.cli.support.options import read_options, read_settings
-from gateway.cli.support.recording_options import (
-    BesideOption,
-    ColumnsOption,
-    Files,
-    FromOption,
-    FuseWithOption,
-    ToOption,
-    print_remarks,
-    progress_of,
-    read_range,
-    recorded_files,
-)
+from gateway.cli.support.recordings import print_remarks, progress_of, read_range, recorded_files
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
 from gateway.live.other_gateways import log_other_gateways
@@ -60,11 +45,11 @@ group = typer.Typer(help="Control the running player.", no_args_is_help=True)
 
 @app.command()
 def play(
-    files: Files,
+    files: opt.Files,
     *,
     speed: Annotated[str, typer.Option("--speed", help="0.1 to 100, or max.")] = "1",
-    begin: FromOption = None,
-    end: ToOption = None,
+    begin: opt.From = None,
+    end: opt.To = None,
     loop: Annotated[bool, typer.Option("--loop", help="Restart at the end.")] = False,
     paused: Annotated[bool, typer.Option("--paused", help="Start paused.")] = False,
     skip_gaps: Annotated[
@@ -83,9 +68,9 @@ def play(
         bool,
         typer.Option("--fuse", help="For an autopilot's log: mavgate's states, not its own."),
     ] = False,
-    both: BesideOption = False,
-    fuse_with: FuseWithOption = "recorded",
-    columns: ColumnsOption = None,
+    both: opt.Beside = False,
+    fuse_with: opt.FuseWith = "recorded",
+    columns: opt.Columns = None,
     with_commands: Annotated[
         bool,
         typer.Option(
@@ -97,8 +82,8 @@ def play(
         bool, typer.Option("--yes", "-y", help="Send commands to other machines without asking.")
     ] = False,
     attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
-    endpoint: EndpointOption = None,
-    duplicate_ids: DuplicateIdsOption = False,
+    endpoint: opt.Endpoint = None,
+    duplicate_ids: opt.DuplicateIds = False,
 ) -> None:
     """Play one or several recordings to the ground stations.
 
@@ -165,7 +150,7 @@ def seek(
     ],
 ) -> None:
     """Go to a moment."""
-    _show(ask("seek", {"to": to}, of="play"))
+    _show(ask("seek", of="play", to=to))
 
 
 def _add_verb(name: str, text: str) -> None:
@@ -184,21 +169,20 @@ _add_verb("stop", "End the playback.")
 @group.command()
 def step(count: Annotated[int, typer.Argument(min=1, help="Frames.")] = 1) -> None:
     """Pause and play the next frames."""
-    _show(ask("play.step", {"count": count}, of="play"))
+    _show(ask("play.step", of="play", count=count))
 
 
 @group.command("speed")
 def set_speed(speed: Annotated[str, typer.Argument(help="0.1 to 100, or max.")]) -> None:
     """Play faster or slower from now on."""
     value = _speed(speed)
-    wanted = None if value == AS_FAST_AS_POSSIBLE else value
-    _show(ask("play.speed", {"speed": wanted}, of="play"))
+    _show(ask("play.speed", of="play", speed=None if value == AS_FAST_AS_POSSIBLE else value))
 
 
 @group.command("loop")
 def set_loop(on: Annotated[Literal["on", "off"], typer.Argument()] = "on") -> None:
     """Set whether to restart at the end."""
-    _show(ask("play.loop", {"on": on == "on"}, of="play"))
+    _show(ask("play.loop", of="play", on=on == "on"))
 
 
 _add_verb("status", "Show the status of the player.")

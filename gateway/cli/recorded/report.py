@@ -10,17 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from rich.progress import TimeElapsedColumn
 
+from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import folder_of, read_options, read_settings
-from gateway.cli.support.recording_options import (
-    ColumnsOption,
-    FlightsArgument,
-    ForceOption,
-    FuseWithOption,
-    JobsOption,
-    ReferenceOption,
-    SchedulerOption,
-    SmoothOption,
-    SystemOption,
+from gateway.cli.support.recordings import (
     are_many,
     files_of,
     fusion_of,
@@ -63,7 +55,7 @@ UNUSED: Final = {
 
 @app.command()
 def report(
-    flights: FlightsArgument = None,
+    flights: opt.Flights = None,
     *,
     output: Annotated[
         Path,
@@ -82,11 +74,11 @@ def report(
             "the folder of an earlier report.",
         ),
     ] = None,
-    reference: ReferenceOption = None,
-    columns: ColumnsOption = None,
-    system: SystemOption = None,
-    smooth: SmoothOption = False,
-    fuse_with: FuseWithOption = "recorded",
+    reference: opt.Reference = None,
+    columns: opt.Columns = None,
+    system: opt.System = None,
+    smooth: opt.Smooth = False,
+    fuse_with: opt.FuseWith = "recorded",
     quick: Annotated[
         bool,
         typer.Option(
@@ -95,9 +87,9 @@ def report(
             "recordings.",
         ),
     ] = False,
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
-    force: ForceOption = False,
+    jobs: opt.Jobs = None,
+    scheduler: opt.Scheduler = None,
+    force: opt.Force = False,
 ) -> None:
     """Make figures and tables of flights, or one HTML file of a flight.
 

@@ -31,22 +31,10 @@ from gateway.analysis.sweep import (
     with_values,
 )
 from gateway.batch.tasks import SweepTask, without_secrets
-from gateway.cli.support.batch_work import BatchWork, HoldOutOption, IntervalOption, exit_if_failed
+from gateway.cli.support import shared_options as opt
+from gateway.cli.support.batch_work import BatchWork, exit_if_failed
 from gateway.cli.support.options import output_file, read_options, read_settings
-from gateway.cli.support.recording_options import (
-    ColumnsOption,
-    FlightsArgument,
-    ForceOption,
-    FuseWithOption,
-    JobsOption,
-    ReferenceOption,
-    SchedulerOption,
-    SystemOption,
-    are_many,
-    fusion_of,
-    load_flight,
-    refuse_unused,
-)
+from gateway.cli.support.recordings import are_many, fusion_of, load_flight, refuse_unused
 from gateway.cli.support.terminal import console_of, progress_bar, refuse, table_of
 from gateway.config import GatewaySettings, render
 from gateway.output import check_output, write_new
@@ -77,7 +65,7 @@ HEADINGS: Final = {
 
 @app.command()
 def sweep(
-    flights: FlightsArgument = None,
+    flights: opt.Flights = None,
     *,
     vary: Annotated[
         list[str] | None,
@@ -96,21 +84,30 @@ def sweep(
             "or against the reference's position or attitude."
         ),
     ] = "held",
-    hold_out: HoldOutOption = 5,
-    gps_interval: IntervalOption = 0.0,
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
+    hold_out: Annotated[
+        int, typer.Option("--hold-out", help="Withhold every n-th fix; 0 for none.", min=0)
+    ] = 5,
+    gps_interval: Annotated[
+        float,
+        typer.Option(
+            "--gps-interval",
+            help="Fuse one fix in this many seconds, and withhold all others; 0 for all.",
+            min=0.0,
+        ),
+    ] = 0.0,
+    jobs: opt.Jobs = None,
+    scheduler: opt.Scheduler = None,
     output: Annotated[Path, output_file("Settings file for the best.", (".toml",))] = Path(
         "best.toml"
     ),
     table: Annotated[
         Path | None, output_file("CSV file for every trial.", (".csv",), "--table")
     ] = None,
-    reference: ReferenceOption = None,
-    columns: ColumnsOption = None,
-    system: SystemOption = None,
-    fuse_with: FuseWithOption = "recorded",
-    force: ForceOption = False,
+    reference: opt.Reference = None,
+    columns: opt.Columns = None,
+    system: opt.System = None,
+    fuse_with: opt.FuseWith = "recorded",
+    force: opt.Force = False,
 ) -> None:
     """Try settings on one flight or many, and write the best as a settings file.
 

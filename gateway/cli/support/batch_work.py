@@ -5,30 +5,18 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
 import typer
 
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
 from gateway.batch.storage import BatchItem, is_url, items_of
 from gateway.batch.tasks import FlightResult, FlightTask, ResultFolder, run_batch
-from gateway.cli.support.recording_options import recorded_files
+from gateway.cli.support.recordings import recorded_files
 from gateway.cli.support.terminal import console_of, progress_bar, refuse
 from gateway.extras import require
 from gateway.printable import printable
 from gateway.units import counted
-
-HoldOutOption = Annotated[
-    int, typer.Option("--hold-out", help="Withhold every n-th fix; 0 for none.", min=0)
-]
-IntervalOption = Annotated[
-    float,
-    typer.Option(
-        "--gps-interval",
-        help="Fuse one fix in this many seconds, and withhold all others; 0 for all.",
-        min=0.0,
-    ),
-]
 
 SHOWN_FAILURES: Final = 12
 """Failures that are listed individually."""

@@ -9,13 +9,7 @@ from gateway.cli.support.options import CONFIG, SOCKET, folder_of, read_settings
 from gateway.live.control_socket import find_socket, live_sockets, request
 
 
-def ask(
-    verb: str,
-    params: dict[str, Any] | None = None,
-    *,
-    of: str = "run",
-    wait_s: float | None = None,
-) -> Any:
+def ask(verb: str, *, of: str = "run", wait_s: float | None = None, **params: Any) -> Any:
     """Send a request to the running gateway, player or fleet, and return the answer."""
     return request(socket_of(of), verb, params, timeout_s=wait_s)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from contextvars import ContextVar
-from enum import StrEnum
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -27,13 +26,6 @@ CONFIG: Final[ContextVar[Path | None]] = ContextVar("config", default=None)
 """Settings file given by the user."""
 SOCKET: Final[ContextVar[Path | None]] = ContextVar("socket", default=None)
 """Control socket given by the user."""
-
-
-class RadioName(StrEnum):
-    """The radios of the boards by their names on the command line."""
-
-    NRF24 = "nrf24"
-    SX1276 = "sx1276"
 
 
 @cache

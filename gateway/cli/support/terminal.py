@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
@@ -63,8 +63,8 @@ def print_json(value: object) -> None:
     print(printable_json(msgspec.json.encode(value).decode()))
 
 
-def table_of(*columns: str, left: int = 1) -> Table:
-    """Create an empty table; the first `left` columns are text, the others numbers.
+def table_of(*columns: str, left: int = 1, rows: Iterable[Iterable[str]] = ()) -> Table:
+    """Create a table; the first `left` columns are text, the others numbers.
 
     No frame and narrow padding, so that the table of clients fits in 80 columns.
     """
@@ -74,6 +74,8 @@ def table_of(*columns: str, left: int = 1) -> Table:
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number < left else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
@@ -107,8 +109,7 @@ def progress_bar(*columns: ProgressColumn, auto_refresh: bool = False) -> Progre
 
 def refuse(text: str) -> NoReturn:
     """End the command with an error."""
-    console = console_of(stderr=True)
-    console.print(text, style="red")
+    console_of(stderr=True).print(text, style="red")
     raise typer.Exit(2)
 
 

@@ -34,7 +34,7 @@ class Link:
         self.captures = 0
         self.breaks_at = 1000
 
-    def __call__(self, seconds: float, *, turned: bool = False) -> NodeSamples:
+    def __call__(self, seconds: float, turned: bool) -> NodeSamples:
         rng = np.random.default_rng(self.captures)
         side = SIDES[self.captures % 6]
         self.captures += 1
@@ -110,7 +110,7 @@ def test_dry_run_saves_nothing(config: Path) -> None:
 
 
 def test_failed_step_is_reported(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def moving(seconds: float) -> NodeSamples:
+    def moving(seconds: float, turned: bool) -> NodeSamples:
         noise, times_s = np.random.default_rng(1).normal(0, 5.0, (300, 3)), np.arange(300) / 100
         mag = np.empty(0), np.empty((0, 3))
         return NodeSamples(times_s, noise, noise, *mag, np.zeros(300, np.bool_))

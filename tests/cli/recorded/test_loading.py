@@ -6,7 +6,7 @@ import pytest
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.support.options import read_options
-from gateway.cli.support.recording_options import DESCRIPTIONS, load_flight
+from gateway.cli.support.recordings import DESCRIPTIONS, load_flight
 from gateway.config import GatewaySettings
 from gateway.estimation.kernel import FoundLatency
 from gateway.estimation.select import EstimationSettings

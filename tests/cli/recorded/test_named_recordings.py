@@ -10,7 +10,7 @@ import pytest
 from gateway.cli.live.demo import recorded_line
 from gateway.cli.recorded import play
 from gateway.cli.support.options import read_options
-from gateway.cli.support.recording_options import files_of, load_flight
+from gateway.cli.support.recordings import files_of, load_flight
 from gateway.config import load
 from gateway.player import PlayerDaemon
 from gateway.recordings.files import FlightError

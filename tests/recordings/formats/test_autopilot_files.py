@@ -12,7 +12,7 @@ import pytest
 
 from gateway.analysis.metrics import rms, rotation_error, total_error_rad
 from gateway.cli.support.options import read_options
-from gateway.cli.support.recording_options import load_flight
+from gateway.cli.support.recordings import load_flight
 from gateway.config import GatewaySettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.file_format import TLOG, format_of

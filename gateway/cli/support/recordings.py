@@ -1,4 +1,4 @@
-"""Arguments and options for recordings: given by path or name, and how to read them."""
+"""Recordings of the command line: found by path or name, and read with progress."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
-import typer
 from rich.progress import DownloadColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from gateway.cli.support.control import recordings_folder
@@ -18,7 +17,6 @@ from gateway.recordings.file_format import TABLE, TLOG, format_of
 from gateway.recordings.files import FlightError
 from gateway.recordings.index import NEWEST, RecordingError, find_recording, recording_name
 from gateway.recordings.moment import Moment, parse_moment
-from gateway.recordings.table import Position, SettingsChoice
 
 if TYPE_CHECKING:
     from gateway.analysis.flight import Flight
@@ -26,77 +24,8 @@ if TYPE_CHECKING:
     from gateway.recordings.fuse import FusionSettings
     from gateway.recordings.recorded_table import ReadOptions
 
-Files = Annotated[list[Path], typer.Argument(help="Recordings.", show_default=False)]
-SmoothOption = Annotated[
-    bool,
-    typer.Option(
-        "--smooth",
-        help="Smooth forwards and backwards (Rauch-Tung-Striebel); "
-        "an hour of flight takes 120 MB of memory.",
-    ),
-]
-BesideOption = Annotated[
-    bool,
-    typer.Option(
-        "--beside",
-        help="For an autopilot's log: its own estimates and mavgate's, as two vehicles.",
-    ),
-]
-ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite the output.")]
-FromOption = Annotated[
-    str | None, typer.Option("--from", help="Start: 80, 1:20 or 2026-06-11T14:25:30Z.")
-]
-ToOption = Annotated[str | None, typer.Option("--to", help="End, written like --from.")]
-JobsOption = Annotated[
-    int | None, typer.Option("--jobs", help="Processes; by default one per core.", min=1)
-]
-ColumnsOption = Annotated[
-    Path | None, typer.Option("--columns", help="Column map of another program's CSV (TOML).")
-]
-SensorOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--sensor",
-        help="For a ULog or DataFlash log: gps=2 for the second GPS; likewise imu, mag and baro. "
-        "By default the first with data.",
-    ),
-]
-FuseWithOption = Annotated[
-    SettingsChoice,
-    typer.Option("--fuse-with", help="Fuse tables with the recorded or the current settings."),
-]
-PositionOption = Annotated[
-    Position,
-    typer.Option("--position", help="Position as live, or on straight lines between fixes."),
-]
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--scheduler",
-        help="For many recordings, a Dask cluster: tcp://HOST:8786.",
-        show_default=False,
-    ),
-]
 Wanted = Literal["tlogs", "tables", "all"]
 """Files of a recording to use; if it has none of these, the others are used."""
-FlightsArgument = Annotated[
-    list[str] | None,
-    typer.Argument(
-        help="Recordings by name or file, folders of them, and URLs: s3://, sftp://, …; "
-        "by default the built-in simulated flight.",
-        show_default=False,
-    ),
-]
-ReferenceOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--reference",
-        help="A mavgate CSV on the flight's clock, with the states to compare with.",
-    ),
-]
-SystemOption = Annotated[
-    int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to use.")
-]
 OTHER_DESCRIPTION: Final = "Recorded by another program; its samples count as calibrated."
 DESCRIPTIONS: Final = {
     TABLE: "Recorded by mavgate.",
