@@ -4,10 +4,12 @@ import gzip
 import os
 import struct
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 from intelhex import IntelHex
 from pymavlink.dialects.v20 import all as mavlink
@@ -17,10 +19,14 @@ from gateway.flashing import boards
 from gateway.live.serial_port import Port
 from gateway.recordings.columns import TableRow
 from gateway.recordings.recorded_table import header_for
-from gateway.recordings.table import TableHeader
+from gateway.recordings.table import TableHeader, encode_head
+from gateway.records import GpsFix, ImuFlags, ImuRaw, NodeId
 from tests.analysis.test_flight import rows
+from tests.batch.flights import line_of
+from tests.cli import machines
 from tests.cli.recorded import test_diff
 from tests.cli.recorded import test_extract as extracts
+from tests.estimation.samples import fix
 from tests.flashing.test_settings_block import BLOCK, NRF24_BLOCK, image_with, with_crc
 from tests.kit.mavlink import Sender
 from tests.kit.recordings import (
@@ -31,7 +37,7 @@ from tests.kit.recordings import (
     write_table,
     write_tlog,
 )
-from tests.kit.records import state_at
+from tests.kit.records import raw_at, state_at
 from tests.recordings.flights import flown_table, read
 
 NAMES = "time_s,ax,ay,az,gx,gy,gz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m"
@@ -125,7 +131,7 @@ def zipped(folder: Path, fault: str) -> None:
     if fault == "none":
         (folder / "log.csv").write_bytes(gzip.compress(data))
     elif fault == "bomb":
-        packed(path, NAMES.encode() + b"\n", b"#\n" * (1 << 19), 34)
+        packed(path, NAMES.encode() + b"\n", (b"#" * 1023 + b"\n") * 1024, 34)
     else:
         whole = gzip.compress(data)
         path.write_bytes(whole[:-100] if fault == "cut" else whole[:-8] + bytes(8))
@@ -232,7 +238,7 @@ def dialect(folder: Path, kind: str) -> None:
     )
 
 
-def images(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def images(folder: Path, *, monkeypatch: pytest.MonkeyPatch) -> None:
     """Write images of one program, on a machine without serial ports."""
     for name, block in (("imu", NRF24_BLOCK), ("imu_sx1276", BLOCK)):
         image = IntelHex()
@@ -244,11 +250,28 @@ def images(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"gateway.cli.live.{module}.list_serial_ports", list[Port])
 
 
+def turning(folder: Path) -> None:
+    """Write a flight of vehicle 3 in smooth air: a rest, and a long turn that is as even."""
+    rng = np.random.default_rng(2)
+    records: list[ImuRaw | GpsFix] = []
+    for time_us in range(0, 80_000_000, 20_000):
+        turns = time_us >= 20_000_000
+        if time_us % 200_000 == 0:
+            records.append(fix(time_us, vel=(15.0 if turns else 0.0, 0.0, 0.0)))
+        x, y, z = map(int, (np.array([5, -8, 330 if turns else 11]) + rng.normal(0, 1, 3)).round())
+        raw = {"accel_raw": (0, 0, 4096), "gyro_raw": (x, y, z), "flags": ImuFlags(0)}
+        records.append(raw_at(time_us, node=NodeId(3, 0), **raw))
+    head = encode_head(TableHeader(vehicle_id=3))
+    (folder / "flight_01_v3.csv").write_text(head + "".join(map(line_of, records)))
+    (folder / "g.toml").write_text('aircraft_folder = "."\n[recording]\nfolder = "."\n')
+
+
 MAKE: dict[str, Callable[..., object]] = {
     made.__name__: made
     for made in (
         log, odd_log, table, flight, half_minute, recordings, zipped, endless, introduced,
-        future, compared, mission, images, dataflash, empty_dataflash, dialect,
+        future, compared, mission, images, dataflash, empty_dataflash, dialect, turning,
+        machines.link,
     )
 }  # fmt: skip
 
@@ -276,12 +299,18 @@ def change(path: Path, how: str) -> None:
         case _:
             old, new = how.split(" => ")
             assert old.encode() in data
-            data = data.replace(old.encode(), new.encode(), 1)
+            data = data.replace(old.encode(), new.replace("\\n", "\n").encode(), 1)
     path.write_bytes(data)
 
 
-def arrange(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make an arrangement.
+SERVE = {
+    serve.__name__: serve
+    for serve in (machines.gateway, machines.receiver, machines.line, machines.machine)
+}
+
+
+def arrange(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch, opened: ExitStack) -> None:
+    """Make an arrangement, which may hold until the end of the case.
 
     Arguments with ` @ FILE` at their end change it; `FILE: TEXT` writes one; the others are the
     arguments of the function.
@@ -290,9 +319,12 @@ def arrange(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own, after = list[str](), list[str]()
     for one in arguments:
         (after if " @ " in one or re_file(one) else own).append(one)
-    if name in MAKE:
-        extra = (monkeypatch,) if name == "images" else ()
-        MAKE[name](folder, *own, *extra)
+    make = MAKE.get(name) or SERVE.get(name)
+    if make is not None:
+        patched = {"monkeypatch": monkeypatch} if "monkeypatch" in make.__annotations__ else {}
+        made = make(folder, *own, **patched)
+        if name in SERVE:
+            opened.enter_context(made)
     for one in after:
         if " @ " in one:
             how, _, file = one.rpartition(" @ ")

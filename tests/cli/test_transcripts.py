@@ -1,8 +1,8 @@
 """The commands as people run them, as a table: `transcripts.txt` next to this file.
 
 `[NAME; ARGUMENT; …]` is an arrangement of `arrangements.py`, of which each case begins with a new
-one. A line is a command (`$`, or `&` after another of the same case), its exit code unless that is
-0, and its expectations, separated by bars:
+one. A line is a command (`$`, or `&` after another of the same case), its input after ` < ` (or the
+number of empty lines), its exit code unless that is 0, and its expectations, separated by bars:
 
     TEXT                is in the output, with one space for all white space; ! TEXT is not
     + FILE: TEXT        is made (or changed: ~) in the case and contains a text; - FILE is removed
@@ -14,20 +14,22 @@ All other files are neither made nor changed. `{a|b}` stands for a case of each.
 import re
 import shlex
 import time
+from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import ExitStack
 from itertools import takewhile
 from pathlib import Path
 
 import pytest
 
 from tests.cli.arrangements import arrange
-from tests.kit.cli import run
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
 TABLE = Path(__file__).with_name("transcripts.txt")
 CHOICE = re.compile(r"\{([^{}]*\|[^{}]*)\}")
-STEP = re.compile(r"[$&] (.*?)(?: \[(\d)\])?")
+STEP = re.compile(r"[$&] (.*?)(?: < (\S+))?(?: \[(\d)\])?")
 CPU_S = 20.0
 """Bound on the processor time of a case: input without an end is refused in a moment."""
 NEVER = ("Traceback", "Input should", "Value error", "parse string")
@@ -67,15 +69,26 @@ def test_transcript(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.chdir(folder)
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    head, *steps = case.split("\n")
-    arrange(head, folder, monkeypatch)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    head, *steps = case.replace("HERE", str(folder)).split("\n")
+    with ExitStack() as opened:
+        arrange(head, folder, monkeypatch, opened)
+        check(steps, folder)
+
+
+def check(steps: list[str], folder: Path) -> None:
+    """Run the commands of a case, and compare output and files."""
     before, begin_s = contents(folder), time.process_time()
-    made, changed, removed = dict[str, str](), dict[str, str](), set[str]()
+    made, changed = defaultdict[str, list[str]](list), defaultdict[str, list[str]](list)
+    removed = set[str]()
     for step in steps:
         command, *expected = step.split(" | ")
         found = STEP.fullmatch(command)
         assert found is not None, command
-        output = run(*shlex.split(found[1]), code=int(found[2] or 0))
+        lines = found[2] or ""
+        answers = "\n" * int(lines) if lines.isdigit() else lines.replace("\\n", "\n")
+        done = invoke(*shlex.split(found[1]), answers=answers, code=int(found[3] or 0))
+        output = " ".join(done.output.split())
         assert not [word for word in NEVER if word in output], output
         for each in expected:
             mark, _, text = each.partition(" ")
@@ -84,9 +97,9 @@ def test_transcript(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
                 case "!":
                     assert text not in output, output
                 case "+":
-                    made[file] = part
+                    made[file].append(part)
                 case "~":
-                    changed[file] = part
+                    changed[file].append(part)
                 case "-":
                     removed.add(text)
                 case "==":
@@ -98,5 +111,5 @@ def test_transcript(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     after = contents(folder)
     assert (after.keys() - before, before.keys() - after) == (made.keys(), removed)
     assert {name for name in after.keys() & before if after[name] != before[name]} == {*changed}
-    for name, part in (made | changed).items():
+    for name, part in ((name, part) for name, parts in (made | changed).items() for part in parts):
         assert part.replace("\\n", "\n").encode() in after[name], name

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from gateway.cli.app import COMMANDS, load_command
+from gateway.cli.live.doctor import EXTRA_USES
 from gateway.extras import EXTRAS
 from tests.kit.process import python
 
@@ -60,9 +61,13 @@ def test_no_command_ends_in_a_traceback(found: dict[str, Any]) -> None:
     assert len(found) > len(COMMANDS)
 
 
-@pytest.mark.parametrize(("words", "extra"), [pair for pair in NEEDS.items() if pair[1]])
-def test_missing_extra_is_one_line(found: dict[str, Any], words: str, extra: str) -> None:
-    code, output, _ = found[words]
-    assert code == 2
-    assert f" needs the extra {extra}; to install it: " in output
-    assert len(output.splitlines()) == 1
+def test_missing_extra_is_one_line(found: dict[str, Any]) -> None:
+    for words, extra in NEEDS.items():
+        code, output, _ = found[words]
+        assert code == 2, words
+        assert f" needs the extra {extra}; to install it: " in output, words
+        assert len(output.splitlines()) == 1, words
+
+
+def test_use_of_every_extra_is_named() -> None:
+    assert set(EXTRA_USES) == set(EXTRAS)

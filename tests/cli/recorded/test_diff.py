@@ -1,17 +1,12 @@
 """`mavgate diff`: recordings and parameter files."""
 
-import asyncio
 import json
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.aircraft import Aircraft, AircraftSettings
-from gateway.live.control_socket import ControlServer, socket_path
-from gateway.live.control_verbs import introduction_verb
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender
 from tests.kit.recordings import records_of, write_tlog
@@ -76,25 +71,3 @@ def test_page_escapes_texts(flights: tuple[Path, Path], tmp_path: Path) -> None:
     run("diff", flights[0], other, "--html", tmp_path / "diff.html")
     text = (tmp_path / "diff.html").read_text()
     assert ("&lt;script&gt;" in text, "<script>" in text) == (True, False)
-
-
-async def test_running_aircraft_is_compared_with_its_parameters_and_their_meaning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    vehicle = Aircraft(1, AircraftSettings()).vehicle
-    frames = [sent.frame for sent in vehicle.introduction()]
-    server = ControlServer(socket_path("run"), introduction_verb({1: frames}.__getitem__))
-    await server.start()
-    other = tmp_path / "other.param"
-    other.write_text("A,1\n")
-    try:
-        text = await asyncio.to_thread(run, "diff", "live:1", other, "--json")
-        refused = await asyncio.to_thread(partial(run, "diff", "live:2", other, code=2))
-    finally:
-        server.close()
-    found = json.loads(text)
-    assert found["names"] == ["live:1", str(other)]
-    assert found["parameters"].keys() - {"A"} == vehicle.metadata.of_parameters().keys()
-    assert all(meaning for _, meaning in found["known"].values())
-    assert "has no aircraft 2" in refused
