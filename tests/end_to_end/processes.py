@@ -20,9 +20,21 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from mavsdk.plugins.telemetry.telemetry import Position
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.kit.process import START_LIMIT_S, Process
 from tests.ports import free_ports
 
+HOME = SimulatorSettings()
+NEAR_DEG = 0.004
+"""The whole simulated flight; how much of it has been flown by then depends on the machine."""
+STEEPEST_DEG = 50.0
+"""Of the simulated flight."""
+EXPECTED = {
+    "HEARTBEAT", "SYS_STATUS", "SYSTEM_TIME", "ATTITUDE_QUATERNION", "ATTITUDE",
+    "GLOBAL_POSITION_INT", "VFR_HUD", "GPS_RAW_INT", "HIGHRES_IMU", "SCALED_PRESSURE",
+    "HOME_POSITION", "STATUSTEXT",
+}  # fmt: skip
+"""Messages of the simulated flight."""
 SO_RCVBUFFORCE = 33
 """Of Linux, for root alone: beyond the limit that others have."""
 RECEIVE_BYTES = 16 << 20

@@ -25,13 +25,20 @@ from mavsdk.exceptions import MavsdkError
 from mavsdk.plugins.param import ParamError, ParamResult
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import Gateway, MavProxy, mavsdk_system
+from tests.end_to_end.processes import (
+    EXPECTED,
+    HOME,
+    NEAR_DEG,
+    STEEPEST_DEG,
+    Client,
+    Gateway,
+    MavProxy,
+    first_position,
+    mavsdk_system,
+)
 from tests.end_to_end.station import Station
 from tests.kit.ground_station import qgroundcontrol
 from tests.kit.process import START_LIMIT_S
-
-HOME = SimulatorSettings()
 
 CONFIG = """
 [hub]
@@ -76,7 +83,8 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     """Start one gateway for all tests: each start takes seconds, and no test changes it."""
     running = Gateway(tmp_path_factory.mktemp("gateway"), "demo", config=CONFIG)
     yield running
-    running.end()
+    assert running.end() == 0
+    assert "Traceback" not in running.log.read_text()
 
 
 @pytest.fixture
@@ -101,15 +109,30 @@ def stations(gateway: Gateway) -> Iterator[Callable[..., Station]]:
         station.close()
 
 
+def test_every_message_arrives(gateway: Gateway, connect: Callable[..., Client]) -> None:
+    seen = connect(gateway.port).until(lambda seen: set(seen) >= EXPECTED)
+    heartbeat, position = seen["HEARTBEAT"], seen["GLOBAL_POSITION_INT"]
+    assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
+    assert heartbeat.autopilot == mavlink.MAV_AUTOPILOT_GENERIC
+    assert position.lat / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+    assert position.lon / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+
+
 def test_qgroundcontrol_start_up_is_answered(stations: Callable[..., Station]) -> None:
     for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
         for version in (1, 2):
             qgroundcontrol(stations(kind, version))
 
 
-async def test_mavsdk_reads_health_home_and_attitude(gateway: Gateway) -> None:
+async def test_mavsdk_reads_health_home_position_and_attitude(gateway: Gateway) -> None:
     async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
+        position = await first_position(telemetry)
+        assert position.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+        assert position.longitude_deg == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+        assert position.absolute_altitude_m == pytest.approx(HOME.home_alt_m, abs=100.0)
+        attitude = await anext(telemetry.subscribe_attitude_euler())
+        assert abs(attitude.roll_deg) < STEEPEST_DEG
         async for health in telemetry.subscribe_health():
             if (
                 health.is_armable
@@ -127,7 +150,7 @@ async def test_mavsdk_reads_health_home_and_attitude(gateway: Gateway) -> None:
         assert norm == pytest.approx(1.0, abs=1e-5)
         metrics = await anext(telemetry.subscribe_fixedwing_metrics())
         assert metrics.airspeed_m_s == metrics.groundspeed_m_s, "nothing measures the airspeed"
-        assert math.isfinite(metrics.climb_rate_m_s)
+        assert abs(metrics.climb_rate_m_s) < 8.0
 
 
 async def test_mavsdk_sets_stream_rates_above_those_of_the_settings(gateway: Gateway) -> None:
@@ -329,6 +352,13 @@ def test_mavproxy_loads_parameters_and_uploads_a_mission(gateway: Gateway, tmp_p
         mavproxy.until(r"wp_dist : \d+", asking="status NAV_CONTROLLER_OUTPUT")
         mavproxy.until(r"airspeed : \d\S*, groundspeed : \d", asking="status VFR_HUD")
         mavproxy.until(r"link 1 OK", asking="link")
+        pattern = r"GLOBAL_POSITION_INT \{.*?lat : (-?\d+), lon : (-?\d+),"
+        position = mavproxy.until(pattern, asking="status GLOBAL_POSITION_INT")
+        assert int(position[1]) / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+        assert int(position[2]) / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+        pattern = r"ATTITUDE \{.*?roll : (\S+), pitch : (\S+),"
+        attitude = mavproxy.until(pattern, asking="status ATTITUDE")
+        assert max(abs(float(angle)) for angle in attitude.groups()) < math.radians(STEEPEST_DEG)
         assert "breach" not in mavproxy.output
     finally:
         mavproxy.process.kill()

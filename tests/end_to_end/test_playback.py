@@ -10,10 +10,8 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.live.control_socket import request
-from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.recorded_frames import RecordedFrame
-from tests.end_to_end.processes import Client, Gateway, MavProxy, mavsdk_system
-from tests.end_to_end.test_demo import NEAR_DEG
+from tests.end_to_end.processes import HOME, NEAR_DEG, Client, Gateway, MavProxy, mavsdk_system
 from tests.kit.mavlink import Sender
 from tests.kit.process import START_LIMIT_S, Process
 from tests.kit.recordings import START_US, make_tlog
@@ -185,8 +183,7 @@ def test_mavproxy_recording_is_seen_by_mavproxy_and_mavsdk(
     gateway.end()
     recorded = (tmp_path / "mav.tlog").rename(tmp_path / "recorded.tlog")
     playing = play(str(recorded), "--loop")
-    home = SimulatorSettings()
     latitude, _ = asyncio.run(position_by_mavsdk(playing.port))
-    assert latitude == pytest.approx(home.home_lat_deg, abs=NEAR_DEG)
+    assert latitude == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
     proxy = start_mavproxy(playing.port)
-    assert latitude_by_mavproxy(proxy, 1) == pytest.approx(home.home_lat_deg, abs=NEAR_DEG)
+    assert latitude_by_mavproxy(proxy, 1) == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)

@@ -23,8 +23,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from websockets.sync.client import connect as follow
 
 from gateway.wire.mavlink_json import template
-from tests.end_to_end.processes import Client, Gateway
-from tests.end_to_end.test_demo import EXPECTED, HOME, NEAR_DEG, STEEPEST_DEG
+from tests.end_to_end.processes import EXPECTED, HOME, NEAR_DEG, STEEPEST_DEG, Client, Gateway
 from tests.kit.process import START_LIMIT_S, Process
 from tests.ports import free_port
 from tests.wire.test_mavlink_json import as_pymavlink_reads

@@ -107,12 +107,11 @@ class Recording:
         self._bench.recorder.close()
 
 
-@pytest.fixture(params=["eskf", "paper", "lines", "phone", "crsf"])
-async def recorded(
-    request: pytest.FixtureRequest, tmp_path: Path, clock: ManualClock
-) -> tuple[Path, list[bytes], list[NavState], Flight]:
-    flight = Flight(request.param, clock)
-    recording = Recording(tmp_path / "first", clock, flight.header, flight.fusion_state)
+async def record(
+    flight: Flight, folder: Path, clock: ManualClock
+) -> tuple[list[bytes], list[NavState]]:
+    """Record a flight; return its frames and states."""
+    recording = Recording(folder, clock, flight.header, flight.fusion_state)
     frames: list[bytes] = []
     states: list[NavState] = []
     async with recording as recorder:
@@ -128,13 +127,15 @@ async def recorded(
                 if isinstance(record, FusedSample):
                     states.append(record.state)
             await recording.turn()
-    return tmp_path / "first", frames, states, flight
+    return frames, states
 
 
-async def test_recorded_replayed_and_recorded_again_is_equal_message_for_message(
-    recorded: tuple[Path, list[bytes], list[NavState], Flight], tmp_path: Path, clock: ManualClock
+@pytest.mark.parametrize("name", ["eskf", "paper", "lines", "phone", "crsf"])
+async def test_flight_recorded_replayed_recorded_again_and_fused_again_is_equal(
+    name: str, tmp_path: Path, clock: ManualClock
 ) -> None:
-    folder, frames, _, flight = recorded
+    flight, folder = Flight(name, clock), tmp_path / "first"
+    frames, states = await record(flight, folder, clock)
     assert len(frames) > (80 if flight.kind else 100) * FLIGHT_S
     assert frames_of(folder) == frames
     sources = [TlogFile(path) for path in sorted(folder.glob("*.tlog"))]
@@ -149,12 +150,11 @@ async def test_recorded_replayed_and_recorded_again_is_equal_message_for_message
     for source in sources:
         source.close()
     assert frames_of(tmp_path / "second") == frames
+    check_tables(folder, states, flight)
 
 
-async def test_table_alone_gives_recorded_states_bit_for_bit(
-    recorded: tuple[Path, list[bytes], list[NavState], Flight],
-) -> None:
-    folder, _, states, flight = recorded
+def check_tables(folder: Path, states: list[NavState], flight: Flight) -> None:
+    """Check that the tables alone give the recorded states bit for bit."""
     paths = sorted(folder.glob("*.csv"))
     # Of CRSF only the fixes are fused; its states are in the tlog.
     assert flight.kind == "crsf" or len(paths) > 1, "the parts of a recording must fuse as one"
@@ -173,8 +173,7 @@ async def test_table_alone_gives_recorded_states_bit_for_bit(
     assert repr(again) == repr(rows)
     # A later part alone begins in flight, and goes on from what the fusion remembered there.
     out = folder / "again.csv"
-    done = invoke("fuse", paths[-1], "-o", out)
-    assert done.exit_code == 0, done.output
+    invoke("fuse", paths[-1], "-o", out, code=0)
     assert out.read_bytes() == paths[-1].read_bytes()
 
 
@@ -206,6 +205,5 @@ async def test_table_that_begins_before_arming_is_fused_again_bit_for_bit(
     assert times_us[-1] > 19_000_000
     assert reader.header is not None
     assert not reader.header.cold_start
-    done = invoke("fuse", path, "-o", path.with_name("again.csv"))
-    assert done.exit_code == 0, done.output
+    invoke("fuse", path, "-o", path.with_name("again.csv"), code=0)
     assert path.with_name("again.csv").read_bytes() == path.read_bytes()

@@ -12,9 +12,10 @@ import pytest
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from mavsdk.plugins.telemetry.telemetry import FlightMode
 
-from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import (
     CONFIG,
+    HOME,
+    NEAR_DEG,
     Client,
     Gateway,
     MavProxy,
@@ -24,8 +25,6 @@ from tests.end_to_end.processes import (
 from tests.kit.cli import invoke
 from tests.ports import free_port
 
-HOME = SimulatorSettings()
-NEAR_DEG = 0.004
 STEEPEST_DEG = 60.0
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
