@@ -20,7 +20,7 @@ from gateway.live.serial_port import Port
 from gateway.recordings.columns import TableRow
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import TableHeader, encode_head
-from gateway.records import GpsFix, ImuFlags, ImuRaw, NodeId
+from gateway.records import GpsFix, ImuCalibrated, ImuFlags, ImuRaw, NodeId
 from tests.analysis.test_flight import rows
 from tests.batch.flights import line_of
 from tests.cli import machines
@@ -100,6 +100,13 @@ def half_minute(folder: Path, speed: str = "") -> None:
         slow = {"vel_n_mps": (0.2, 0.1, 0.0)}
         made = [replace(r, gps=r.gps and msgspec.structs.replace(r.gps, **slow)) for r in made]
     write_table(folder / "flight.csv", TableHeader(), made)
+
+
+def short(folder: Path) -> None:
+    """Write a table of one sample."""
+    rest = ((0.0, 0.0, -9.81), (0.0, 0.0, 0.0), None, 20.0, ImuFlags(0))
+    row = TableRow(10_000, imu=ImuCalibrated(10_000, NodeId(1, 0), *rest))
+    write_table(folder / "flight.csv", header_for(AircraftSettings(), 1), [row])
 
 
 def recordings(folder: Path) -> None:
@@ -269,7 +276,7 @@ def turning(folder: Path) -> None:
 MAKE: dict[str, Callable[..., object]] = {
     made.__name__: made
     for made in (
-        log, odd_log, table, flight, half_minute, recordings, zipped, endless, introduced,
+        log, odd_log, table, flight, short, half_minute, recordings, zipped, endless, introduced,
         future, compared, mission, images, dataflash, empty_dataflash, dialect, turning,
         machines.link,
     )
