@@ -276,17 +276,8 @@ def _begin_logging(*, verbose: bool) -> None:
 class _CurrentStderr:
     """The present `sys.stderr`: a progress bar replaces it, so that log lines appear above it."""
 
-    def write(self, text: str) -> int:
-        return sys.stderr.write(text)
-
-    def flush(self) -> None:
-        sys.stderr.flush()
-
-    def isatty(self) -> bool:
-        return sys.stderr.isatty()
-
-    def fileno(self) -> int:
-        return sys.stderr.fileno()
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys.stderr, name)
 
 
 def _prepare_streams() -> None:

@@ -9,17 +9,15 @@ import ssl
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
-from enum import StrEnum
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, NamedTuple
 
 import typer
 
-from gateway.cli.support.options import CONFIG, USER_CONFIG, folder_of, read_settings, settings_file
+from gateway.cli.support.options import CONFIG, folder_of, read_settings, settings_file
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.compiled.entry_point import LibraryError, load_entry_points
 from gateway.config import (
@@ -61,27 +59,16 @@ SOON_S: Final = 14 * 86_400
 """Remaining time at which a certificate should have been renewed."""
 
 
-class Grade(StrEnum):
-    """Result of a check."""
+class Diagnosis(NamedTuple):
+    """One check and its result, with its remedy."""
 
-    OK = "OK"
-    INFO = "INFO"
-    FAIL = "FAIL"
-
-
-@dataclass(frozen=True, slots=True)
-class Diagnosis:
-    """One check and its result."""
-
-    grade: Grade
+    grade: str
     what: str
     text: str
-    """The result, and its remedy."""
 
 
-ok: Final = partial(Diagnosis, Grade.OK)
-info: Final = partial(Diagnosis, Grade.INFO)
-fail: Final = partial(Diagnosis, Grade.FAIL)
+STYLES: Final = {"OK": "green", "INFO": "yellow", "FAIL": "red"}
+ok, info, fail = (partial(Diagnosis, grade) for grade in STYLES)
 
 Check = Callable[[GatewaySettings], Iterator[Diagnosis]]
 
@@ -281,9 +268,9 @@ def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
         except OSError as error:
             yield fail(what, f"{file}: {reason_of(error)}")
         else:
-            grade = Grade.OK if end_s - time.time() > SOON_S else Grade.INFO
+            made = ok if end_s - time.time() > SOON_S else info
             until = datetime.fromtimestamp(end_s, UTC)
-            yield Diagnosis(grade, what, f"{file}, valid until {until:%Y-%m-%d}")
+            yield made(what, f"{file}, valid until {until:%Y-%m-%d}")
 
 
 def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
@@ -295,7 +282,7 @@ def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
 
 def _write_template(text: str) -> None:
     """Write the settings file, which is never overwritten."""
-    file = CONFIG.get() or USER_CONFIG.expanduser()
+    file = settings_file()
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
         write_new(file, [text.encode()], rights=PRIVATE)
@@ -315,9 +302,6 @@ CHECKS: Final[tuple[Check, ...]] = (
     check_certificates,
     check_extras,
 )
-
-
-STYLES: Final = {Grade.OK: "green", Grade.INFO: "yellow", Grade.FAIL: "red"}
 
 
 @app.command()
@@ -351,7 +335,7 @@ def doctor(
     console = console_of()
     failed = False
     for finding in _findings(file):
-        failed |= finding.grade is Grade.FAIL
+        failed |= finding.grade == "FAIL"
         console.print(f"{finding.grade:4}  ", style=STYLES[finding.grade], end="")
         console.print(f"{finding.what}: {finding.text}")
     if failed:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NoReturn
 
@@ -57,16 +56,6 @@ console = console_of()
 app = typer.Typer()
 
 
-@dataclass
-class Observed:
-    """The records received within a time."""
-
-    statuses: dict[tuple[int, int], NodeStatus] = field(default_factory=dict)
-    """The newest report of each node, by vehicle and node id."""
-    fixes: dict[int, GpsFix] = field(default_factory=dict)
-    """The newest fix of each vehicle."""
-
-
 @app.command()
 def setup(
     what: Annotated[
@@ -110,11 +99,17 @@ def _guide(
     """Run the steps of the first start; with a simulated aircraft nothing is saved."""
     logging.getLogger(SerialPort.__module__).setLevel(logging.WARNING)
     serial = _find(serial)
-    seen = Observed()
-    report = _observe(serial, seen, lambda: False, LOOK_S)
+    statuses: dict[tuple[int, int], NodeStatus] = {}
+
+    def keep(records: list[RawRecord]) -> bool:
+        found = (record for record in records if isinstance(record, NodeStatus))
+        statuses.update({(one.node.vehicle_id, one.node.node_id): one for one in found})
+        return False
+
+    report = _observe(serial, keep, LOOK_S)
     _check_receiver(report, serial)
     number = _choose(report, vehicle)
-    _check_nodes(report, seen.statuses, number)
+    _check_nodes(report, statuses, number)
     _check_gps(serial, number)
     done = _calibrate(settings, serial, number, bench)
     _head("Done" if done == len(STEPS) else f"Calibrated: {done} of {len(STEPS)} steps")
@@ -225,9 +220,16 @@ def _sensors(bits: int) -> str:
 
 def _check_gps(serial: SerialSettings, vehicle: int) -> None:
     _head("3 of 5: GPS")
-    seen = Observed()
-    _observe(serial, seen, lambda: vehicle in seen.fixes and seen.fixes[vehicle].fix_ok, GPS_WAIT_S)
-    fix = seen.fixes.get(vehicle)
+    fix: GpsFix | None = None
+
+    def has_fix(records: list[RawRecord]) -> bool:
+        nonlocal fix
+        for record in records:
+            if isinstance(record, GpsFix) and record.node.vehicle_id == vehicle:
+                fix = record
+        return fix is not None and fix.fix_ok
+
+    _observe(serial, has_fix, GPS_WAIT_S)
     if fix is None:
         _hint("no GPS node is received: position will be missing; see step 2")
     elif not fix.fix_ok:
@@ -269,18 +271,9 @@ def _calibrate(
 
 
 def _observe(
-    serial: SerialSettings, seen: Observed, is_done: Callable[[], bool], limit_s: float
+    serial: SerialSettings, feed: Callable[[list[RawRecord]], bool], limit_s: float
 ) -> LinkReport:
-    """Read the receiver until something holds, at most for a time; shows progress."""
-
-    def feed(records: list[RawRecord]) -> bool:
-        for record in records:
-            if isinstance(record, NodeStatus):
-                seen.statuses[record.node.vehicle_id, record.node.node_id] = record
-            elif isinstance(record, GpsFix):
-                seen.fixes[record.node.vehicle_id] = record
-        return is_done()
-
+    """Read the receiver until `feed` has enough, at most for a time; shows progress."""
     bar = Progress(
         TextColumn("listening"), BarColumn(), TimeElapsedColumn(),
         console=console, transient=True, disable=not console.is_terminal,

@@ -41,10 +41,8 @@ def get_map(
     from gateway.panel.flight_page import read_flight
 
     settings = read_settings()
-    positions: list[tuple[float, float]] = []
-    if (pair := _coordinates(around)) is not None:
-        positions = [pair]
-    else:
+    positions = [] if (pair := _coordinates(around)) is None else [pair]
+    if not positions:
         files = files_of([Path(around)], folder_of(settings), "tlogs")
         around = name_of(Path(around), files)
         flight = read_flight(files, read_options(settings), around)
@@ -58,10 +56,7 @@ def get_map(
         with Progress(console=console_of(stderr=True), transient=True) as progress:
             task = progress.add_task("fetching tiles", total=None)
             count = map_area.extract_area(
-                map_area.open_source(source),
-                target,
-                box,
-                zoom,
+                *(map_area.open_source(source), target, box, zoom),
                 lambda done, total: progress.update(task, completed=done, total=total),
             )
     except FileExistsError:

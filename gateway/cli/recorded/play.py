@@ -1,9 +1,10 @@
 """`mavgate play`, and commands for a running player."""
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Any, Final, Literal
 
 import typer
@@ -18,13 +19,12 @@ from gateway.cli.support.control import ask
 from gateway.cli.support.options import read_options, read_settings
 from gateway.cli.support.recordings import print_remarks, progress_of, read_range, recorded_files
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
-from gateway.config import GatewaySettings
 from gateway.live.other_gateways import log_other_gateways
 from gateway.live.player_edge import PlayerStatus
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals, on_parent_gone
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond, prepare
 from gateway.recordings.files import FlightError
-from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
+from gateway.recordings.opening import lay_out, open_flights
 from gateway.recordings.play import (
     AS_FAST_AS_POSSIBLE,
     GREATEST_SPEED,
@@ -41,6 +41,7 @@ FASTEST: Final = "max"
 KEYS: Final = "space pause  ← → 10 s  ↓ ↑ 1 min  + − speed  . step  home begin  l loop  q quit"
 LEAPS_S: Final = {"left": -10.0, "right": 10.0, "down": -60.0, "up": 60.0}
 group = typer.Typer(help="Control the running player.", no_args_is_help=True)
+app.add_typer(group, name="player")
 
 
 @app.command()
@@ -94,8 +95,12 @@ def play(
     flight. `mavgate player` controls the running player.
     """
     gateway = with_endpoints(read_settings(), endpoint)
-    if with_commands and not yes:
-        _ask_for_commands(gateway)
+    if with_commands and not yes and (away := endpoints_beyond(gateway.hub)):
+        typer.confirm(
+            "Recorded commands (arming, steering, parameters, missions) would go to "
+            f"{', '.join(away)}, and a vehicle there may obey them. Send them?",
+            abort=True,
+        )
     with ExitStack() as opened:
         plan = PlayPlan(
             *read_range(begin, end), _speed(speed), skip_gaps, loop, paused,
@@ -115,32 +120,10 @@ def play(
             log_other_gateways()
         print_remarks(remark for flight in recorded for remark in flight.remarks)
         names = [file.name for file in files]
-        print_plan(names, flights, gateway.hub.endpoints)
+        whom = ", ".join(gateway.hub.endpoints) or "no client: no endpoint is set"
+        vehicles = f"vehicle{'s' * (len(played) != 1)} {', '.join(map(str, played))}"
+        console_of().print(f"playing {', '.join(names)} as {vehicles} to {whom}")
         asyncio.run(_serve(lambda: PlayerDaemon(gateway, flights, plan, names), attached=attached))
-
-
-def print_plan(
-    names: Sequence[str], flights: Sequence[PlayedFlight], endpoints: Sequence[str]
-) -> None:
-    """Print the vehicles that are sent, and the endpoints."""
-    systems = [system_id for flight in flights for system_id in flight.system_ids.values()]
-    listed = ", ".join(map(str, systems))
-    whom = ", ".join(endpoints) or "no client: no endpoint is set"
-    vehicles = f"vehicle{'s' * (len(systems) != 1)} {listed}"
-    console_of().print(f"playing {', '.join(names)} as {vehicles} to {whom}", markup=False)
-
-
-def _ask_for_commands(settings: GatewaySettings) -> None:
-    """Ask before recorded commands leave this machine; end the command unless confirmed."""
-    if away := endpoints_beyond(settings.hub):
-        typer.confirm(
-            "Recorded commands (arming, steering, parameters, missions) would go to "
-            f"{', '.join(away)}, and a vehicle there may obey them. Send them?",
-            abort=True,
-        )
-
-
-app.add_typer(group, name="player")
 
 
 @group.command(context_settings=NEGATIVE_NUMBERS)
@@ -153,17 +136,12 @@ def seek(
     _show(ask("seek", of="play", to=to))
 
 
-def _add_verb(name: str, text: str) -> None:
-    """Add a command without arguments."""
-
-    @group.command(name, help=text)
-    def command() -> None:
-        _show(ask(f"play.{name}", of="play"))
+def _ask(name: str) -> None:
+    _show(ask(f"play.{name}", of="play"))
 
 
-_add_verb("pause", "Pause.")
-_add_verb("resume", "Resume.")
-_add_verb("stop", "End the playback.")
+for verb, text in (("pause", "Pause."), ("resume", "Resume."), ("stop", "End the playback.")):
+    group.command(verb, help=text)(partial(_ask, verb))
 
 
 @group.command()
@@ -185,7 +163,7 @@ def set_loop(on: Annotated[Literal["on", "off"], typer.Argument()] = "on") -> No
     _show(ask("play.loop", of="play", on=on == "on"))
 
 
-_add_verb("status", "Show the status of the player.")
+group.command("status", help="Show the status of the player.")(partial(_ask, "status"))
 
 
 async def _serve(daemon_of: Callable[[], PlayerDaemon], *, attached: bool) -> None:

@@ -18,6 +18,7 @@ ANY_ADDRESS: Final = "0.0.0.0"
 ELSEWHERE: Final = ("192.0.2.1", 9)
 """An address that no machine has; connecting a UDP socket to it sends nothing."""
 KIND: Final = "phone:push"
+Sources = tuple[SourceSettings, ...]
 TOKEN_BYTES: Final = 24
 NEXT: Final = (
     "In Sensor Logger (Android, iOS): settings, HTTP Push, paste this URL, shortest batch period.",
@@ -64,9 +65,7 @@ def guide_phone(settings: GatewaySettings, file: Path, head: Callable[[str], Non
     console.print(url, *NEXT, "Then start `mavgate run`; restart one that runs.", sep="\n")
 
 
-def _with_phone(
-    sources: tuple[SourceSettings, ...],
-) -> tuple[str, tuple[SourceSettings, ...]]:
+def _with_phone(sources: Sources) -> tuple[str, Sources]:
     """Keep the token of a phone in the settings, or add one; the app has stored its URL."""
     token = secrets.token_urlsafe(TOKEN_BYTES)
     for each in sources:
@@ -83,12 +82,11 @@ def _save(file: Path, before: GatewaySettings, after: GatewaySettings) -> None:
     """Store the changed settings."""
     if before == after:
         return
-    names = ("enabled", "address", "password", "insecure")
-    panel = {
-        name: getattr(after.panel, name)
-        for name in names
-        if getattr(after.panel, name) != getattr(before.panel, name)
-    }
+    old, new = (
+        {name: getattr(one.panel, name) for name in ("enabled", "address", "password", "insecure")}
+        for one in (before, after)
+    )
+    panel = dict(new.items() - old.items())
     sources = [{"url": each.url} for each in after.sources]
     try:
         save_values(file, {"panel": panel, "sources": sources})

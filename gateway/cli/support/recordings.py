@@ -95,14 +95,27 @@ def print_remarks(remarks: Iterable[str]) -> None:
 def recorded_files(names: Iterable[Path], wanted: Wanted) -> list[Path]:
     """Replace names of recordings by their files; only for names a gateway is asked."""
     names = list(names)
-    if all(map(_is_path, names)):
-        return names
-    return files_of(names, recordings_folder(), wanted)
+    is_named = not all(map(_is_path, names))
+    return files_of(names, recordings_folder(), wanted) if is_named else names
 
 
 def files_of(names: Iterable[Path], folder: Path, wanted: Wanted) -> list[Path]:
     """Replace names of recordings by their files; paths stay unchanged."""
-    return [file for name in names for file in _files_of(name, folder, wanted)]
+    found = list[Path]()
+    for name in names:
+        if _is_path(name):
+            found.append(name)
+            continue
+        try:
+            files = find_recording(folder, str(name)).files
+        except RecordingError as error:
+            lacking = "recording" if str(name) == NEWEST else "recording of that name"
+            raise FlightError(
+                f"{name}: no such file, and no {lacking} in {folder}; `mavgate info` lists them"
+            ) from error
+        ending = {"tlogs": ".tlog", "tables": ".csv", "all": ""}[wanted]
+        found += [file for file in files if file.name.endswith(ending)] or files
+    return found
 
 
 def name_of(wanted: Path, files: Sequence[Path]) -> str:
@@ -112,22 +125,6 @@ def name_of(wanted: Path, files: Sequence[Path]) -> str:
 
 def _is_path(name: Path) -> bool:
     return name.exists() or name.name != str(name)
-
-
-def _files_of(name: Path, folder: Path, wanted: Wanted) -> list[Path]:
-    if _is_path(name):
-        return [name]
-    try:
-        files = list(find_recording(folder, str(name)).files)
-    except RecordingError as error:
-        lacking = "recording" if str(name) == NEWEST else "recording of that name"
-        raise FlightError(
-            f"{name}: no such file, and no {lacking} in {folder}; `mavgate info` lists them"
-        ) from error
-    if wanted == "all":
-        return files
-    ending = ".tlog" if wanted == "tlogs" else ".csv"
-    return [file for file in files if file.suffix == ending] or files
 
 
 def fusion_of(settings: GatewaySettings) -> FusionSettings:
