@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -121,39 +121,35 @@ async def seen(mavsdk: Mavsdk) -> dict[int, System]:
 
 
 async def test_aircraft_with_one_system_id_at_three_sites_are_kept_apart(
-    fleet: Fleet, tmp_path: Path
+    fleet: Fleet, tmp_path: Path, start_mavproxy: Callable[[int], MavProxy]
 ) -> None:
     (tmp_path / "way.txt").write_text(WAYPOINTS)
-    mavproxy = MavProxy(fleet.ports[1], tmp_path)
-    try:
-        configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
-        async with Mavsdk(configuration) as mavsdk:
-            await mavsdk.add_any_connection(f"udpin://127.0.0.1:{fleet.ports[0]}")
-            systems = await seen(mavsdk)
-            ids = await asyncio.to_thread(fleet.ids)
-            assert set(ids) == set(SITES)
-            assert {*ids.values()} == {*systems} == {1, 2, 3}
-            for system_id in systems:
-                await asyncio.to_thread(mavproxy.until, rf"Detected vehicle {system_id}:1")
-            first, second, third = (systems[ids[site]] for site in SITES)
-            async with asyncio.timeout(START_LIMIT_S):
-                params = [ParamAsync(system) for system in (first, second, third)]
-                name = "PAPER_ACC_CUTOFF"
-                before = [await answered(param.get_param_float, name) for param in params]
-                await answered(params[1].set_param_float, name, before[1] + 1.5)
-                after = [await answered(param.get_param_float, name) for param in params]
-                assert after == [before[0], before[1] + 1.5, before[2]]
-            mavproxy.type(f"vehicle {ids['field-3']}")
-            mavproxy.type("wp load way.txt")
-            found = r"Got MISSION_ACK: TYPE_MISSION: ACCEPTED"
-            await asyncio.to_thread(mavproxy.until, found)
-            async with asyncio.timeout(START_LIMIT_S):
-                missions = [MissionRawAsync(system) for system in (first, second, third)]
-                items = [await answered(mission.download_mission) for mission in missions]
-            assert [len(found) for found in items] == [0, 0, 2]
-    finally:
-        mavproxy.process.kill()
-        mavproxy.process.communicate(timeout=START_LIMIT_S)
+    mavproxy = start_mavproxy(fleet.ports[1])
+    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
+    async with Mavsdk(configuration) as mavsdk:
+        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{fleet.ports[0]}")
+        systems = await seen(mavsdk)
+        ids = await asyncio.to_thread(fleet.ids)
+        assert set(ids) == set(SITES)
+        assert {*ids.values()} == {*systems} == {1, 2, 3}
+        for system_id in systems:
+            await asyncio.to_thread(mavproxy.until, rf"Detected vehicle {system_id}:1")
+        first, second, third = (systems[ids[site]] for site in SITES)
+        async with asyncio.timeout(START_LIMIT_S):
+            params = [ParamAsync(system) for system in (first, second, third)]
+            name = "PAPER_ACC_CUTOFF"
+            before = [await answered(param.get_param_float, name) for param in params]
+            await answered(params[1].set_param_float, name, before[1] + 1.5)
+            after = [await answered(param.get_param_float, name) for param in params]
+            assert after == [before[0], before[1] + 1.5, before[2]]
+        mavproxy.type(f"vehicle {ids['field-3']}")
+        mavproxy.type("wp load way.txt")
+        found = r"Got MISSION_ACK: TYPE_MISSION: ACCEPTED"
+        await asyncio.to_thread(mavproxy.until, found)
+        async with asyncio.timeout(START_LIMIT_S):
+            missions = [MissionRawAsync(system) for system in (first, second, third)]
+            items = [await answered(mission.download_mission) for mission in missions]
+        assert [len(found) for found in items] == [0, 0, 2]
 
 
 def times_reported(client: Client) -> dict[int, float]:

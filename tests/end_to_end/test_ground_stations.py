@@ -6,6 +6,7 @@ import math
 import socket
 import time
 from collections.abc import Awaitable, Callable, Iterator
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -308,58 +309,54 @@ async def test_mavsdk_uploads_downloads_and_clears_a_mission(gateway: Gateway) -
         assert await answered(missions.download_mission) == []
 
 
-def test_mavproxy_sees_two_vehicles_with_id_1_as_1_and_2(tmp_path: Path) -> None:
+def test_mavproxy_sees_two_vehicles_with_id_1_as_1_and_2(
+    tmp_path: Path, gateway: Gateway, start_mavproxy: Callable[[int], MavProxy]
+) -> None:
     """Two gateways fly a vehicle 1 each, and a third joins them without one of its own."""
-    folders = [tmp_path / name for name in ("first", "second", "router")]
+    folders = [tmp_path / name for name in ("other", "router")]
     for folder in folders:
         folder.mkdir()
-    flying = [Gateway(folder, "demo", config=CONFIG) for folder in folders[:2]]
-    first, second = (gateway.listen_port for gateway in flying)
-    urls = f'"tcp:127.0.0.1:{first}", "tcp:127.0.0.1:{second}?as=2", "udp:127.0.0.1:{{port}}"'
-    router = Gateway(folders[2], "run", config=f"[hub]\nendpoints = [{urls}]")
-    mavproxy = MavProxy(router.port, tmp_path)
-    try:
+    with ExitStack() as ending:
+        flying = [gateway, ending.enter_context(Gateway(folders[0], "demo", config=CONFIG))]
+        first, second = (each.listen_port for each in flying)
+        urls = f'"tcp:127.0.0.1:{first}", "tcp:127.0.0.1:{second}?as=2", "udp:127.0.0.1:{{port}}"'
+        config = f"[hub]\nendpoints = [{urls}]"
+        router = ending.enter_context(Gateway(folders[1], "run", config=config))
+        mavproxy = start_mavproxy(router.port)
         mavproxy.until(r"Detected vehicle 1:1")
         mavproxy.until(r"Detected vehicle 2:1")
         mavproxy.type("vehicle 2")
         # Refused until the parameters are loaded.
-        words = ("param set PAPER_ACC_CUTOFF 12.5", "param show PAPER_ACC_CUTOFF")
-        mavproxy.until(r"PAPER_ACC_CUTOFF\s+12\.5", asking="\n".join(words))
+        words = ("param set PAPER_ACC_CUTOFF 13.5", "param show PAPER_ACC_CUTOFF")
+        mavproxy.until(r"PAPER_ACC_CUTOFF\s+13\.5", asking="\n".join(words))
         values = []
         request = mavlink.MAVLink_param_request_read_message(1, 1, b"PAPER_ACC_CUTOFF", -1)
-        for gateway in flying:
-            station = Station.connect(socket.SOCK_DGRAM, gateway.listen_port, 2)
-            values += [each.param_value for each in station.ask(request, "PARAM_VALUE")]
+        for each in flying:
+            station = Station.connect(socket.SOCK_DGRAM, each.listen_port, 2)
+            values += [found.param_value for found in station.ask(request, "PARAM_VALUE")]
             station.close()
-        assert values[0] != values[1] == 12.5
-    finally:
-        mavproxy.process.kill()
-        mavproxy.process.communicate(timeout=START_LIMIT_S)
-        for gateway in (router, *flying):
-            gateway.end()
+        assert values[0] != values[1] == 13.5
 
 
-def test_mavproxy_loads_parameters_and_uploads_a_mission(gateway: Gateway, tmp_path: Path) -> None:
+def test_mavproxy_loads_parameters_and_uploads_a_mission(
+    gateway: Gateway, start_mavproxy: Callable[[int], MavProxy], tmp_path: Path
+) -> None:
     """Load the parameters, set one, upload waypoints and see the way to them."""
     (tmp_path / "way.txt").write_text(WAYPOINTS)
-    mavproxy = MavProxy(gateway.port, tmp_path)
-    try:
-        mavproxy.until(r"Received \d+ parameters")
-        mavproxy.type("param set PAPER_ACC_CUTOFF 12.5")
-        mavproxy.until(r"PAPER_ACC_CUTOFF\s+12\.5", asking="param show PAPER_ACC_CUTOFF")
-        mavproxy.type("wp load way.txt")
-        mavproxy.until(r"Got MISSION_ACK: TYPE_MISSION: ACCEPTED")
-        mavproxy.until(r"wp_dist : \d+", asking="status NAV_CONTROLLER_OUTPUT")
-        mavproxy.until(r"airspeed : \d\S*, groundspeed : \d", asking="status VFR_HUD")
-        mavproxy.until(r"link 1 OK", asking="link")
-        pattern = r"GLOBAL_POSITION_INT \{.*?lat : (-?\d+), lon : (-?\d+),"
-        position = mavproxy.until(pattern, asking="status GLOBAL_POSITION_INT")
-        assert int(position[1]) / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
-        assert int(position[2]) / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
-        pattern = r"ATTITUDE \{.*?roll : (\S+), pitch : (\S+),"
-        attitude = mavproxy.until(pattern, asking="status ATTITUDE")
-        assert max(abs(float(angle)) for angle in attitude.groups()) < math.radians(STEEPEST_DEG)
-        assert "breach" not in mavproxy.output
-    finally:
-        mavproxy.process.kill()
-        mavproxy.process.communicate(timeout=START_LIMIT_S)
+    mavproxy = start_mavproxy(gateway.port)
+    mavproxy.until(r"Received \d+ parameters")
+    mavproxy.type("param set PAPER_ACC_CUTOFF 12.5")
+    mavproxy.until(r"PAPER_ACC_CUTOFF\s+12\.5", asking="param show PAPER_ACC_CUTOFF")
+    mavproxy.type("wp load way.txt")
+    mavproxy.until(r"Got MISSION_ACK: TYPE_MISSION: ACCEPTED")
+    mavproxy.until(r"wp_dist : \d+", asking="status NAV_CONTROLLER_OUTPUT")
+    mavproxy.until(r"airspeed : \d\S*, groundspeed : \d", asking="status VFR_HUD")
+    mavproxy.until(r"link 1 OK", asking="link")
+    pattern = r"GLOBAL_POSITION_INT \{.*?lat : (-?\d+), lon : (-?\d+),"
+    position = mavproxy.until(pattern, asking="status GLOBAL_POSITION_INT")
+    assert int(position[1]) / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+    assert int(position[2]) / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+    pattern = r"ATTITUDE \{.*?roll : (\S+), pitch : (\S+),"
+    attitude = mavproxy.until(pattern, asking="status ATTITUDE")
+    assert max(abs(float(angle)) for angle in attitude.groups()) < math.radians(STEEPEST_DEG)
+    assert "breach" not in mavproxy.output

@@ -18,8 +18,14 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn
 
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.control import ask, is_running
-from gateway.cli.support.options import CONFIG, folder_of, read_options, read_settings
+from gateway.cli.support.options import (
+    CONFIG,
+    ask,
+    folder_of,
+    is_running,
+    read_options,
+    read_settings,
+)
 from gateway.cli.support.recordings import files_of
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import GatewayClock, unix_time_us
@@ -70,6 +76,10 @@ SIDES: Final = (
 """Orientation of the board when +x, -x, +y, -y, +z, -z measures gravity."""
 
 
+Capture = Callable[[float, bool], NodeSamples]
+"""Waits for samples over some seconds, or also until the compass was turned to most sides."""
+
+
 class Step(StrEnum):
     """The kinds of calibration."""
 
@@ -89,8 +99,6 @@ ATTITUDES_DEG: Final = {
 """Roll and pitch of a step's poses, deg; in other steps the aircraft is level."""
 
 
-Capture = Callable[[float, bool], NodeSamples]
-"""Waits for samples over some seconds, or also until the compass was turned to most sides."""
 Poses = Callable[[Step], list[NodeSamples]]
 """Function that returns the samples of each pose of a step; raises CalibrationError with advice."""
 
@@ -444,7 +452,6 @@ def _ask(text: str) -> None:
 
 
 def _show(old: NodeCalibration, new: NodeCalibration) -> None:
-    """Print the changes."""
     rows = []
     for name in new.__struct_fields__:
         before, after = getattr(old, name), getattr(new, name)

@@ -9,8 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from gateway.cli.support.control import ask
-from gateway.cli.support.options import SOCKET, settings_file
+from gateway.cli.support.options import SOCKET, ask, settings_file
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
     JsonOption,
@@ -233,7 +232,6 @@ def _requests(found: Sequence[Record], now_us: int) -> Table:
 
 
 def _vehicles(rows: Sequence[Record]) -> Table:
-    """Show all vehicles, own and foreign."""
     return table_of(*VEHICLE_HEADS, left=8, rows=(vehicle_cells(VehicleRow(**row)) for row in rows))
 
 
@@ -259,7 +257,6 @@ def _name_of(record: Record, board: Record | None = None) -> str:
 
 
 def _board(board: Record | None, overruns: str) -> tuple[str, ...]:
-    """Return the cells of a node's report on its board."""
     if board is None:
         return (*(UNKNOWN,) * 4, overruns, UNKNOWN)
     counts = (str(board[key]) for key in ("bus_errors", "radio_failed", "radio_retries"))

@@ -179,7 +179,6 @@ def _choose(report: LinkReport, vehicle: int | None) -> int:
 def _check_nodes(
     report: LinkReport, statuses: dict[tuple[int, int], NodeStatus], vehicle: int
 ) -> None:
-    """Print the boards of the aircraft, and their faults."""
     rows, hints = list[tuple[str, ...]](), list[str]()
     for link in report.nodes:
         if link.node.vehicle_id != vehicle:

@@ -275,7 +275,6 @@ def _check_airtime(program: Program, settings: BoardSettings, duty: float | None
 
 
 def _print(device: str, block: SettingsBlock) -> None:
-    """Print the program and settings of a board."""
     major, minor = block.firmware_version
     name = block.program.name.lower()
     console.print(f"{device}: {name}, version {major}.{minor}, for {block.clock_mhz} MHz")

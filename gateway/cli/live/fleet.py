@@ -13,8 +13,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColu
 
 from gateway.cli.live.run import with_endpoints
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.control import ask, socket_of
-from gateway.cli.support.options import read_settings
+from gateway.cli.support.options import ask, read_settings, socket_of
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, refuse, table_of
 from gateway.extras import require
 from gateway.fleet.recording_fetch import FetchError, RecordingFetch

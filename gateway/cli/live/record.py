@@ -6,8 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from gateway.cli.support.control import ask, is_running
-from gateway.cli.support.options import folder_of, read_settings
+from gateway.cli.support.options import ask, folder_of, is_running, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, duration_text, print_json
 from gateway.live.session import SessionState
 from gateway.recordings.index import (

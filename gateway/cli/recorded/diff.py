@@ -10,8 +10,7 @@ import typer
 from gateway.aircraft import Aircraft
 from gateway.answers.log_answers import LogAnswers
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.control import ask
-from gateway.cli.support.options import output_file, read_options, read_settings
+from gateway.cli.support.options import ask, output_file, read_options, read_settings
 from gateway.cli.support.recordings import print_remarks, progress_of, recorded_files
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.output import check_output, write_new

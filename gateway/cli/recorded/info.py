@@ -11,8 +11,7 @@ import typer
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.control import recordings_folder
-from gateway.cli.support.options import output_file, read_options, read_settings
+from gateway.cli.support.options import output_file, read_options, read_settings, recordings_folder
 from gateway.cli.support.recordings import progress_of, recorded_files, refuse_unused
 from gateway.cli.support.terminal import (
     console_of,
@@ -110,7 +109,6 @@ def info(
 
 
 def _list_all(*, json: bool) -> None:
-    """List the recordings, newest last."""
     folder = recordings_folder()
     found = list_recordings(folder)
     figures = _figures(found) if found else {}
@@ -199,7 +197,6 @@ def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[byte
 
 
 def _print_some(lines: Sequence[str], more: str) -> None:
-    """Print the first lines of a list, and the number of further ones."""
     for line in lines[:SHOWN]:
         console_of().print(line)
     if len(lines) > SHOWN:
@@ -252,7 +249,6 @@ def _heading(vehicle: VehicleInfo, kind: str) -> str:
 
 
 def _figures_of(vehicle: VehicleInfo) -> list[str]:
-    """Return the facts of a flight as lines of text."""
     facts = vehicle.facts
     if facts is None:
         return []
@@ -291,7 +287,6 @@ def _when(found: FileInfo) -> str:
 
 
 def _figures(recordings: list[Recording]) -> dict[str, dict[int, FlightFigures]]:
-    """Update the catalogue of the recordings, and return figures from it."""
     from gateway.batch.catalogue import CatalogueError, figures_of, find_flights
     from gateway.batch.executors import ThisProcess
 
@@ -309,7 +304,6 @@ def _figures(recordings: list[Recording]) -> dict[str, dict[int, FlightFigures]]
 
 
 def _index(folder: Path, columns: Path | None, executor: Executor) -> IndexReport:
-    """Update the catalogue of a folder, with a progress bar."""
     from gateway.batch.catalogue import index_folder
 
     with progress_bar() as progress:
@@ -324,7 +318,6 @@ def _index(folder: Path, columns: Path | None, executor: Executor) -> IndexRepor
 def _list_flights(
     folder: Path, columns: Path | None, where: str, *, geojson: bool, json: bool
 ) -> None:
-    """Index a folder, and list the flights that satisfy a condition."""
     from gateway.batch.catalogue import CatalogueError, find_flights, geojson_of
     from gateway.batch.executors import LocalProcesses
 

@@ -4,7 +4,6 @@ import asyncio
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from functools import partial
 from typing import Annotated, Any, Final, Literal
 
 import typer
@@ -15,8 +14,7 @@ from rich.text import Text
 
 from gateway.cli.live.run import refuse_conflicts, with_endpoints
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.control import ask
-from gateway.cli.support.options import read_options, read_settings
+from gateway.cli.support.options import ask, read_options, read_settings
 from gateway.cli.support.recordings import print_remarks, progress_of, read_range, recorded_files
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.live.other_gateways import log_other_gateways
@@ -136,12 +134,15 @@ def seek(
     _show(ask("seek", of="play", to=to))
 
 
-def _ask(name: str) -> None:
-    _show(ask(f"play.{name}", of="play"))
+def _add_verb(name: str, text: str) -> None:
+    @group.command(name, help=text)
+    def command() -> None:
+        _show(ask(f"play.{name}", of="play"))
 
 
-for verb, text in (("pause", "Pause."), ("resume", "Resume."), ("stop", "End the playback.")):
-    group.command(verb, help=text)(partial(_ask, verb))
+_add_verb("pause", "Pause.")
+_add_verb("resume", "Resume.")
+_add_verb("stop", "End the playback.")
 
 
 @group.command()
@@ -163,7 +164,7 @@ def set_loop(on: Annotated[Literal["on", "off"], typer.Argument()] = "on") -> No
     _show(ask("play.loop", of="play", on=on == "on"))
 
 
-group.command("status", help="Show the status of the player.")(partial(_ask, "status"))
+_add_verb("status", "Show the status of the player.")
 
 
 async def _serve(daemon_of: Callable[[], PlayerDaemon], *, attached: bool) -> None:

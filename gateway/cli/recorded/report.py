@@ -173,7 +173,6 @@ def _report_one(
 
 
 def _drawn(make: Callable[[], Report], output: Path) -> Path:
-    """Make a report and write it, with its progress."""
     from gateway.analysis.reporting.page import count_pictures, write_report
 
     with progress_bar(TimeElapsedColumn()) as progress:

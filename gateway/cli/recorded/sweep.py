@@ -214,7 +214,6 @@ def _cell(value: object) -> str:
 
 
 def _parse_axes(options: SweepOptions) -> list[Axis]:
-    """Parse the axes to vary; raises SweepError for invalid ones."""
     wanted = list[tuple[str, str]]()
     for item in options.vary:
         name, equals, text = item.partition("=")

@@ -1,4 +1,4 @@
-"""Global options of the user: settings file, control socket; and the file to write.
+"""Global options of the user: settings file, control socket; requests; and the file to write.
 
 The settings import all stages, and with them NumPy. Commands that do not read settings must not
 wait for that, so they are imported where they are read.
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
+from gateway.live.control_socket import find_socket, live_sockets, request
 from gateway.output import check_ending
 
 if TYPE_CHECKING:
@@ -82,3 +83,25 @@ def read_options(settings: GatewaySettings, columns: Path | None = None, **how: 
         columns=None if columns is None else read_column_map(columns),
         **how,
     )
+
+
+def ask(verb: str, *, of: str = "run", wait_s: float | None = None, **params: Any) -> Any:
+    """Send a request to the running gateway, player or fleet, and return the answer."""
+    return request(socket_of(of), verb, params, timeout_s=wait_s)
+
+
+def socket_of(of: str) -> Path:
+    """Return the socket of the selected gateway; raises ControlError if there is none."""
+    return SOCKET.get() or find_socket(of)
+
+
+def is_running() -> bool:
+    """Return whether a gateway can be asked; a socket that the user gave is not tried."""
+    return SOCKET.get() is not None or bool(live_sockets("run"))
+
+
+def recordings_folder() -> Path:
+    """Return the folder of recordings of the running gateway, or of the given settings."""
+    if CONFIG.get() is None and is_running():
+        return Path(ask("record.status")["folder"])
+    return folder_of(read_settings())

@@ -79,7 +79,6 @@ def _with_phone(sources: Sources) -> tuple[str, Sources]:
 
 
 def _save(file: Path, before: GatewaySettings, after: GatewaySettings) -> None:
-    """Store the changed settings."""
     if before == after:
         return
     old, new = (

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from rich.progress import DownloadColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from gateway.cli.support.control import recordings_folder
-from gateway.cli.support.options import folder_of
+from gateway.cli.support.options import folder_of, recordings_folder
 from gateway.cli.support.terminal import console_of, progress_bar, refuse
 from gateway.recordings.file_format import TABLE, TLOG, format_of
 from gateway.recordings.files import FlightError

@@ -10,8 +10,7 @@ from intelhex import IntelHex
 
 from gateway.flashing import boards
 from gateway.flashing.boards import find_block
-from gateway.live.serial_port import Port
-from tests.flashing.test_settings_block import BLOCK, NRF24_BLOCK, image_with, with_crc
+from tests.cli.arrangements import images as make_images
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
@@ -20,15 +19,8 @@ pytestmark = pytest.mark.io
 @pytest.fixture
 def images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Images of one program, and a machine without serial ports."""
-    folder = tmp_path / "images"
-    folder.mkdir()
-    for name, block in (("imu", NRF24_BLOCK), ("imu_sx1276", BLOCK)):
-        image = IntelHex()
-        image.puts(0, image_with(with_crc(block)))
-        for mhz in (16, 8):
-            image.write_hex_file(str(folder / f"{name}_{mhz}mhz.hex"))
-    monkeypatch.setattr(boards, "IMAGES", folder)
-    monkeypatch.setattr("gateway.cli.live.flash.list_serial_ports", list[Port])
+    (folder := tmp_path / "images").mkdir()
+    make_images(folder, monkeypatch=monkeypatch)
     return folder
 
 
@@ -48,9 +40,6 @@ def test_output_holds_the_image_with_the_given_settings(images: Path, tmp_path: 
     after = IntelHex(str(out)).tobinstr()
     assert before[:104] == after[:104]
     assert before[150:] == after[150:]
-    refused = flash("imu", "-o", out, code=2)
-    assert f"{out} already exists; use --force to overwrite" in refused
-    flash("imu", "-o", out, "--force")
 
 
 def test_lora_image_holds_its_settings_and_names_its_airtime(images: Path, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Invalid input to the commands: the message states file, line, fault and remedy."""
 
+import gc
 import tracemalloc
 from pathlib import Path
 
@@ -52,6 +53,8 @@ def test_packed_log_beyond_the_unpacked_limit_is_refused_and_fills_neither_memor
     reason = RATIO if command == "play" else "unpacks to more than 8 MB"
     assert f"bomb.gz: {reason}" in printed
     assert ("unpacked_limit_mb" in printed) == (command != "play")
+    # What the error refers to is removed with it, at the latest at the end of the process.
+    gc.collect()
     assert not list(temporary.iterdir())
 
 
