@@ -84,19 +84,17 @@ def demo(
     The simulated receiver sends the real protocol on a pseudo-terminal, at true rates. A recording
     that is flown instead restarts at its end, with a message.
     """
-    # Read here: a reload runs in another thread, without the context.
-    file = CONFIG.get()
+    file = CONFIG.get()  # Read here: a reload runs in another thread, without the context.
 
     def read() -> GatewaySettings:
         return with_endpoints(read_settings(file), endpoint)
 
-    settings = read()
-    first, count = settings.simulator.vehicle_id, 1 if flight else settings.simulator.vehicles
-    refuse_conflicts(range(first, first + count), settings, allowed=duplicate_ids)
+    one = (settings := read()).simulator
+    ids = [one.vehicle_id + number for number in range(1 if flight else one.vehicles)]
+    refuse_conflicts(ids, settings, allowed=duplicate_ids)
     # First, as it takes seconds to load; the simulator is therefore imported later.
-    page = launched_panel(wanted=panel)
+    page, daemons = launched_panel(wanted=panel), list[Daemon]()
     load_entry_points()
-    daemons: list[Daemon] = []
 
     def report(text: str) -> None:
         log.info(text)
@@ -107,7 +105,6 @@ def demo(
         if flight is not None:
             line, aircraft = recorded_line(settings, flight, report)
         else:
-            one = settings.simulator
             boards = firmware and firmware_line(one, unix_time_us(), firmware)
             line = made_ahead(boards or simulated_line(one, tracker))
             aircraft = calibrated_aircraft(settings)

@@ -59,6 +59,9 @@ SOON_S: Final = 14 * 86_400
 """Remaining time at which a certificate should have been renewed."""
 
 
+STYLES: Final = {"OK": "green", "INFO": "yellow", "FAIL": "red"}
+
+
 class Diagnosis(NamedTuple):
     """One check and its result, with its remedy."""
 
@@ -67,7 +70,6 @@ class Diagnosis(NamedTuple):
     text: str
 
 
-STYLES: Final = {"OK": "green", "INFO": "yellow", "FAIL": "red"}
 ok, info, fail = (partial(Diagnosis, grade) for grade in STYLES)
 
 Check = Callable[[GatewaySettings], Iterator[Diagnosis]]
