@@ -153,10 +153,12 @@ def gateway(folder: Path, mode: str = "") -> Iterator[None]:
     thread = threading.Thread(target=lambda: loop.run_until_complete(serve()))
     thread.start()
     assert begun.wait(60.0)
-    yield
-    loop.call_soon_threadsafe(ended.set)
-    thread.join()
-    loop.close()
+    try:
+        yield
+    finally:
+        loop.call_soon_threadsafe(ended.set)
+        thread.join()
+        loop.close()
 
 
 G = 9.80665
@@ -240,9 +242,11 @@ def line(folder: Path, sent: str = "", *, monkeypatch: pytest.MonkeyPatch) -> It
 
     monkeypatch.setattr(first_start, "LOOK_S", 0.3)
     monkeypatch.setattr(SerialPort, "start", start)
-    yield
-    os.close(master)
-    os.close(slave)
+    try:
+        yield
+    finally:
+        os.close(master)
+        os.close(slave)
 
 
 NAMELESS = 3_999_999_999
