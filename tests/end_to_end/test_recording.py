@@ -22,7 +22,8 @@ from gateway.recordings.play import Player, Track
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, TableReader
-from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState
+from gateway.recordings.tlog import UNRECORDED
+from gateway.records import RECORDED_ONLY, FusedSample, FusionState, NavState
 from gateway.simulator.receiver import simulate
 from gateway.simulator.source_bytes import SOURCE_BYTES
 from gateway.sources.kinds import make_sources
@@ -108,24 +109,32 @@ class Recording:
 
 
 async def record(
-    flight: Flight, folder: Path, clock: ManualClock
+    flight: Flight,
+    folder: Path,
+    clock: ManualClock,
+    *introduction: Callable[[int], list[bytes]],
+    mode: Mode = "always",
+    before_turn: Callable[[Recorder], None] = lambda _: None,
 ) -> tuple[list[bytes], list[NavState]]:
-    """Record a flight; return its frames and states."""
-    recording = Recording(folder, clock, flight.header, flight.fusion_state)
+    """Record a flight as the daemon does, without HIGH_LATENCY2; return its frames and states."""
+    of_flight = (flight.header, flight.fusion_state, *introduction)
+    recording = Recording(folder, clock, *of_flight, mode=mode)
     frames: list[bytes] = []
     states: list[NavState] = []
     async with recording as recorder:
         for out in flight.outputs():
             for sent in out.frames:
-                frames.append(sent.frame)
-                recorder.frame(sent.frame)
-                # Frames of one post of a phone take time, as those of a running gateway do.
-                clock.now_us += 10
+                is_kept = sent.client_id in (None, RECORDED_ONLY)
+                if is_kept and sent.message_id not in UNRECORDED:
+                    frames.append(sent.frame)
+                    recorder.frame(sent.frame)
+                    # Frames of one post of a phone take time, as those of a running gateway do.
+                    clock.now_us += 10
             for record in out.records:
-                if isinstance(record, FusedSample | BaroRaw | GpsFix):
-                    recorder.flight(record)
+                recorder.flight(record)
                 if isinstance(record, FusedSample):
                     states.append(record.state)
+            before_turn(recorder)
             await recording.turn()
     return frames, states
 
@@ -181,20 +190,13 @@ async def test_table_that_begins_before_arming_is_fused_again_bit_for_bit(
     tmp_path: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder_module, "HELD_US", 5_000_000)
-    flight = Flight("eskf", clock)
-    recording = Recording(
-        tmp_path / "armed", clock, flight.header, flight.fusion_state, mode="armed"
-    )
-    async with recording as recorder:
-        for out in flight.outputs():
-            for sent in out.frames:
-                recorder.frame(sent.frame)
-            for record in out.records:
-                if isinstance(record, FusedSample | BaroRaw | GpsFix):
-                    recorder.flight(record)
-            recorder.set_in_flight(in_flight=False, operates=clock() > 17_000_000)
-            await recording.turn()
-    (path,) = (tmp_path / "armed").glob("*.csv")
+
+    def report(recorder: Recorder) -> None:
+        recorder.set_in_flight(in_flight=False, operates=clock() > 17_000_000)
+
+    armed = tmp_path / "armed"
+    await record(Flight("eskf", clock), armed, clock, mode="armed", before_turn=report)
+    (path,) = armed.glob("*.csv")
     reader = TableReader()
     times_us = [
         event.time_us

@@ -14,12 +14,12 @@ from gateway.answers.log_answers import ANSWERS, VehicleAnswers
 from gateway.recordings.opening import lay_out, open_flights
 from gateway.recordings.play import AS_FAST_AS_POSSIBLE, Player
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.tlog import UNRECORDED, TlogScanner
-from gateway.records import RECORDED_ONLY, Incoming, Outgoing
+from gateway.recordings.tlog import TlogScanner
+from gateway.records import Incoming, Outgoing
 from gateway.vehicle.recorded_vehicle import RecordedVehicle
 from gateway.wire.mavlink_splitter import message_id_of
 from tests.conftest import ManualClock
-from tests.end_to_end.test_recording import Flight, Recording
+from tests.end_to_end.test_recording import Flight, record
 from tests.kit.mavlink import packed
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -66,22 +66,13 @@ class Shown:
 
 @pytest.fixture
 async def folder(tmp_path: Path, clock: ManualClock) -> Path:
-    """Record as the daemon does: with the head of every part, without HIGH_LATENCY2."""
+    """Record with the head of every part, as the daemon does."""
     flight = Flight("eskf", clock)
 
     def introduction(vehicle_id: int) -> list[bytes]:
         return [sent.frame for sent in flight.pipeline.aircraft[vehicle_id].vehicle.introduction()]
 
-    recording = Recording(tmp_path, clock, flight.header, flight.fusion_state, introduction)
-    async with recording as recorder:
-        for out in flight.outputs():
-            for sent in out.frames:
-                is_kept = sent.client_id in (None, RECORDED_ONLY)
-                if is_kept and sent.message_id not in UNRECORDED:
-                    recorder.frame(sent.frame)
-            for record in out.records:
-                recorder.flight(record)
-            await recording.turn()
+    await record(flight, tmp_path, clock, introduction)
     return tmp_path
 
 

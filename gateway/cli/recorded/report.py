@@ -245,14 +245,14 @@ def _report_many(
         write_flights_page,
     )
     from gateway.batch.tasks import JudgeTask, without_secrets
-    from gateway.cli.support.batch_work import BatchWork, exit_if_failed
+    from gateway.cli.support.batch_work import exit_if_failed, run_on_all
 
     if not quick:
         require("a report", "plot")
     if len(against) > 1:
         refuse("--against: give the folder of one earlier report")
-    work = BatchWork(names, jobs, cluster)
-    results = work.run(JudgeTask(without_secrets(options), not quick), work.items(), output)
+    task = JudgeTask(without_secrets(options), not quick)
+    results = run_on_all(names, task, output, jobs=jobs, scheduler=cluster)
     compared = _compare(results, against[0]) if against else None
     grid = table_of(
         "aircraft", "estimator", "flights", "median, m", "9 in 10, m", "worst, m", left=2

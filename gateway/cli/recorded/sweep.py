@@ -32,7 +32,7 @@ from gateway.analysis.sweep import (
 )
 from gateway.batch.tasks import SweepTask, without_secrets
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.batch_work import BatchWork, exit_if_failed
+from gateway.cli.support.batch_work import exit_if_failed, run_on_all
 from gateway.cli.support.options import output_file, read_options, read_settings
 from gateway.cli.support.recordings import are_many, fusion_of, load_flight, refuse_unused
 from gateway.cli.support.terminal import console_of, progress_bar, refuse, table_of
@@ -122,8 +122,7 @@ def sweep(
     read = read_options(current, columns, choice=fuse_with, system_id=system)
     if are_many(given):
         refuse_unused("many recordings", {"--reference": reference, "--system": system})
-        work = BatchWork(given, jobs, scheduler)
-        run_sweep_of_many(work, without_secrets(read), current, options)
+        run_sweep_of_many(given, scheduler, without_secrets(read), current, options)
         return
     refuse_unused("one recording", {"--scheduler": scheduler})
     path = Path(given[0]) if given else None
@@ -281,7 +280,11 @@ def _show(results: "pd.DataFrame", contest: Contest, metric: Metric) -> None:
 
 
 def run_sweep_of_many(
-    work: BatchWork, read: ReadOptions, settings: GatewaySettings, options: SweepOptions
+    names: Sequence[str],
+    scheduler: str | None,
+    read: ReadOptions,
+    settings: GatewaySettings,
+    options: SweepOptions,
 ) -> None:
     """Score every point on every flight, show the point that is best overall, and write it."""
     import pandas as pd
@@ -296,7 +299,7 @@ def run_sweep_of_many(
     fusion = with_estimator_of(fusion_of(settings), keys)
     column = COLUMN_OF[options.metric]
     task = SweepTask(read, axes, column, options.hold_out, options.gps_interval_s)
-    results = work.run(task, work.items(), None)
+    results = run_on_all(names, task, None, jobs=options.jobs, scheduler=scheduler)
     swept = [result for result in results if result.error is None]
     if not swept:
         refuse("the sweep failed on all flights")

@@ -1,9 +1,8 @@
 """Run a command's task on many recordings: find them, run the task, show progress."""
 
 import logging
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, nullcontext
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from pathlib import Path
 from typing import Final
 
@@ -22,71 +21,66 @@ SHOWN_FAILURES: Final = 12
 """Failures that are listed individually."""
 
 
-@dataclass(frozen=True, slots=True)
-class BatchWork:
-    """Recordings, and the processes or cluster for the work on them."""
+def run_on_all(
+    names: Sequence[str],
+    task: FlightTask,
+    output: Path | None,
+    *,
+    jobs: int | None,
+    scheduler: str | None,
+) -> list[FlightResult]:
+    """Run a task on all recordings, with a progress bar, and list the failures.
 
-    names: Sequence[str]
-    jobs: int | None = None
-    scheduler: str | None = None
-
-    def items(self) -> list[BatchItem]:
-        """Find the recordings; a missing one ends the command."""
-        if any(map(is_url, self.names)):
-            require("a URL", "batch")
-            log = logging.getLogger()
-            # Storage libraries log each connection.
-            if log.level == logging.INFO:
-                log.setLevel(logging.WARNING)
-        names: list[str] = []
-        for name in self.names:
-            if is_url(name):
-                names.append(name)
-                continue
-            names += map(str, recorded_files([Path(name).expanduser()], "tables"))
-        try:
-            items = items_of(names)
-        except OSError as error:
-            refuse(str(error))
-        if not items:
-            refuse(f"{', '.join(self.names)}: contains no recording")
-        return items
-
-    @contextmanager
-    def executor(self) -> Iterator[Executor]:
-        """Open the executor; an unusable cluster ends the command."""
-        if self.scheduler is None:
-            yield LocalProcesses(self.jobs)
-            return
+    A missing recording or an unusable cluster ends the command.
+    """
+    items = _items_of(names)
+    executor: AbstractContextManager[Executor] = nullcontext(LocalProcesses(jobs))
+    if scheduler is not None:
         require("--scheduler", "batch")
-        with closing(DaskCluster(self.scheduler)) as cluster:
-            yield cluster
+        executor = closing(DaskCluster(scheduler))
+    folder = None if output is None else ResultFolder(output)
+    with (
+        executor as opened,
+        progress_bar() as progress,
+        folder.held() if folder else nullcontext(),
+    ):
+        bar = progress.add_task(task.name, total=len(items))
 
-    def run(
-        self, task: FlightTask, items: Sequence[BatchItem], output: Path | None
-    ) -> list[FlightResult]:
-        """Run a task on all recordings, with a progress bar, and list the failures."""
-        folder = None if output is None else ResultFolder(output)
-        with (
-            self.executor() as executor,
-            progress_bar() as progress,
-            folder.held() if folder else nullcontext(),
-        ):
-            bar = progress.add_task(task.name, total=len(items))
+        def report(what: str, done: int, total: int) -> None:
+            text = f"{task.name}: {printable(what.rsplit('/', 1)[-1][-40:])}"
+            progress.update(bar, description=text, completed=done, total=total, refresh=True)
 
-            def report(what: str, done: int, total: int) -> None:
-                text = f"{task.name}: {printable(what.rsplit('/', 1)[-1][-40:])}"
-                progress.update(bar, description=text, completed=done, total=total, refresh=True)
+        try:
+            results = run_batch(task, items, opened, folder, report)
+        except KeyboardInterrupt:
+            if folder is not None:
+                text = "interrupted; finished results are kept: repeat the command to continue"
+                console_of(stderr=True).print(text)
+            raise
+    _print_failures(results)
+    return results
 
-            try:
-                results = run_batch(task, items, executor, folder, report)
-            except KeyboardInterrupt:
-                if folder is not None:
-                    text = "interrupted; finished results are kept: repeat the command to continue"
-                    console_of(stderr=True).print(text)
-                raise
-        _print_failures(results)
-        return results
+
+def _items_of(names: Sequence[str]) -> list[BatchItem]:
+    if any(map(is_url, names)):
+        require("a URL", "batch")
+        log = logging.getLogger()
+        # Storage libraries log each connection.
+        if log.level == logging.INFO:
+            log.setLevel(logging.WARNING)
+    found = list[str]()
+    for name in names:
+        is_file = not is_url(name)
+        found += (
+            map(str, recorded_files([Path(name).expanduser()], "tables")) if is_file else [name]
+        )
+    try:
+        items = items_of(found)
+    except OSError as error:
+        refuse(str(error))
+    if not items:
+        refuse(f"{', '.join(names)}: contains no recording")
+    return items
 
 
 def exit_if_failed(results: Sequence[FlightResult]) -> None:
