@@ -13,7 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 import gateway.player
-from gateway.cli.recorded.play import print_plan, steer
+from gateway.cli.recorded.play import steer
 from gateway.config import GatewaySettings
 from gateway.hub.hub import SENDS_AT_ONCE
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
@@ -374,18 +374,3 @@ async def test_idle_player_repeats_the_state_without_gaps_in_the_numbers(
     assert {frame.message_id for frame in read} == {mavlink.MAVLINK_MSG_ID_HEARTBEAT}
     first = read[0].sequence
     assert [frame.sequence for frame in read] == [(first + i) % 256 for i in range(len(read))]
-
-
-def test_vehicles_and_endpoints_are_printed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_tlog(tmp_path / "a.tlog", recording())
-    for endpoints, text in (
-        (("udp:127.0.0.1:1", "tcp-listen:127.0.0.1:2"), "udp:127.0.0.1:1, tcp-listen:127.0.0.1:2"),
-        ((), "no client: no endpoint is set"),
-    ):
-        with ExitStack() as opened:
-            flights = lay_out(open_flights([path], OPTIONS, opened), with_commands=False)
-            print_plan(["a.tlog"], flights, endpoints)
-        printed = " ".join(capsys.readouterr().out.split())
-        assert printed == f"playing a.tlog as vehicle 3 to {text}"
