@@ -15,7 +15,7 @@ not changed, and a filter on those does show as loss; with one exception: frames
 answers are kept are numbered for each client, because the gateway sends some in their name.
 
 The frames to a client of known bandwidth are counted, and thinned once a second so that they fit:
-see `send_queue.py`. That changes limits and no routes. A client whose endpoint has `monitor=yes`
+see `bandwidth.py`. That changes limits and no routes. A client whose endpoint has `monitor=yes`
 gets every frame. A client of MAVLink 1 gets the messages that this version can carry, without
 extensions and signatures.
 """

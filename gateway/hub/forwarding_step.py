@@ -195,7 +195,7 @@ def forward(work_at: int, client_at: int, reads: int) -> None:
 
 @compiled
 def _receive(work: Any, client: Any, headers: Any) -> None:
-    """Receive about as many datagrams as `MOST` allows."""
+    """Receive about as many datagrams as `most` bytes allow."""
     work.at = work.offset = work.count = work.taken = work.read = 0
     count = min(READS, max(1, (work.most + client.largest - 1) // client.largest))
     count = receive_many(client.input, work.headers_at, count)
