@@ -83,12 +83,14 @@ class PilotFlight:
     def events(self) -> list[FlightEvent]:
         """Events in the order of their times."""
         facts, tally = self.facts, self.tally
-        outages = [(begin, end - begin) for begin, end in facts.gps_outages_us or ()]
-        gaps = [(gap.time_us, gap.duration_s * US_PER_S) for gap in facts.gaps]
+        lost = [("gps", "GPS", begin, end - begin) for begin, end in facts.gps_outages_us or ()]
+        lost += [("link", "link", g.time_us, round(g.duration_s * US_PER_S)) for g in facts.gaps]
         found = [
             *self._flight_events(),
-            *self._lost("gps", "GPS", outages),
-            *self._lost("link", "link", gaps),
+            *(
+                self._event(begin_us, kind, f"{name} lost for {length_us / US_PER_S:.1f} s")
+                for kind, name, begin_us, length_us in lost
+            ),
             *(self._event(time_us, "mode", f"mode {mode}") for time_us, mode in tally.modes),
             *(
                 self._event(time_us, "text", text)
@@ -99,12 +101,6 @@ class PilotFlight:
 
     def _event(self, time_us: float, kind: str, text: str) -> FlightEvent:
         return FlightEvent(float(self.seconds([time_us])[0]), kind, text)
-
-    def _lost(self, kind: str, name: str, gaps: Sequence[tuple[float, float]]) -> list[FlightEvent]:
-        return [
-            self._event(begin_us, kind, f"{name} lost for {length_us / US_PER_S:.1f} s")
-            for begin_us, length_us in gaps
-        ]
 
     def _flight_events(self) -> list[FlightEvent]:
         points, found = self.points, []

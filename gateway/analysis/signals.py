@@ -2,7 +2,6 @@
 
 import math
 import timeit
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, get_args
 
 import numpy as np
@@ -56,19 +55,11 @@ def filtered(
     return np.array(rows).reshape(-1, 3)
 
 
-@dataclass(frozen=True, slots=True)
-class Response:
-    """Frequency response of one filter."""
+def response(kind: Kind, settings: PaperSettings, rate_hz: float) -> tuple[FloatArray, ...]:
+    """Compute the response from a hundredth of the cutoff to half the sample rate.
 
-    frequency_hz: FloatArray
-    gain_db: FloatArray
-    phase_deg: FloatArray
-    delay_ms: FloatArray
-    """Group delay."""
-
-
-def response(kind: Kind, settings: PaperSettings, rate_hz: float) -> Response:
-    """Compute the frequency response from a hundredth of the cutoff to half the sample rate."""
+    Returns frequencies in Hz, gains in dB, phases in deg and group delays in ms.
+    """
     from scipy import signal
 
     *b, a1, a2 = _design(kind, settings, rate_hz)
@@ -77,12 +68,8 @@ def response(kind: Kind, settings: PaperSettings, rate_hz: float) -> Response:
     frequency = np.geomspace(low_hz, 0.499 * rate_hz, RESPONSE_POINTS)
     _, h = signal.freqz(b, a, frequency, fs=rate_hz)
     _, delay = signal.group_delay((b, a), frequency, fs=rate_hz)
-    return Response(
-        frequency_hz=frequency,
-        gain_db=20.0 * np.log10(np.maximum(np.abs(h), 1e-12)),
-        phase_deg=np.degrees(np.unwrap(np.angle(h))),
-        delay_ms=1e3 * delay / rate_hz,
-    )
+    gain_db = 20.0 * np.log10(np.maximum(np.abs(h), 1e-12))
+    return frequency, gain_db, np.degrees(np.unwrap(np.angle(h))), 1e3 * delay / rate_hz
 
 
 def apply(kind: Kind, settings: PaperSettings, rate_hz: float, x: FloatArray) -> FloatArray:
@@ -102,9 +89,9 @@ def compare(settings: PaperSettings, rate_hz: float) -> "pd.DataFrame":
 
 
 def _properties(kind: Kind, settings: PaperSettings, rate_hz: float) -> dict[str, object]:
-    found = response(kind, settings, rate_hz)
+    frequency_hz, gain_db, _, delay_ms = response(kind, settings, rate_hz)
     cutoff = settings.accel_cutoff_hz
-    passed = found.gain_db[found.frequency_hz <= cutoff]
+    passed = gain_db[frequency_hz <= cutoff]
     # The Butterworth gain decreases monotonically, so only a later increase is ripple.
     ripple_db = float(np.max(np.maximum.accumulate(passed[::-1])[::-1] - passed[0]))
     steps = np.ones((round(STEP_S * rate_hz), 3))
@@ -113,10 +100,10 @@ def _properties(kind: Kind, settings: PaperSettings, rate_hz: float) -> dict[str
     return {
         "filter": kind,
         "ripple, dB": max(ripple_db, 0.0),
-        "gain at cutoff, dB": float(np.interp(cutoff, found.frequency_hz, found.gain_db)),
-        "gain at 3 x cutoff, dB": float(np.interp(3 * cutoff, found.frequency_hz, found.gain_db)),
-        "delay at 0 Hz, ms": float(found.delay_ms[0]),
-        "greatest delay, ms": float(found.delay_ms.max()),
+        "gain at cutoff, dB": float(np.interp(cutoff, frequency_hz, gain_db)),
+        "gain at 3 x cutoff, dB": float(np.interp(3 * cutoff, frequency_hz, gain_db)),
+        "delay at 0 Hz, ms": float(delay_ms[0]),
+        "greatest delay, ms": float(delay_ms.max()),
         "step overshoot, %": 100.0 * float(risen.max() - 1.0),
         "time a sample, ns": _time_ns(kind, settings, rate_hz),
     }

@@ -73,13 +73,12 @@ class _Arrival:
 class _RadioPath:
     """Radio of one node: order, retries, losses and duplicates."""
 
-    def __init__(
-        self, node: Node, pipe: int, settings: SimulatorSettings, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, node: Node, pipe: int, settings: SimulatorSettings) -> None:
         self.pipe = pipe
         self.last_seq: int | None = None
         self._node = node
-        self._rng = rng
+        vehicle_id, node_id = node.node_id.vehicle_id, node.node_id.node_id
+        self._rng = np.random.default_rng([settings.seed, vehicle_id, Chance.RADIO, node_id])
         self._free_s = 0.0
         self._seq = 0
         self._losing = False
@@ -125,7 +124,7 @@ class SimulatedReceiver:
     def __init__(self, settings: SimulatorSettings, nodes: Sequence[Node]) -> None:
         self._settings = settings
         self._clock = DeviceClock(RECEIVER_BOOT_US, settings.clock_skew_ppm * RECEIVER_SKEW_SHARE)
-        self._paths = [_make_path(k, node, settings) for k, node in enumerate(nodes)]
+        self._paths = [_RadioPath(node, k % PIPES, settings) for k, node in enumerate(nodes)]
         self._received = [0] * PIPES
         self._lost = [0] * PIPES
         self._dropped = 0
@@ -219,10 +218,3 @@ def damage(
         hit = rng.random(len(data)) < share
         flips = rng.integers(1, UINT8, len(data), dtype=np.uint8) * hit
         yield TimedFrame(frame.time_s, (data ^ flips).tobytes(), int(hit.sum()))
-
-
-def _make_path(index: int, node: Node, settings: SimulatorSettings) -> _RadioPath:
-    rng = np.random.default_rng(
-        [settings.seed, node.node_id.vehicle_id, Chance.RADIO, node.node_id.node_id]
-    )
-    return _RadioPath(node, index % PIPES, settings, rng)

@@ -122,9 +122,7 @@ def line_of(record: RawRecord) -> str:
         case ImuRaw():
             content: dict[str, object] = {
                 "t_ms": record.time_us / 1000.0,
-                "accel_mps2": _scaled(
-                    record.accel_raw, record.accel_range_g * STANDARD_GRAVITY_MPS2 / COUNTS
-                ),
+                "accel_mps2": _accel_mps2(record),
                 "gyro_dps": _scaled(record.gyro_raw, 1.0 / GYRO_LSB[record.gyro_range_dps]),
             }
             if record.flags & ImuFlags.MAG_NEW:
@@ -163,9 +161,7 @@ def _readings(record: RawRecord, start_unix_us: int) -> Iterator[dict[str, objec
 
     match record:
         case ImuRaw():
-            x, y, z = _scaled(
-                record.accel_raw, record.accel_range_g * STANDARD_GRAVITY_MPS2 / COUNTS
-            )
+            x, y, z = _accel_mps2(record)
             # The axes of a phone whose top points to the nose.
             yield reading("gravity", x=0.0, y=0.0, z=STANDARD_GRAVITY_MPS2)
             yield reading("accelerometer", x=-y, y=x, z=round(z - STANDARD_GRAVITY_MPS2, 5))
@@ -189,6 +185,10 @@ def _readings(record: RawRecord, start_unix_us: int) -> Iterator[dict[str, objec
                 horizontalAccuracy=3.0,
                 verticalAccuracy=5.0,
             )
+
+
+def _accel_mps2(record: ImuRaw) -> list[float]:
+    return _scaled(record.accel_raw, record.accel_range_g * STANDARD_GRAVITY_MPS2 / COUNTS)
 
 
 def _scaled(counts: tuple[int, int, int], scale: float) -> list[float]:

@@ -8,7 +8,7 @@ from tests.batch.flights import write_flight
 
 
 @pytest.fixture(scope="session")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def batch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four flights of two aircraft on three days, and a broken file."""
     folder = tmp_path_factory.mktemp("flights")
     write_flight(folder / "alpha_01_v1.csv", vehicle=1, day=0, noise_m=0.2)

@@ -47,10 +47,10 @@ def report(*words: object, code: int = 0) -> str:
 
 
 @pytest.fixture(scope="module")
-def fused(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def fused(batch: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """All recordings fused by the command."""
     out = tmp_path_factory.mktemp("out")
-    return out, report(recordings, "-o", out, "--jobs", 2, code=1)
+    return out, report(batch, "-o", out, "--jobs", 2, code=1)
 
 
 def test_broken_file_is_reported_and_others_are_fused(fused: tuple[Path, str]) -> None:
@@ -68,10 +68,10 @@ def test_broken_file_is_reported_and_others_are_fused(fused: tuple[Path, str]) -
 
 
 def test_batch_gives_states_of_fuse_command(
-    recordings: Path, fused: tuple[Path, str], tmp_path: Path
+    batch: Path, fused: tuple[Path, str], tmp_path: Path
 ) -> None:
     single = tmp_path / "alone.csv"
-    run("fuse", recordings / FLIGHTS[0], "-o", single)
+    run("fuse", batch / FLIGHTS[0], "-o", single)
     states = pd.read_csv(fused[0] / "fused" / "alpha.csv", comment="#")
     alone = pd.read_csv(single, comment="#").dropna(subset="nav_time_us")[states.columns]
     pd.testing.assert_frame_equal(
@@ -79,19 +79,19 @@ def test_batch_gives_states_of_fuse_command(
     )
 
 
-def test_finished_recordings_are_not_done_again(recordings: Path, fused: tuple[Path, str]) -> None:
+def test_finished_recordings_are_not_done_again(batch: Path, fused: tuple[Path, str]) -> None:
     out, _ = fused
     before = {path: path.stat().st_mtime_ns for path in (out / RESULTS).iterdir()}
     assert len(before) == 5
     (out / "fused" / "beta.csv").unlink()
-    report(recordings, "-o", out, "--jobs", 1, code=1)
+    report(batch, "-o", out, "--jobs", 1, code=1)
     changed = [path for path, time_ns in before.items() if path.stat().st_mtime_ns != time_ns]
     assert len([*(out / RESULTS).iterdir()]) == 5
     assert [json.loads(path.read_bytes())["files"] for path in changed] == [["fused/beta.csv"]]
 
 
-def test_changed_settings_repeat_the_work(recordings: Path, tmp_path: Path) -> None:
-    items = items_of([str(recordings / FLIGHTS[0])])
+def test_changed_settings_repeat_the_work(batch: Path, tmp_path: Path) -> None:
+    items = items_of([str(batch / FLIGHTS[0])])
     seen: list[str] = []
 
     class Counted(LocalProcesses):
@@ -109,7 +109,7 @@ def test_changed_settings_repeat_the_work(recordings: Path, tmp_path: Path) -> N
 
 
 def test_results_of_two_versions_are_compared(
-    fused: tuple[Path, str], recordings: Path, tmp_path: Path
+    fused: tuple[Path, str], batch: Path, tmp_path: Path
 ) -> None:
     out, then = fused[0], tmp_path / "then"
     shutil.copytree(out / RESULTS, then / RESULTS)
@@ -118,13 +118,13 @@ def test_results_of_two_versions_are_compared(
         if "held_m" in result["figures"]:
             result["figures"]["held_m"]["eskf"] /= 2.0
             path.write_text(json.dumps(result))
-    text = report(recordings, "-o", out, "--against", then, code=1)
+    text = report(batch, "-o", out, "--against", then, code=1)
     found = re.search(r"eskf: median error (\S+) m, (\S+) m in the other results", text)
     assert found is not None
     assert float(found[1]) == pytest.approx(2.0 * float(found[2]), abs=0.002)
     assert text.count("worse: ") == 4
     assert "got worse" in (out / "index.html").read_text()
-    report(recordings, "-o", out, "--against", tmp_path / "nowhere", code=2)
+    report(batch, "-o", out, "--against", tmp_path / "nowhere", code=2)
 
 
 def result_of(key: str, *files: str) -> FlightResult:
@@ -154,9 +154,9 @@ def test_partial_result_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert again.find("k") is None
 
 
-def test_missing_file_is_reported_in_plain_words(recordings: Path, tmp_path: Path) -> None:
+def test_missing_file_is_reported_in_plain_words(batch: Path, tmp_path: Path) -> None:
     gone = tmp_path / "gone.csv"
-    items = [*items_of([str(recordings / FLIGHTS[0])]), BatchItem((str(gone),))]
+    items = [*items_of([str(batch / FLIGHTS[0])]), BatchItem((str(gone),))]
     reported: list[tuple[str, int, int]] = []
     task = JudgeTask(OPTIONS, pages=False)
     results = run_batch(task, items, LocalProcesses(1), None, lambda *now: reported.append(now))
@@ -165,9 +165,9 @@ def test_missing_file_is_reported_in_plain_words(recordings: Path, tmp_path: Pat
     assert results[0].began == "2026-05-28 20:26:40"
 
 
-def test_two_batches_do_not_write_into_one_folder(recordings: Path, tmp_path: Path) -> None:
+def test_two_batches_do_not_write_into_one_folder(batch: Path, tmp_path: Path) -> None:
     staged = tmp_path / ".partial" / "k"
-    two = [recordings / name for name in FLIGHTS[:2]]
+    two = [batch / name for name in FLIGHTS[:2]]
     with ResultFolder(tmp_path).held():
         staged.mkdir(parents=True)
         text = report(*two, "-o", tmp_path, code=2)
@@ -186,10 +186,10 @@ def test_results_with_equal_times_are_sorted_by_name(tmp_path: Path) -> None:
     assert [found.location for found in read_results(tmp_path)] == [*"acmyzb"]
 
 
-def test_files_with_non_utf8_names_are_processed(recordings: Path, tmp_path: Path) -> None:
+def test_files_with_non_utf8_names_are_processed(batch: Path, tmp_path: Path) -> None:
     there = tmp_path / "there"
     there.mkdir()
-    shutil.copy(recordings / FLIGHTS[0], there / os.fsdecode(b"fl\xfcg_01_v1.csv"))
+    shutil.copy(batch / FLIGHTS[0], there / os.fsdecode(b"fl\xfcg_01_v1.csv"))
     (there / os.fsdecode(b"bad\xff.csv")).write_text("")
     for _ in range(2):
         text = report(there, "-o", tmp_path / "out", "--jobs", 1, code=1)
@@ -199,11 +199,11 @@ def test_files_with_non_utf8_names_are_processed(recordings: Path, tmp_path: Pat
 
 
 def test_report_folder_contains_page_and_figures(
-    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    batch: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One section stands for all of them, which take ten seconds to draw."""
     monkeypatch.setattr("gateway.analysis.reporting.compose.SECTIONS", (ground_track,))
-    run("report", recordings / FLIGHTS[0], recordings / FLIGHTS[1], "-o", tmp_path)
+    run("report", batch / FLIGHTS[0], batch / FLIGHTS[1], "-o", tmp_path)
     folder = tmp_path / "reports" / "alpha"
     assert "Flight report: alpha" in (folder / "index.html").read_text()
     assert (folder / "ground_track.svg").exists()
@@ -211,12 +211,12 @@ def test_report_folder_contains_page_and_figures(
 
 
 def test_recording_without_samples_has_figures_and_is_no_failure(
-    recordings: Path, tmp_path: Path
+    batch: Path, tmp_path: Path
 ) -> None:
     fix = mavlink.MAVLink_gps_raw_int_message(0, 3, 470_000_000, 80_000_000, *(0,) * 5, 9)
     records = [RecordedFrame(START_US + n * SECOND_US, packed(fix, 7)) for n in range(9)]
     (tmp_path / "fixes.tlog").write_bytes(make_tlog(records))
-    report(tmp_path / "fixes.tlog", recordings / FLIGHTS[0], "-o", tmp_path / "out")
+    report(tmp_path / "fixes.tlog", batch / FLIGHTS[0], "-o", tmp_path / "out")
     flights = pd.read_csv(tmp_path / "out" / "flights.csv").set_index("recording")
     assert flights.loc["fixes.tlog", ["aircraft", "duration, s", "distance, m"]].tolist() == [
         7,
@@ -226,10 +226,10 @@ def test_recording_without_samples_has_figures_and_is_no_failure(
     assert flights["failed"].isna().all()
 
 
-def test_two_recordings_with_equal_names_are_kept_apart(recordings: Path, tmp_path: Path) -> None:
+def test_two_recordings_with_equal_names_are_kept_apart(batch: Path, tmp_path: Path) -> None:
     for folder, name in (("x", FLIGHTS[0]), ("y", FLIGHTS[1])):
         (tmp_path / folder).mkdir()
-        shutil.copy(recordings / name, tmp_path / folder / "log_01_v1.csv")
+        shutil.copy(batch / name, tmp_path / folder / "log_01_v1.csv")
     report(tmp_path / "x", tmp_path / "y", "-o", tmp_path / "out")
     assert len(list((tmp_path / "out" / "fused").glob("log-*.csv"))) == 2
 
@@ -279,11 +279,11 @@ def test_death_of_process_affects_only_its_own_work(
 
 
 @pytest.fixture
-def memory(recordings: Path) -> Iterator[str]:
+def memory(batch: Path) -> Iterator[str]:
     """Two recordings in fsspec's file system in memory."""
     storage = fsspec.filesystem("memory")
     for name in FLIGHTS[:2]:
-        storage.pipe_file(f"/flights/{name}", (recordings / name).read_bytes())
+        storage.pipe_file(f"/flights/{name}", (batch / name).read_bytes())
     yield "memory://flights"
     storage.rm("/flights", recursive=True)
 
@@ -294,11 +294,11 @@ def test_url_names_a_folder_a_pattern_or_a_file(memory: str, pattern: str, first
     assert found == [f"{memory}/{name}" for name in FLIGHTS[first:2]]
 
 
-@pytest.mark.parametrize("folder", ["{memory}", "file://{recordings}"])
+@pytest.mark.parametrize("folder", ["{memory}", "file://{batch}"])
 def test_url_gives_the_results_of_the_local_file(
-    memory: str, recordings: Path, fused: tuple[Path, str], tmp_path: Path, folder: str
+    memory: str, batch: Path, fused: tuple[Path, str], tmp_path: Path, folder: str
 ) -> None:
-    url = f"{folder.format(memory=memory, recordings=recordings)}/{FLIGHTS[1]}"
+    url = f"{folder.format(memory=memory, batch=batch)}/{FLIGHTS[1]}"
     report(url, "-o", tmp_path, "--jobs", 2)
     alone = (fused[0] / "fused" / "beta.csv").read_bytes()
     assert (tmp_path / "fused" / "beta.csv").read_bytes() == alone
@@ -331,11 +331,11 @@ class _Elsewhere(MemoryFileSystem):
         return super()._open(path, mode, **more)
 
 
-def test_remote_files_are_fetched_once_unless_changed(recordings: Path, tmp_path: Path) -> None:
+def test_remote_files_are_fetched_once_unless_changed(batch: Path, tmp_path: Path) -> None:
     fsspec.register_implementation("elsewhere", _Elsewhere, clobber=True)
     storage = fsspec.filesystem("elsewhere")
     for name in FLIGHTS[:2]:
-        storage.pipe_file(f"/flights/{name}", (recordings / name).read_bytes())
+        storage.pipe_file(f"/flights/{name}", (batch / name).read_bytes())
     storage.pipe_file("/flights/locked.csv", b"x")
 
     def fetched() -> list[str]:
@@ -356,7 +356,7 @@ def test_remote_files_are_fetched_once_unless_changed(recordings: Path, tmp_path
     folder = ResultFolder(tmp_path)
     assert fetched() == [*FLIGHTS[:2]]
     assert fetched() == []
-    storage.pipe_file(f"/flights/{FLIGHTS[1]}", (recordings / FLIGHTS[2]).read_bytes())
+    storage.pipe_file(f"/flights/{FLIGHTS[1]}", (batch / FLIGHTS[2]).read_bytes())
     assert fetched() == [FLIGHTS[1]]
 
 
@@ -385,15 +385,15 @@ def test_url_without_a_file_is_reported(tmp_path: Path) -> None:
     ("words", "lacking"),
     [
         (("memory://flights",), "fsspec"),
-        (("{recordings}", "--scheduler", "tcp://x:1"), "distributed"),
+        (("{batch}", "--scheduler", "tcp://x:1"), "distributed"),
     ],
 )
 def test_missing_extra_is_named(
-    words: tuple[str, ...], lacking: str, recordings: Path, tmp_path: Path,
+    words: tuple[str, ...], lacking: str, batch: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.setitem(sys.modules, lacking, None)
-    named = [word.format(recordings=recordings) for word in words]
+    named = [word.format(batch=batch) for word in words]
     assert "needs the extra batch; to install it: " in report(*named, "-o", tmp_path, code=2)
 
 

@@ -92,7 +92,7 @@ def index(folder: Path) -> IndexReport:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all kinds of files, indexed."""
-    folder = tmp_path_factory.mktemp("recordings")
+    folder = tmp_path_factory.mktemp("batch")
     write_flight(folder / "one_01_v1.csv", vehicle=1, day=0)
     write_flight(folder / "deeper" / "two_01_v2.csv", vehicle=2, day=3, lost=10)
     write_tlog(folder / "far.tlog", far_flight())

@@ -39,9 +39,9 @@ def _fail(marker: Path) -> int:
 
 
 def test_cluster_gives_the_results_of_this_machine(
-    address: str, recordings: Path, tmp_path: Path
+    address: str, batch: Path, tmp_path: Path
 ) -> None:
-    files = [recordings / name for name in ("alpha_01_v1.csv", "gamma_01_v2.csv", "broken.csv")]
+    files = [batch / name for name in ("alpha_01_v1.csv", "gamma_01_v2.csv", "broken.csv")]
     for out, options in (("cluster", ("--scheduler", address)), ("here", ())):
         words = ("report", "--quick", *files, "-o", tmp_path / out, *options)
         assert "1 of 3 recordings failed" in run(*words, code=1)

@@ -76,9 +76,9 @@ def test_degraded_flights_are_listed_worst_first() -> None:
 
 
 @pytest.mark.io
-def test_sweep_of_a_folder_finds_one_set_of_settings(recordings: Path, tmp_path: Path) -> None:
+def test_sweep_of_a_folder_finds_one_set_of_settings(batch: Path, tmp_path: Path) -> None:
     best, table = tmp_path / "best.toml", tmp_path / "trials.csv"
-    words = ("sweep", recordings, "--vary", "beta=0.1,0.5,0.9", "-o", best, "--table", table)
+    words = ("sweep", batch, "--vary", "beta=0.1,0.5,0.9", "-o", best, "--table", table)
     text = run(*words, "--jobs", 2, code=1)
     assert "3 points on 4 flights; mean with the recorded settings" in text
     assert "1 of 5 recordings failed" in text
@@ -91,8 +91,8 @@ def test_sweep_of_a_folder_finds_one_set_of_settings(recordings: Path, tmp_path:
     assert np.exp(np.log(rows["best settings"]).mean()) == pytest.approx(means[0], rel=1e-3)
     words = (
         "sweep",
-        recordings / "alpha_01_v1.csv",
-        recordings,
+        batch / "alpha_01_v1.csv",
+        batch,
         "--optimise",
         3,
         "--vary",

@@ -132,10 +132,9 @@ def _draw_response(case: Case, width_in: float) -> Figure:
     rate_hz, paper = case.flight.rate_hz, case.fusion.estimation.paper
     figure, axes = style.panels(width_in, 1, 2.6, columns=3, share_x=True)
     for kind in KINDS:
-        found = response(kind, paper, rate_hz)
-        lines = (found.gain_db, found.phase_deg, found.delay_ms)
+        frequency_hz, *lines = response(kind, paper, rate_hz)
         for panel, line in zip(axes, lines, strict=True):
-            panel.semilogx(found.frequency_hz, line, color=COLOURS[kind], label=kind.capitalize())
+            panel.semilogx(frequency_hz, line, color=COLOURS[kind], label=kind.capitalize())
     for panel, label in zip(axes, ("gain (dB)", "phase (deg)", "group delay (ms)"), strict=True):
         panel.axvline(paper.accel_cutoff_hz, color=style.MUTED, lw=0.8, ls=":")
         panel.set(xlabel="frequency (Hz)", ylabel=label)

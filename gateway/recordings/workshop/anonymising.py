@@ -233,7 +233,7 @@ class Anonymiser(FrameEdit):
             return self._unlisted(read)
         name, fields = MESSAGE_NAMES[read.message_id], fields_of(frame)
         if reason := self._private_part(treatment, fields):
-            self.leave_out(name, reason)
+            self.left_out[name, reason] += 1
             return None
         changes = self._changes(treatment, fields, read.message_id)
         changes = {k: v for k, v in changes.items() if not _is_equal(v, fields[k])}
@@ -253,7 +253,7 @@ class Anonymiser(FrameEdit):
         # A signature contains the time, and cannot be removed without a checksum.
         if name is None and self._keep_unknown and not frame.signed:
             return frame.data
-        self.leave_out(name or f"unknown message {frame.message_id}")
+        self.left_out[name or f"unknown message {frame.message_id}", ""] += 1
         return None
 
     def _private_part(self, treatment: Treatment, fields: Mapping[str, Any]) -> str:

@@ -186,7 +186,7 @@ def contents_of(name: str, plan: RecordedPlan) -> Contents:
     """Return the compared content of a vehicle's answers."""
     return Contents(
         name,
-        {each.name: each.text for each in plan.parameters()},
+        {each.name: parameter_text(each.value) for each in plan.parameters()},
         {name: [_item_text(item) for item in plan.items(kind)] for kind, name in KINDS.items()},
         _versions(plan),
     )
@@ -229,15 +229,9 @@ def as_html(found: Comparison) -> Iterator[str]:
 
 
 def _html_table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
-    yield (
-        "<table><tr>"
-        + "".join(f"<th>{html.escape(printable(head))}</th>" for head in heads)
-        + "</tr>\n"
-    )
+    yield f"<table><tr>{''.join(f'<th>{_escaped(head)}</th>' for head in heads)}</tr>\n"
     for row in rows:
-        yield (
-            "<tr>" + "".join(f"<td>{html.escape(printable(cell))}</td>" for cell in row) + "</tr>\n"
-        )
+        yield f"<tr>{''.join(f'<td>{_escaped(cell)}</td>' for cell in row)}</tr>\n"
     yield "</table>\n"
 
 

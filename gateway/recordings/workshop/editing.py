@@ -62,10 +62,6 @@ class FrameEdit:
         """Return the edited frame; None if it must be left out."""
         raise NotImplementedError
 
-    def leave_out(self, message: str, reason: str = "") -> None:
-        """Count a frame that is left out."""
-        self.left_out[message, reason] += 1
-
 
 @dataclass(frozen=True, slots=True)
 class TlogEdits:
@@ -181,7 +177,8 @@ class Renumbering(FrameEdit):
         sender = self._renamed(read.origin[0])
         found = rename_systems(read, sender, self._renamed, drop_signature=True)
         if found is None:
-            self.leave_out(MESSAGE_NAMES.get(read.message_id, f"unknown message {read.message_id}"))
+            unknown = f"unknown message {read.message_id}"
+            self.left_out[MESSAGE_NAMES.get(read.message_id, unknown), ""] += 1
             return None
         return self._with_parameter(found) if read.message_id in PARAMETER_IDS else found.data
 

@@ -57,11 +57,6 @@ class RecordedParameter:
     kind: int
     """MAV_PARAM_TYPE."""
 
-    @property
-    def text(self) -> str:
-        """Return the value as text; see `parameter_text`."""
-        return parameter_text(self.value)
-
 
 def parameter_text(value: float) -> str:
     """Return a value with the fewest digits that yield the same single-precision float."""
@@ -122,7 +117,7 @@ def _file_name(name: str) -> str:
 def param_file(parameters: Iterable[RecordedParameter]) -> Iterator[str]:
     """Write parameters in the format of Mission Planner and MAVProxy."""
     for parameter in parameters:
-        yield f"{_file_name(parameter.name)},{parameter.text}\n"
+        yield f"{_file_name(parameter.name)},{parameter_text(parameter.value)}\n"
 
 
 def qgc_params(parameters: Iterable[RecordedParameter], plan: RecordedPlan) -> Iterator[str]:
@@ -130,7 +125,13 @@ def qgc_params(parameters: Iterable[RecordedParameter], plan: RecordedPlan) -> I
     yield f"# Onboard parameters for Vehicle {plan.system_id}\n#\n"
     yield "# Vehicle-Id Component-Id Name Value Type\n"
     for each in parameters:
-        cells = (plan.system_id, plan.component_id, _file_name(each.name), each.text, each.kind)
+        cells = (
+            plan.system_id,
+            plan.component_id,
+            _file_name(each.name),
+            parameter_text(each.value),
+            each.kind,
+        )
         yield "\t".join(map(str, cells)) + "\n"
 
 

@@ -93,13 +93,6 @@ class ClockOffset:
     share: float = 1.0
     """Share of the time that both files cover in which there are copies."""
 
-    @property
-    def fault(self) -> str:
-        """Why the files are not of one flight, independent of the clocks; empty if they may be."""
-        if self.share >= FAIR_SHARE:
-            return ""
-        return f"its {counted(self.copies, 'equal frame')} are in {self.share:.0%} of the time only"
-
 
 def clock_offset(sample: FrameSample, reference: FrameSample) -> ClockOffset | None:
     """Estimate the offset of a file's clock; None if too few frames are copies."""
@@ -167,11 +160,13 @@ class Alignment:
         self.offsets.append(max(found, key=lambda each: each.copies, default=None))
 
     def _fault_of(self, offset: ClockOffset) -> str:
-        if not (fault := offset.fault) and not self.is_one_flight:
-            shift_s = offset.offset_us / US_PER_S
-            if abs(offset.offset_us) > MAX_OFFSET_US:
-                fault = f"the clocks differ by {shift_s:+.0f} s; if it is one flight, give --merge"
-        return fault
+        if offset.share < FAIR_SHARE:
+            equal = counted(offset.copies, "equal frame")
+            return f"its {equal} are in {offset.share:.0%} of the time only"
+        if self.is_one_flight or abs(offset.offset_us) <= MAX_OFFSET_US:
+            return ""
+        shift_s = offset.offset_us / US_PER_S
+        return f"the clocks differ by {shift_s:+.0f} s; if it is one flight, give --merge"
 
     @property
     def shifts_us(self) -> list[int]:

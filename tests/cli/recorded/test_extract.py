@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings import files
 from gateway.recordings.vehicle_recording import VehicleRecording
-from gateway.recordings.workshop.extracts import RecordedParameter
+from gateway.recordings.workshop.extracts import parameter_text
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender
 from tests.kit.recordings import START_US, make_records, records_of, write_tlog
@@ -108,7 +108,7 @@ def test_integers_that_px4_sends_bytewise_are_read_as_integers(tmp_path: Path) -
     ("value", "text"), [(0.1, "0.1"), (1e-7, "1e-07"), (3.0, "3"), (16777217.5, "16777218")]
 )
 def test_parameter_is_written_with_the_digits_of_a_float(value: float, text: str) -> None:
-    assert RecordedParameter("X", float(np.float32(value)), 9).text == text
+    assert parameter_text(float(np.float32(value))) == text
 
 
 @pytest.mark.parametrize(("option", "count"), [("--mission", 3), ("--fence", 4), ("--rally", 1)])

@@ -1,7 +1,11 @@
 """Recordings joined in order of civil time, without repeated rows."""
 
+import re
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gateway.recordings.columns import TableRow
 from gateway.recordings.files import FlightError
@@ -38,34 +42,28 @@ def seconds_of(joined: RecordedTable) -> tuple[list[int], list[int]]:
     return (times / SECOND_US).astype(int).tolist(), [int(mark.text) for mark in marks]
 
 
-@pytest.mark.parametrize("spans", [((0, 40), (40, 80)), ((0, 40), (60, 90), (90, 99))])
-def test_recordings_are_ordered_by_civil_time(spans: tuple[tuple[int, int], ...]) -> None:
-    joined = joined_tables([table(*span, EPOCH_US) for span in spans])
-    times, _ = seconds_of(joined)
-    assert times == [second for span in spans for second in range(*span)]
-    assert joined.remarks == []
-
-
-@pytest.mark.parametrize("session", ["", "20260611-142530"])
-@pytest.mark.parametrize(
-    ("spans", "kept", "left_out"),
-    [
-        (((0, 40), (25, 60)), range(60), 14),
-        (((0, 40), (5, 12), (39, 50)), range(50), 7),
-        (((0, 40), (0, 40)), range(40), 39),
-    ],
+@given(
+    # Clocks that differ by a second or two are taken for one.
+    begins=st.lists(st.integers(0, 12).map(lambda k: 5 * k), min_size=1, max_size=4),
+    lengths=st.lists(st.integers(2, 40), min_size=4, max_size=4),
+    session=st.sampled_from(["", "20260611-142530"]),
 )
-def test_overlapping_rows_are_taken_once(
-    spans: tuple[tuple[int, int], ...], kept: range, left_out: int, session: str
+def test_rows_are_joined_in_order_and_overlapping_ones_taken_once(
+    begins: list[int], lengths: list[int], session: str
 ) -> None:
-    joined = joined_tables([table(*span, EPOCH_US, session) for span in spans])
+    """Cut and joined, a recording is itself; what two recordings cover is taken once."""
+    begins = [begin - min(begins) for begin in sorted(begins)]
+    ordered = [(begin, begin + length) for begin, length in zip(begins, lengths, strict=False)]
+    joined = joined_tables([table(*span, EPOCH_US, session) for span in ordered])
     times, marks = seconds_of(joined)
+    kept = sorted({second for span in ordered for second in range(*span)})
     # The last second of a recording may hold more than one row.
-    assert sorted(set(times)) == [*kept]
+    assert sorted(set(times)) == kept
     assert times == sorted(times)
-    assert sorted(set(marks)) == [*kept[::10]]
-    (remark,) = joined.remarks
-    assert remark.startswith(f"left out {left_out} rows")
+    assert sorted(set(marks)) == [second for second in kept if second % 10 == 0]
+    total = sum(end - begin for begin, end in ordered)
+    left_out = [int(re.findall(r"\d+", remark)[0]) for remark in joined.remarks]
+    assert len(times) + sum(left_out) == total
 
 
 @pytest.mark.parametrize("session", ["", "20260611-142530"])

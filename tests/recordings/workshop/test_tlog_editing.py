@@ -4,11 +4,15 @@ import math
 import re
 import struct
 from collections.abc import Callable
+from itertools import pairwise
 from os import SEEK_END
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.tlog import TlogScanner
@@ -217,18 +221,13 @@ def test_armed_state_of_a_gimbal_or_a_station_does_not_count() -> None:
     assert sum(map(len, cut)) == 0
 
 
-def test_armed_parts_are_cut_on_the_command_line(tmp_path: Path) -> None:
-    kept, _ = convert(tmp_path, armed_flight((20, 30)), "--armed", "--margin", 2.5)
-    assert kept[0].time_us == START_US + 17_500_000
-    assert kept[-1].time_us == START_US + 32 * SECOND_US
-
-
 @pytest.mark.parametrize(
     ("options", "kept_s"),
     [
         (("--from-mode", "auto"), [10, 11, 30, 31]),
         (("--from-mode", "AUTO", "--from-mode", "6"), [10, 11, 20, 21, 30, 31]),
         (("--from-mode", "AUTO", "--armed"), [30, 31]),
+        (("--armed", "--margin", "2.5"), [28, 29, 30, 31, 32, 33]),
         (("--from-mode", "AUTO", "--from-mode", "LAND", "--system", "1"), [10, 11, 30, 31]),
     ],
 )
@@ -341,8 +340,16 @@ def test_join_keeps_copies_and_times(tmp_path: Path) -> None:
     assert [r.time_us for r in kept] == sorted(r.time_us for r in kept)
 
 
-def test_files_one_behind_another_are_joined_in_order_of_time(tmp_path: Path) -> None:
-    kept, text = convert(tmp_path, MIXED[100:], MIXED[:100])
+EDGES = [k for k in range(1, len(MIXED)) if MIXED[k].time_us != MIXED[k - 1].time_us]
+
+
+@given(cuts=st.lists(st.sampled_from(EDGES), min_size=1, max_size=4, unique=True))
+@settings(max_examples=10)
+def test_cut_then_join_is_the_identity(cuts: list[int]) -> None:
+    edges = [0, *sorted(cuts), len(MIXED)]
+    parts = [MIXED[begin:end] for begin, end in pairwise(edges)]
+    with TemporaryDirectory() as folder:
+        kept, text = convert(Path(folder), *reversed(parts))
     assert kept == MIXED
     assert "cop" not in text
 
