@@ -218,11 +218,8 @@ def test_recording_without_samples_has_figures_and_is_no_failure(
     (tmp_path / "fixes.tlog").write_bytes(make_tlog(records))
     report(tmp_path / "fixes.tlog", batch / FLIGHTS[0], "-o", tmp_path / "out")
     flights = pd.read_csv(tmp_path / "out" / "flights.csv").set_index("recording")
-    assert flights.loc["fixes.tlog", ["aircraft", "duration, s", "distance, m"]].tolist() == [
-        7,
-        8,
-        0,
-    ]
+    fixes = flights.loc["fixes.tlog", ["aircraft", "duration, s", "distance, m"]]
+    assert fixes.tolist() == [7, 8, 0]
     assert flights["failed"].isna().all()
 
 
@@ -230,6 +227,8 @@ def test_two_recordings_with_equal_names_are_kept_apart(batch: Path, tmp_path: P
     for folder, name in (("x", FLIGHTS[0]), ("y", FLIGHTS[1])):
         (tmp_path / folder).mkdir()
         shutil.copy(batch / name, tmp_path / folder / "log_01_v1.csv")
+    (tmp_path / "z").mkdir()
+    assert "contains no recording" in report(tmp_path / "z", "-o", tmp_path / "out", code=2)
     report(tmp_path / "x", tmp_path / "y", "-o", tmp_path / "out")
     assert len(list((tmp_path / "out" / "fused").glob("log-*.csv"))) == 2
 
@@ -367,18 +366,21 @@ def test_broken_remote_file_is_reported_by_its_url(memory: str, tmp_path: Path) 
     assert "/mavgate-" not in text
 
 
-def test_missing_package_of_a_storage_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("memory://nothing/*.csv", "contains no recording"),
+        ("gopher://old/flights", "gopher"),
+        ("s3://bucket/", r"(?s)s3://bucket/: needs.*pip install s3fs"),
+    ],
+    ids=["empty", "unknown scheme", "missing package"],
+)
+def test_url_that_gives_no_recording_is_reported(
+    name: str, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "s3fs", None)
-    with pytest.raises(StorageError, match=r"(?s)s3://bucket/: needs.*pip install s3fs"):
-        items_of(["s3://bucket/"])
-
-
-def test_url_without_a_file_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match="contains no recording"):
-        items_of(["memory://nothing/*.csv"])
-    with pytest.raises(StorageError, match="gopher"):
-        items_of(["gopher://old/flights"])
-    assert "contains no recording" in report(tmp_path, "-o", tmp_path / "out", code=2)
+    with pytest.raises(StorageError, match=text):
+        items_of([name])
 
 
 @pytest.mark.parametrize(

@@ -146,36 +146,32 @@ class TestRanges:
         assert of_kind(found, NodeStatus)[0].sensors_present == 1
 
 
-class TestGpsGaps:
-    def test_missing_values_are_reported_as_unknown(self) -> None:
-        table = columns(gps_vn=None, gps_alt_m=None)
-        fix, *_ = of_kind(fly(RecordedFlight.from_columns(table)), GpsFix)
-        assert np.isnan([fix.speed_acc_mps, fix.v_acc_m]).all()
-        assert fix.h_acc_m == 2.0
-
-    def test_fixes_from_before_the_start_are_left_out(self) -> None:
-        early = columns()["gps_time_s"] - 5.0
-        assert len(RecordedFlight.from_columns(columns(gps_time_s=early)).gps_time_s) == 25
+def test_missing_values_are_reported_as_unknown() -> None:
+    table = columns(gps_vn=None, gps_alt_m=None)
+    fix, *_ = of_kind(fly(RecordedFlight.from_columns(table)), GpsFix)
+    assert np.isnan([fix.speed_acc_mps, fix.v_acc_m]).all()
+    assert fix.h_acc_m == 2.0
 
 
-class TestRefusals:
-    @pytest.mark.parametrize(
-        ("changes", "why"),
-        [
-            ({"ay": None, "gz": None}, "columns missing: ay, gz"),
-            ({"time_s": np.where(TIME_S == 100.4, 100.36, TIME_S)}, r"decreases at 100\.36 s"),
-            ({"ax": np.full(ROWS, NAN)}, "0 rows"),
-        ],
-        ids=["columns", "time", "samples"],
-    )
-    def test_unusable_recording_is_refused(self, changes: dict[str, Any], why: str) -> None:
-        with pytest.raises(ValueError, match=why):
-            RecordedFlight.from_columns(columns(**changes))
+def test_fixes_from_before_the_start_and_rows_without_samples_are_left_out() -> None:
+    table = columns(gps_time_s=columns()["gps_time_s"] - 5.0)
+    table["ax"][5] = NAN
+    flight = RecordedFlight.from_columns(table)
+    assert (len(flight.gps_time_s), len(flight.time_s)) == (25, ROWS - 1)
 
-    def test_rows_without_samples_are_skipped(self) -> None:
-        ax = columns()["ax"]
-        ax[5] = NAN
-        assert len(RecordedFlight.from_columns(columns(ax=ax)).time_s) == ROWS - 1
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"ay": None, "gz": None}, "columns missing: ay, gz"),
+        ({"time_s": np.where(TIME_S == 100.4, 100.36, TIME_S)}, r"decreases at 100\.36 s"),
+        ({"ax": np.full(ROWS, NAN)}, "0 rows"),
+    ],
+    ids=["columns", "time", "samples"],
+)
+def test_unusable_recording_is_refused(changes: dict[str, Any], why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        RecordedFlight.from_columns(columns(**changes))
 
 
 @pytest.mark.io

@@ -40,16 +40,13 @@ def make_report(made: Case | PilotFlight, other: Case | None = None) -> Report:
     sections, facts, description = [the_flight(flight)], facts_of(flight), NO_SAMPLES
     if isinstance(made, Case):
         description = made.flight.description
-        facts += _sample_facts(made)
+        samples = f"IMU samples, {made.flight.rate_hz:.0f} a second"
+        facts += [
+            Fact(f"{len(made.flight.time_us)}", samples),
+            Fact(f"{len(made.fixes)}", "usable GPS fixes"),
+            Fact(made.chosen, "estimator"),
+        ]
         sections += [section for build in SECTIONS if (section := build(made)) is not None]
         if other is not None:
             sections.insert(0, comparison(made, other))
     return Report(f"Flight report: {flight.name}", description, facts, sections)
-
-
-def _sample_facts(case: Case) -> list[Fact]:
-    return [
-        Fact(f"{len(case.flight.time_us)}", f"IMU samples, {case.flight.rate_hz:.0f} a second"),
-        Fact(f"{len(case.fixes)}", "usable GPS fixes"),
-        Fact(case.chosen, "estimator"),
-    ]
