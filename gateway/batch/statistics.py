@@ -114,7 +114,6 @@ def why_leads(results: Sequence[FlightResult]) -> str:
 
 
 def _medians_m(results: Sequence[FlightResult], key: str) -> dict[str, float]:
-    """Return the median error of each estimator."""
     names = {name for result in results for name in result.figures.get(key, {})}
     return {
         name: float(

@@ -157,7 +157,6 @@ def _known(figures: Mapping[str, float]) -> dict[str, float]:
 
 
 def _page_of(made: Case | PilotFlight, name: str) -> Files:
-    """Make the page of a flight."""
     # Imported here: these require the extra `plot`, and take a second to import.
     from gateway.analysis.reporting.compose import make_report
     from gateway.analysis.reporting.page import write_report

@@ -145,7 +145,6 @@ class GpsSampler:
     def _measure(
         self, valid_s: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return latitude, longitude, height and velocity with their errors."""
         size = len(valid_s)
         truth = self._trajectory.truth_at(valid_s)
         off_m = POSITION_WANDER_M * self._position_wander.draw(size)

@@ -289,7 +289,6 @@ def _gps_samples(flight: RecordedFlight, start_unix_us: int) -> GpsSamples:
 
 
 def _complete(vectors: FloatArray) -> BoolArray:
-    """Return which rows contain no NaN."""
     return np.asarray(np.isfinite(vectors).all(axis=1))
 
 

@@ -265,7 +265,6 @@ def mag_counts(field_ut: FloatArray, gain: int) -> IntArray:
 
 
 def _imperfect(rng: np.random.Generator) -> FloatArray:
-    """Draw a matrix of scale and misalignment errors."""
     matrix = MISALIGNMENT_RAD * rng.standard_normal((3, 3))
     np.fill_diagonal(matrix, 1.0 + SCALE_SPREAD * rng.standard_normal(3))
     return matrix

@@ -379,7 +379,6 @@ class Workbench:
         return from_euler_array(self._angles(time_s)[0])
 
     def _angles(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return roll, pitch and yaw and their rates, shape (N, 3)."""
         since_s = np.maximum(time_s - self._turned_from_s, 0.0)
         # The rate increases gradually over some seconds: s' = 1 - exp(-t).
         s, s_rate = since_s + np.expm1(-since_s), -np.expm1(-since_s)

@@ -46,13 +46,8 @@ def _left_over() -> Iterator[None]:
 
 @pytest.mark.io
 @pytest.mark.usefixtures("_left_over")
-def test_worker_does_not_collect_garbage_of_its_parent() -> None:
+def test_processes_do_not_collect_garbage_of_their_parent() -> None:
     assert dict(LocalProcesses(1).run(collect, [0])) == {0: []}
-
-
-@pytest.mark.io
-@pytest.mark.usefixtures("_left_over")
-def test_forked_process_does_not_collect_garbage_of_its_parent() -> None:
     with forked(collect, 2) as run:
         assert dict(run([0, 1])) == {0: [], 1: []}
 

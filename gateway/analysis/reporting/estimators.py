@@ -138,7 +138,6 @@ def error_table(
 
 
 def _reference(case: Case) -> Reference | None:
-    """Return the flight's own reference, or its interpolated GPS."""
     if case.flight.reference is not None:
         return case.flight.reference
     if case.frame is None:

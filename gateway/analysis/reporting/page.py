@@ -1,7 +1,7 @@
 """Write the report as one self-contained HTML page, and its figures and tables as files."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -167,11 +167,6 @@ def prose(text: str) -> Markup:
     """Escape a text, and set parts in backticks as code."""
     escaped = str(jinja2.filters.do_forceescape(text))
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped))
-
-
-def count_pictures(sections: Iterable[Section]) -> int:
-    """Count the figures of a report."""
-    return sum(len(section.pictures) for section in sections)
 
 
 def _drawn(picture: Picture, folder: Path) -> Drawn:

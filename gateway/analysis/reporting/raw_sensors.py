@@ -36,11 +36,6 @@ def acceleration(case: Case) -> Section:
     """Build the section; only the filters' design if the flight's rate is too low for them."""
     paper, rate_hz = case.fusion.estimation.paper, case.flight.rate_hz
     cutoff = paper.accel_cutoff_hz
-    of_paper = ReportTable(
-        "filters_paper",
-        compare(paper, PAPER_RATE_HZ),
-        f"At the paper's {PAPER_RATE_HZ:.0f} samples/s.",
-    )
     if cutoff >= 0.5 * rate_hz:
         return Section(
             "Acceleration filters",
@@ -48,7 +43,7 @@ def acceleration(case: Case) -> Section:
             "half the sample rate is the highest possible frequency. So there is nothing to "
             "plot for this flight; the table is for the filters at the paper's rate.",
             [],
-            [of_paper],
+            [_paper_table(case)],
         )
     return Section(
         "Acceleration filters",
@@ -75,8 +70,16 @@ def acceleration(case: Case) -> Section:
                 f"At this flight's {rate_hz:.0f} samples/s; times were taken on this machine for "
                 "three axes.",
             ),
-            of_paper,
+            _paper_table(case),
         ],
+    )
+
+
+def _paper_table(case: Case) -> ReportTable:
+    return ReportTable(
+        "filters_paper",
+        compare(case.fusion.estimation.paper, PAPER_RATE_HZ),
+        f"At the paper's {PAPER_RATE_HZ:.0f} samples/s.",
     )
 
 

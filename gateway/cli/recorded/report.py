@@ -173,13 +173,14 @@ def _report_one(
 
 
 def _drawn(make: Callable[[], Report], output: Path) -> Path:
-    from gateway.analysis.reporting.page import count_pictures, write_report
+    from gateway.analysis.reporting.page import write_report
 
     with progress_bar(TimeElapsedColumn()) as progress:
         task = progress.add_task("fusing", total=None)
         progress.refresh()
         made = make()
-        progress.update(task, description="drawing", total=count_pictures(made.sections))
+        count = sum(len(section.pictures) for section in made.sections)
+        progress.update(task, description="drawing", total=count)
 
         def advance() -> None:
             # No thread for the progress bar, since drawing processes are forked from this one.

@@ -278,7 +278,6 @@ class Anonymiser(FrameEdit):
     def _changes(
         self, treatment: Treatment, fields: Mapping[str, Any], message_id: int
     ) -> dict[str, Any]:
-        """Return the new values of the fields of a message, also unchanged ones."""
         changes: dict[str, Any] = dict(treatment.fixed)
         if treatment.has_command:
             changes |= self._parameters(fields)
@@ -321,7 +320,6 @@ class Anonymiser(FrameEdit):
         return dict(zip((pair.lat, pair.lon), moved, strict=True))
 
     def _parameters(self, fields: Mapping[str, Any]) -> dict[str, float]:
-        """Return the new values of the parameters of a command or mission item."""
         changes: dict[str, float] = {}
         names, is_local = _names_of(fields), fields.get("frame") in LOCAL_FRAMES
         for number, treatment in enumerate(_parameters_of(fields) or ""):
@@ -407,7 +405,6 @@ def _is_unknown(value: float) -> bool:
 
 
 def _names_of(fields: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of the parameters of a command or mission item."""
     return ITEM_PARAMETERS if "x" in fields else PARAMETERS
 
 
@@ -433,5 +430,4 @@ def _is_near(lat_deg: float, lon_deg: float, other_lat_deg: float, other_lon_deg
 
 
 def _wrapped(lon_deg: float) -> float:
-    """Return a longitude between -180 and 180 degrees."""
     return math.remainder(lon_deg, 360.0)

@@ -315,7 +315,6 @@ def _write_table(flight: FlightToWrite) -> Iterator[bytes]:
 
 
 def _drawn(draw: Callable[[str, list[VehicleTrack]], Iterator[str]]) -> Write:
-    """Return a writer of map tracks."""
     return lambda flight: (piece.encode() for piece in draw(flight.title, _vehicles(flight)))
 
 
