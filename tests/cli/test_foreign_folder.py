@@ -71,9 +71,3 @@ def test_every_python_child_is_started_with_a_safe_module_path() -> None:
                     if options not in (["-P"], ["-I"]):
                         unsafe.append(f"{path.relative_to(ROOT)}:{first.lineno}")
     assert unsafe == []
-
-
-def test_service_runs_the_installed_script() -> None:
-    unit = (ROOT / "tools" / "mavgate.service").read_text()
-    [start] = [line for line in unit.splitlines() if line.startswith("ExecStart=")]
-    assert start.startswith("ExecStart=/usr/bin/mavgate run")

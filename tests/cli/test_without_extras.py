@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
-from gateway.cli.app import COMMANDS, load_command
+from gateway.cli.app import COMMANDS
 from gateway.cli.live.doctor import EXTRA_USES
 from gateway.extras import EXTRAS
+from tests.cli.test_app import ALL
 from tests.kit.process import python
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -34,12 +35,7 @@ print(json.dumps(found))
 """
 
 
-def leaves_of(command: Any, words: str) -> list[str]:
-    below = getattr(command, "commands", {}).items()
-    return [leaf for name, each in below for leaf in leaves_of(each, f"{words} {name}")] or [words]
-
-
-LEAVES = [leaf for name in COMMANDS for leaf in leaves_of(load_command(name), name)]
+LEAVES = [" ".join(words) for words in ALL if not any(words == other[:-1] for other in ALL)]
 ENDLESS = {"run", "demo"}
 """They serve until they are interrupted."""
 
