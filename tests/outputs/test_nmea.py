@@ -19,7 +19,7 @@ from gateway.vehicle_state.newest import POSITION_OLD_US
 from tests.kit.hub import receive
 from tests.kit.messages import HERE, at, beat, estimator, gps
 from tests.kit.process import START_LIMIT_S
-from tests.outputs.conftest import OutputRig
+from tests.outputs.conftest import OutputRig, connected
 from tests.ports import free_port
 
 ABSOLUTE = mavlink.ESTIMATOR_POS_HORIZ_ABS
@@ -55,26 +55,25 @@ async def test_sentences_contain_position_motion_and_heading(outputs: OutputRig)
     assert output.counters.sent == 1
 
 
-@pytest.mark.parametrize(
-    ("messages", "age_us", "is_valid"),
-    [
-        ([at()], 0, True),
-        ([at()], POSITION_OLD_US, True),
-        ([at()], POSITION_OLD_US + 1, False),
-        ([at(0.0, 0.0)], 0, False),
-        ([at(95.0, 0.0)], 0, False),
-        ([gps(kind=1)], 0, False),
-        ([gps(kind=2)], 0, True),
-        ([at(), estimator(ABSOLUTE)], 0, True),
-        ([at(), estimator(0)], 0, False),
-        ([at(), estimator(ABSOLUTE | mavlink.ESTIMATOR_CONST_POS_MODE)], 0, False),
-        ([gps(), estimator(0)], 0, True),
-        ([], 0, False),
-    ],
-)
-async def test_position_is_void_unless_valid_and_new(
-    outputs: OutputRig, messages: list[Any], age_us: int, is_valid: bool
-) -> None:
+POSITIONS: dict[str, tuple[list[Any], int, bool]] = {
+    "new": ([at()], 0, True),
+    "just new enough": ([at()], POSITION_OLD_US, True),
+    "old": ([at()], POSITION_OLD_US + 1, False),
+    "zero": ([at(0.0, 0.0)], 0, False),
+    "beyond the pole": ([at(95.0, 0.0)], 0, False),
+    "GPS without a fix": ([gps(kind=1)], 0, False),
+    "GPS with a 2D fix": ([gps(kind=2)], 0, True),
+    "absolute": ([at(), estimator(ABSOLUTE)], 0, True),
+    "not absolute": ([at(), estimator(0)], 0, False),
+    "constant": ([at(), estimator(ABSOLUTE | mavlink.ESTIMATOR_CONST_POS_MODE)], 0, False),
+    "GPS beside an estimator without a position": ([gps(), estimator(0)], 0, True),
+    "none": ([], 0, False),
+}
+
+
+@pytest.mark.parametrize("name", POSITIONS)
+async def test_position_is_void_unless_valid_and_new(outputs: OutputRig, name: str) -> None:
+    messages, age_us, is_valid = POSITIONS[name]
     await outputs.udp("nmea")
     outputs.hear(beat(), *messages)
     outputs.clock.now_us = age_us
@@ -220,12 +219,7 @@ async def test_gpsd_reports_the_position(outputs: OutputRig) -> None:
 
 async def first_fix(outputs: OutputRig, port: int) -> Any:
     """Return the first report of gpsd with a position and a speed."""
-    while True:
-        try:
-            reader, writer = await asyncio.open_connection("127.0.0.1", port)
-            break
-        except ConnectionRefusedError:
-            await asyncio.sleep(0.01)
+    reader, writer = await connected(port)
     writer.write(b'?WATCH={"enable":true,"json":true};\n')
     reading = asyncio.get_running_loop().create_task(reader.readline())
     try:

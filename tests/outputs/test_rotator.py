@@ -18,7 +18,7 @@ from gateway.vehicle_state.newest import NewestState
 from gateway.vehicle_state.positions import Position
 from tests.kit.messages import HERE, at, beat, gps, home
 from tests.kit.process import START_LIMIT_S
-from tests.outputs.conftest import OutputRig
+from tests.outputs.conftest import OutputRig, connected
 from tests.ports import free_port
 
 EARTH_M = 6_371_000.0
@@ -115,12 +115,7 @@ async def test_direction_is_a_proprietary_sentence(outputs: OutputRig) -> None:
 @pytest.mark.skipif(shutil.which("rotctld") is None, reason="needs hamlib's rotctld")
 class TestHamlib:
     async def ask(self, port: int, text: str, lines: int) -> list[str]:
-        while True:
-            try:
-                reader, writer = await asyncio.open_connection("127.0.0.1", port)
-                break
-            except ConnectionRefusedError:
-                await asyncio.sleep(0.01)
+        reader, writer = await connected(port)
         try:
             writer.write(text.encode())
             return [(await reader.readline()).decode().strip() for _ in range(lines)]
