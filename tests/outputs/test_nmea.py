@@ -66,7 +66,7 @@ POSITIONS: dict[str, tuple[list[Any], int, bool]] = {
     "absolute": ([at(), estimator(ABSOLUTE)], 0, True),
     "not absolute": ([at(), estimator(0)], 0, False),
     "constant": ([at(), estimator(ABSOLUTE | mavlink.ESTIMATOR_CONST_POS_MODE)], 0, False),
-    "GPS beside an estimator without a position": ([gps(), estimator(0)], 0, True),
+    "GPS and an estimator without a position": ([gps(), estimator(0)], 0, True),
     "none": ([], 0, False),
 }
 

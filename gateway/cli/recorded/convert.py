@@ -286,7 +286,7 @@ def fuse_log(
     fuse_with: opt.FuseWith = "recorded",
     position: opt.Placing = "causal",
     smooth: opt.Smooth = False,
-    both: opt.Beside = False,
+    both: opt.BothEstimates = False,
     begin: opt.From = None,
     end: opt.To = None,
     columns: opt.Columns = None,

@@ -67,7 +67,7 @@ def play(
         bool,
         typer.Option("--fuse", help="For an autopilot's log: mavgate's states, not its own."),
     ] = False,
-    both: opt.Beside = False,
+    both: opt.BothEstimates = False,
     fuse_with: opt.FuseWith = "recorded",
     columns: opt.Columns = None,
     with_commands: Annotated[

@@ -16,7 +16,7 @@ Smooth = Annotated[
         "an hour of flight takes 120 MB of memory.",
     ),
 ]
-Beside = Annotated[
+BothEstimates = Annotated[
     bool,
     typer.Option(
         "--beside",
