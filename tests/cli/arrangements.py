@@ -58,6 +58,9 @@ PARM, 10000000, MAV_SYSID, 7, 1"""
 EMPTY = {
     "formats": b"\x83\x30",
     "imu": b"\x80\x83\x27IMU\0fffffffff" + bytes(7) + b"AccX,AccY,AccZ,GyroX,GyroY",
+    "sdlog2": b"\x80\x83\x27IMU\0fffffffff"
+    + bytes(7)
+    + b"AccX,AccY,AccZ,GyroX,GyroY,GyroZ,MagX,MagY,MagZ",
     "rows": b"\x80\x83\x1bIMU\0Qffffff" + bytes(9) + b"TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ",
 }
 """Formats of DataFlash logs without a sample."""
@@ -213,8 +216,11 @@ def dataflash(folder: Path, kind: str) -> None:
 
 
 def empty_dataflash(folder: Path, kind: str) -> None:
-    data = b"\xa3\x95" + EMPTY[kind].ljust(87, b"\0") + bytes(600)
-    (folder / "a.bin").write_bytes(data)
+    data = b"\xa3\x95" + EMPTY[kind].ljust(87, b"\0")
+    rows = (
+        20 * (b"\xa3\x95\x83" + struct.pack("<9f", *range(9))) if kind == "sdlog2" else bytes(600)
+    )
+    (folder / "a.bin").write_bytes(data + rows)
 
 
 def samples(delimiter: str, *, comma: bool = False, step: int = 1) -> str:

@@ -7,7 +7,7 @@ milliseconds (TimeMS; T in GPS) and names the second sensor IMU2, GPS2 and so on
 import contextlib
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from datetime import UTC, datetime
 from functools import cache
 from importlib.resources import files
@@ -215,8 +215,10 @@ class RowReader:
     def _times_of(self, fix: Message) -> dict[str, int]:
         """Return the time of week of a fix, and its civil time; firmware before 3.3 has TimeMS."""
         week = getattr(fix, "GWk", 0) or getattr(fix, "Week", 0)
-        week_ms = getattr(fix, "GMS", None)
-        found = {"week_ms": int(fix.TimeMS if week_ms is None else week_ms)}
+        week_ms = getattr(fix, "GMS", getattr(fix, "TimeMS", None))
+        if week_ms is None:
+            return {}
+        found = {"week_ms": int(week_ms)}
         if week and fix.Status >= FIX_2D:
             counted_us = week * WEEK_US + found["week_ms"] * 1000
             found["utc_us"] = unix_us_of_gps(_in_era(counted_us))
@@ -343,7 +345,11 @@ def open_record(path: Path, options: ReadOptions, *, sampled: bool = False) -> A
     log, known = DataFlash(path, options), table()
     forms = {form.name: _Kind(form) for form in log.log.formats.values()}
     counts = log.counts
-    present = {kind.topic for name, kind in forms.items() if counts.get(name)}
+    present = {
+        kind.topic
+        for name, kind in forms.items()
+        if counts.get(name) and not _lacking(kind.topic, log.columns[name])
+    }
     if log.is_damaged and not present - {"FMT"}:
         # The index ends at the damage, so the rest of the log may have rows of any topic.
         present = {*known.topics}
@@ -407,14 +413,21 @@ def _unix_us_at(log: DataFlash, own_us: int) -> int | None:
     return unix_us_of_gps(_in_era(zero_us + own_us))
 
 
+def _lacking(topic: str, columns: Set[str]) -> Set[str]:
+    """Return the columns without which samples or fixes of a format cannot be used."""
+    if topic == "GPS":
+        return {"Lat", "Lng"} - columns
+    if topic != "IMU":
+        return frozenset()
+    return IMU_COLUMNS - columns | ({"TimeUS"} if columns.isdisjoint(TIME_COLUMNS) else set())
+
+
 def _why_no_samples(formats: Mapping[str, set[str]], *, is_undecoded: bool) -> str:
     if not formats.keys() - {"FMT"}:
         return "it has no list of formats (FMT), without which its messages cannot be decoded"
     for name, columns in formats.items():
-        lacking = IMU_COLUMNS - columns | (
-            {"TimeUS"} if columns.isdisjoint(TIME_COLUMNS) else set()
-        )
-        if table().aliases.get(name, (name, 0))[0] == "IMU" and lacking:
+        topic = table().aliases.get(name, (name, 0))[0]
+        if topic == "IMU" and (lacking := _lacking(topic, columns)):
             return (
                 f"its {name} messages cannot be decoded: they have no {', '.join(sorted(lacking))}"
                 ", as in a log of sdlog2, PX4's logger before ULog, which is not supported"
