@@ -225,6 +225,16 @@ def test_samples_behind_a_lost_header_are_read(short: Path, tmp_path: Path, name
     assert any("before its first message" in remark for remark in table.remarks)
 
 
+def test_fixes_behind_lost_formats_are_read(tmp_path: Path) -> None:
+    """The first row is one of a lost format, so that the index of the log is empty."""
+    formats = {name: form for name, form in flown.DATAFLASH.items() if name != "GPA"}
+    rows = [row for row in flown.dataflash_rows(4.0) if row[0] != "GPA"]
+    lost = len(flown.dataflash_of({name: formats[name] for name in ("FMT", "PARM")}, []))
+    data = bytes(lost) + flown.dataflash_of(formats, rows)[lost:]
+    _, found = rows_of(flown.write(tmp_path / "damaged.bin", data))
+    assert sum(row.gps is not None for row in found) == sum(name == "GPS" for name, _ in rows)
+
+
 def test_download_of_a_log_in_a_tlog_is_a_tlog(short: Path, tmp_path: Path) -> None:
     frame = b"\xfd\x09\0\0\0\x01\x01\0\0\0" + bytes(11)
     for name in ("new.ulg", "flight.bin"):
