@@ -1,7 +1,7 @@
 """Measure work on many recordings: serial, in processes, on a Dask cluster.
 
-    python -m tools.bench_batch judge --flights 24     # or report, sweep: serial and in processes
-    python -m tools.bench_batch dask --flights 24      # judge: a cluster of two, and processes
+    python -m tools.bench_batch evaluate --flights 24  # or report, sweep: serial and in processes
+    python -m tools.bench_batch dask --flights 24      # evaluate: a cluster of two, and processes
     python -m tools.bench_batch growth --flights 200   # cost and memory against the number of files
     python -m tools.bench_batch catalogue --files 10000   # index, index again, query
 
@@ -35,7 +35,7 @@ from gateway.analysis.sweep import parse_axis
 from gateway.batch.catalogue import CATALOGUE_NAME, find_flights, geojson_of, index_folder
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
 from gateway.batch.storage import items_of
-from gateway.batch.tasks import FlightTask, JudgeTask, ResultFolder, SweepTask, run_batch
+from gateway.batch.tasks import EvaluateTask, FlightTask, ResultFolder, SweepTask, run_batch
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, encode_head
@@ -60,7 +60,7 @@ QUERIES = (
     "gps_outages > 0 or faults > 0",
     "error is not null",
 )
-TASKS = ("judge", "report", "sweep")
+TASKS = ("evaluate", "report", "sweep")
 PARTS = (*TASKS, "dask", "growth", "catalogue")
 BROKEN = 100
 """One in this many files of the catalogue is broken."""
@@ -86,7 +86,7 @@ def main() -> None:
         fresh_process(catalogue, folder / f"catalogue-{options.files}", options.files)
         return
     make(folder / f"flights-{options.duration:.0f}", flights, options.duration)
-    task = part if part in TASKS else "judge"
+    task = part if part in TASKS else "evaluate"
     runs = {
         "growth": [("processes", max(flights // n, 1)) for n in (8, 4, 2, 1)],
         "dask": [("processes", flights), ("dask", flights)],
@@ -130,7 +130,7 @@ def task_of(part: str) -> FlightTask:
     if part == "sweep":
         axes = tuple(parse_axis(name, "0.1,0.5,0.9") for name in ("alpha", "beta"))
         return SweepTask(OPTIONS, axes, "held_m", 5, 0.0)
-    return JudgeTask(OPTIONS, pages=part == "report")
+    return EvaluateTask(OPTIONS, pages=part == "report")
 
 
 Used = Callable[[], tuple[float, float]]

@@ -11,7 +11,7 @@ enum ImuFamily : uint8_t {
     IMU_MPU6050,  // WHO_AM_I 0x68
     IMU_MPU6500,  // 0x70, 0x71 (MPU9250), 0x73 (MPU9255), 0x74 (MPU6515)
     IMU_ICM20689, // 0x98, 0x12 (ICM-20602), 0x19 (MPU6886), 0xAF (ICM-20608)
-    IMU_UNKNOWN,  // any other id: used alike, its self-test is not judged
+    IMU_UNKNOWN,  // any other id: used alike, its self-test is not evaluated
 };
 
 ImuFamily imu_family(uint8_t id);

@@ -353,7 +353,7 @@ def track_of(time_us: IntArray, states: FloatArray) -> FlightTrack:
     )
 
 
-def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight:
+def compared_with(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight:
     """Use the states of a recording as a flight's reference.
 
     Raises ValueError if the recording contains no states.
@@ -361,7 +361,7 @@ def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight
     states = [block.cells[has_group(block.cells, NAV)][:, NAV] for block in blocks]
     track = _recorded_states(flight, states) if states else None
     if track is None:
-        raise ValueError(f"{name}: contains no states to judge by")
+        raise ValueError(f"{name}: contains no states to compare with")
     return replace(
         flight, reference=Reference(track, is_exact=False, description=f"the states in {name}")
     )

@@ -227,9 +227,9 @@ def best_of(trials: Sequence[Trial], metric: Metric) -> Values:
 
     The table is not used, since its numbers are NumPy types.
     """
-    judged = COLUMN_OF[metric]
-    scored = [trial for trial in trials if not math.isnan(trial[1][judged])]
-    return min(scored, key=lambda trial: trial[1][judged])[0]
+    column = COLUMN_OF[metric]
+    scored = [trial for trial in trials if not math.isnan(trial[1][column])]
+    return min(scored, key=lambda trial: trial[1][column])[0]
 
 
 def idle_axes(contest: Contest, axes: Sequence[Axis]) -> list[str]:

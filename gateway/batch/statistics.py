@@ -161,15 +161,15 @@ def write_flights_page(
     # Imported here: these require the extra `plot`, which the command has checked.
     from gateway.analysis.reporting.page import Fact, Report, ReportTable, Section, write_report
 
-    judged = [result for result in results if HELD in result.figures]
+    evaluated = [result for result in results if HELD in result.figures]
     broken = [result for result in results if result.error is not None]
     sections = [
         Section(
             "Errors by aircraft and estimator",
             "Each flight was fused without every fifth fix and scored at those: figures are the "
-            f"root mean square errors of the flights, horizontal. {why_leads(judged)}".strip(),
-            [_picture(judged)] if any(result.figures[HELD] for result in judged) else [],
-            [ReportTable("errors", errors_by_group(judged), "Errors at withheld fixes.")],
+            f"root mean square errors of the flights, horizontal. {why_leads(evaluated)}".strip(),
+            [_picture(evaluated)] if any(result.figures[HELD] for result in evaluated) else [],
+            [ReportTable("errors", errors_by_group(evaluated), "Errors at withheld fixes.")],
         )
     ]
     if compared is not None:
@@ -189,7 +189,7 @@ def write_flights_page(
     facts = [
         Fact(str(len(results) - len(broken)), "flights"),
         Fact(f"{seconds / 3600.0:.1f} h", "recorded"),
-        Fact(str(len({result.vehicle for result in judged})), "aircraft"),
+        Fact(str(len({result.vehicle for result in evaluated})), "aircraft"),
         Fact(str(len(broken)), "recordings that failed"),
     ]
     description = "Many flights, fused again by every estimator."

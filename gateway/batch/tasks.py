@@ -116,7 +116,7 @@ class FlightTask(ABC):
 
 
 @dataclass(frozen=True)
-class JudgeTask(FlightTask):
+class EvaluateTask(FlightTask):
     """Score every estimator at withheld fixes, write the states of the settings, and a page."""
 
     pages: bool

@@ -95,7 +95,7 @@ def _checksum(data: ByteArray, at: int, extra: ExtraArray) -> int:
 
 
 @compiled
-def _judge(
+def _check_record(
     data: ByteArray, at: int, final: bool, strict: bool, in_step: bool, extra: ExtraArray
 ) -> int:
     """Return the frame size of the record at `at`; 0 if there is none, -1 if bytes are missing."""
@@ -183,7 +183,7 @@ def _walk(
     at = count = damaged = 0
     bad_from = -1
     while at < data.shape[0]:
-        size = _judge(data, at, final, strict, in_step, extra)
+        size = _check_record(data, at, final, strict, in_step, extra)
         if size == _WAIT:
             break
         if size == 0:

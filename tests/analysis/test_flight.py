@@ -12,10 +12,10 @@ from gateway.analysis.flight import (
     Flight,
     FlightTrack,
     at_times,
+    compared_with,
     fixes_of,
     flight_of_blocks,
     fuse_track,
-    judged_by,
 )
 from gateway.analysis.metrics import position_error_m, rms
 from gateway.analysis.reporting.compose import make_report
@@ -145,14 +145,14 @@ def test_report_without_reference_compares_recorded_states() -> None:
 
 def test_states_of_another_recording_serve_as_reference() -> None:
     plain = replace(short_flight(), reference=None)
-    judged = judged_by(plain, [block_of(rows(raw=False))], "ref.csv")
-    assert judged.reference is not None
-    assert not judged.reference.is_exact
-    assert "ref.csv" in judged.reference.description
-    known = np.isfinite(judged.reference.track.lat_deg)
+    compared = compared_with(plain, [block_of(rows(raw=False))], "ref.csv")
+    assert compared.reference is not None
+    assert not compared.reference.is_exact
+    assert "ref.csv" in compared.reference.description
+    known = np.isfinite(compared.reference.track.lat_deg)
     assert 20.0 < known.sum() / 50.0 < 30.0
     with pytest.raises(ValueError, match=r"ref\.csv: contains no states"):
-        judged_by(plain, [block_of([TableRow(0)])], "ref.csv")
+        compared_with(plain, [block_of([TableRow(0)])], "ref.csv")
 
 
 def test_nearest_row_is_used_within_time_limit() -> None:

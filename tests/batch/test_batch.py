@@ -22,8 +22,8 @@ from gateway.batch.executors import LocalProcesses, ThisProcess, WorkFailed
 from gateway.batch.storage import BatchItem, StorageError, items_of
 from gateway.batch.tasks import (
     RESULTS,
+    EvaluateTask,
     FlightResult,
-    JudgeTask,
     ResultFolder,
     read_results,
     run_batch,
@@ -103,7 +103,7 @@ def test_changed_settings_repeat_the_work(batch: Path, tmp_path: Path) -> None:
     folder = ResultFolder(tmp_path)
     for choice in ("recorded", "current", "recorded"):
         options = ReadOptions(OPTIONS.current, choice=choice)
-        run_batch(JudgeTask(options, pages=False), items, Counted(1), folder, lambda *_: None)
+        run_batch(EvaluateTask(options, pages=False), items, Counted(1), folder, lambda *_: None)
     # A digest each time, and two works.
     assert sorted(seen) == ["str", "str", "str", "tuple", "tuple"]
 
@@ -158,7 +158,7 @@ def test_missing_file_is_reported_in_plain_words(batch: Path, tmp_path: Path) ->
     gone = tmp_path / "gone.csv"
     items = [*items_of([str(batch / FLIGHTS[0])]), BatchItem((str(gone),))]
     reported: list[tuple[str, int, int]] = []
-    task = JudgeTask(OPTIONS, pages=False)
+    task = EvaluateTask(OPTIONS, pages=False)
     results = run_batch(task, items, LocalProcesses(1), None, lambda *now: reported.append(now))
     assert [done for _, done, total in reported if total == 2] == [1, 2, 2]
     assert [result.error for result in results] == [None, f"{gone}: No such file or directory"]
@@ -340,7 +340,7 @@ def test_remote_files_are_fetched_once_unless_changed(batch: Path, tmp_path: Pat
     def fetched() -> list[str]:
         items = items_of(["elsewhere://user:secret@host/flights"])
         _Elsewhere.fetched.clear()
-        task = JudgeTask(OPTIONS, pages=False)
+        task = EvaluateTask(OPTIONS, pages=False)
         results = run_batch(task, items, ThisProcess(), folder, lambda *_: None)
         digests = [sha256(storage.store[f"/flights/{name}"].getvalue()) for name in FLIGHTS[:2]]
         assert [r.digest for r in results[:2]] == [digest.hexdigest() for digest in digests]
@@ -403,5 +403,5 @@ def test_signing_passphrase_is_not_sent_to_workers() -> None:
     vehicle = msgspec.structs.replace(AircraftSettings().vehicle, signing_passphrase="secret word")
     aircraft = msgspec.structs.replace(AircraftSettings(), vehicle=vehicle)
     options = without_secrets(ReadOptions(PipelineSettings(aircraft, {2: aircraft})))
-    assert b"secret word" not in JudgeTask(options, pages=False).fingerprint
+    assert b"secret word" not in EvaluateTask(options, pages=False).fingerprint
     assert options.current.aircraft[2].vehicle.signing_passphrase == ""

@@ -41,7 +41,7 @@ def test_errors_are_summed_up_by_aircraft_and_estimator() -> None:
     ]
 
 
-def test_page_of_flights_too_short_to_be_judged_has_no_picture(tmp_path: Path) -> None:
+def test_page_of_flights_too_short_to_be_evaluated_has_no_picture(tmp_path: Path) -> None:
     page = write_flights_page([flight("a_01_v1.csv", 1)], tmp_path, None).read_text()
     assert "a_01_v1.csv" in page
     assert "Share of the flights" not in page

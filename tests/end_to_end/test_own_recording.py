@@ -245,7 +245,7 @@ def test_sweep_of_the_seconds_before_the_take_off_teaches_nothing(
     assert f"{table.name}: at rest throughout" in done.output
 
 
-def test_folder_is_judged_by_the_batch_command(folder: Path, tmp_path: Path) -> None:
+def test_folder_is_evaluated_by_the_batch_command(folder: Path, tmp_path: Path) -> None:
     invoke("report", "--quick", folder, "-o", tmp_path / "out", "--jobs", 1, code=0)
     page = (tmp_path / "out" / "index.html").read_text()
     assert all(table.name in page for table in folder.glob("*_01_v?.csv"))

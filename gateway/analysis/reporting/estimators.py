@@ -290,7 +290,9 @@ def weights(case: Case) -> Section | None:
     if case.frame is None:
         return None
     thinned = blend_table(case.flight, case.fusion, INTERVAL_S)
-    if not _is_judged(thinned) or not _is_judged(full := blend_table(case.flight, case.fusion, 0)):
+    if not _has_errors(thinned) or not _has_errors(
+        full := blend_table(case.flight, case.fusion, 0)
+    ):
         return None
     paper = paper_table().rename(columns={"north_m": "paper latitude", "east_m": "paper longitude"})
     return Section(
@@ -341,7 +343,7 @@ def _lead(table: pd.DataFrame) -> str:
     )
 
 
-def _is_judged(table: pd.DataFrame) -> bool:
+def _has_errors(table: pd.DataFrame) -> bool:
     return bool(table[["north_m", "east_m"]].notna().all(axis=1).any())
 
 

@@ -90,16 +90,16 @@ def yaw_lines(case: Case) -> YawLines:
     fused = {COMPASS: case.tracks[PAPER]}
     if reference and case.chosen != PAPER:
         fused[f"estimator {case.chosen}"] = case.track
-    judge = reference.track if reference else case.track
-    known = np.isfinite(judge.q_nb).all(axis=1)
+    basis = reference.track if reference else case.track
+    known = np.isfinite(basis.q_nb).all(axis=1)
     if not known.any():
-        judge, known = case.track, np.isfinite(case.track.q_nb).all(axis=1)
+        basis, known = case.track, np.isfinite(case.track.q_nb).all(axis=1)
     start = int(np.argmax(known))
     gyro_q = np.full((len(flight.time_us), 4), np.nan)
     gyro_q[start:] = _attitude_by_rate(
-        flight.time_us[start:], flight.imu.gyro_b_radps[start:], judge.q_nb[start]
+        flight.time_us[start:], flight.imu.gyro_b_radps[start:], basis.q_nb[start]
     )
-    reference_deg = continuous_yaw_deg(judge.q_nb)
+    reference_deg = continuous_yaw_deg(basis.q_nb)
     yaw = {GYRO: continuous_yaw_deg(gyro_q)}
     yaw |= {name: continuous_yaw_deg(track.q_nb) for name, track in fused.items()}
     for name, line in yaw.items():

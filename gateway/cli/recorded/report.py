@@ -245,14 +245,14 @@ def _report_many(
         why_leads,
         write_flights_page,
     )
-    from gateway.batch.tasks import JudgeTask, without_secrets
+    from gateway.batch.tasks import EvaluateTask, without_secrets
     from gateway.cli.support.batch_work import exit_if_failed, run_on_all
 
     if not quick:
         require("a report", "plot")
     if len(against) > 1:
         refuse("--against: give the folder of one earlier report")
-    task = JudgeTask(without_secrets(options), not quick)
+    task = EvaluateTask(without_secrets(options), not quick)
     results = run_on_all(names, task, output, jobs=jobs, scheduler=cluster)
     compared = _compare(results, against[0]) if against else None
     grid = table_of(

@@ -267,11 +267,11 @@ def _search(axes: Sequence[Axis], run: Run, generations: int, metric: Metric) ->
 
 
 def _show(results: "pd.DataFrame", contest: Contest, metric: Metric) -> None:
-    judged = COLUMN_OF[metric]
+    column = COLUMN_OF[metric]
     others = [name for name in ("north_m", "east_m", "reference_m") if name in results]
-    names = [*contest.keys, judged, *(name for name in others if name != judged)]
+    names = [*contest.keys, column, *(name for name in others if name != column)]
     title = (
-        f"Best of {counted(len(results), 'trial')}, by the {HEADINGS[judged].rpartition(',')[0]}"
+        f"Best of {counted(len(results), 'trial')}, by the {HEADINGS[column].rpartition(',')[0]}"
     )
     shown = table_of(*(HEADINGS.get(name, name.rsplit(".", 1)[-1]) for name in names), left=0)
     for row in results[names].head(SHOWN).itertuples(index=False):

@@ -141,7 +141,7 @@ def load_flight(
 ) -> Flight:
     """Read a recording, or the simulated flight; raises FlightError if a file has no flight."""
     # Imported here: these import all stages, which commands without fusion need not wait for.
-    from gateway.analysis.flight import flight_of_files, judged_by
+    from gateway.analysis.flight import compared_with, flight_of_files
     from gateway.analysis.simulated import simulated_flight
     from gateway.recordings.reading import is_table, open_rows
 
@@ -162,4 +162,4 @@ def load_flight(
         print_remarks(table.remarks)
         if reference is None:
             return flight
-        return judged_by(flight, open_rows(reference, options).blocks, reference.name)
+        return compared_with(flight, open_rows(reference, options).blocks, reference.name)
