@@ -85,13 +85,13 @@ def main() -> None:
     if part == "catalogue":
         fresh_process(catalogue, folder / f"catalogue-{options.files}", options.files)
         return
-    make(folder / f"flights-{options.duration:.0f}", flights, options.duration)
+    recordings = folder / f"flights-{options.duration:.0f}"
+    make(recordings, flights, options.duration)
     task = part if part in TASKS else "evaluate"
     runs = {
         "growth": [("processes", max(flights // n, 1)) for n in (8, 4, 2, 1)],
         "dask": [("processes", flights), ("dask", flights)],
     }.get(part, [("serial", flights), ("processes", flights)])
-    recordings = folder / f"flights-{options.duration:.0f}"
     rows = [(*run, fresh_process(measure, recordings, task, *run)) for run in runs]
     base = rows[0][2]["wall_s"] / rows[0][1]
     show(

@@ -12,6 +12,7 @@ or encoding; `--forwarder` names another such program, in any language. The maxi
 highest rate is the longest pause, including pauses of the machine, which the baseline has as well.
 """
 
+import contextlib
 import itertools
 import json
 import math
@@ -190,14 +191,12 @@ class Line:
         """Frames of the last exchange without an answer."""
         self._line, self._sock = SerialLine(), udp_socket()
         values = {"line": self._line.device, "port": port_of(self._sock)}
-        self._program = running(*(word.format(**values) for word in command))
-        self.process = self._program.__enter__()
-
-    def close(self) -> None:
-        """End the program."""
-        self._program.__exit__(None, None, None)
-        self._sock.close()
-        self._line.close()
+        self._opened = contextlib.ExitStack()
+        self._opened.callback(self._line.close)
+        self._opened.callback(self._sock.close)
+        program = running(*(word.format(**values) for word in command))
+        self.process = self._opened.enter_context(program)
+        self.close = self._opened.close
 
     def await_answer(self, rate_hz: int) -> None:
         """Feed the line until the program answers, then read all answers."""

@@ -9,11 +9,11 @@ result.
 """
 
 import asyncio
-import math
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -113,23 +113,35 @@ class FaultBench(Bench):
         return {
             "a client stops, TCP open": partial(self.stopped, tcp_port, "read"),
             "a browser stalls, WebSocket open": partial(self.stopped, web_port, "read-web"),
-            "a port is refused": partial(self.reloaded, math.inf),
-            "settings are reloaded 5 times a second": partial(self.reloaded, RELOAD_S),
+            "a port is refused": self.refused,
+            "settings are reloaded 5 times a second": self.reloaded,
             **{name: partial(self.traffic, self.port, kind) for name, kind in TRAFFIC.items()},
         }
 
     @contextmanager
-    def reloaded(self, interval_s: float) -> Iterator[None]:
-        """Add a client whose port is closed, and remove and add it repeatedly."""
+    def refused(self) -> Iterator[None]:
+        """Add a client whose port is closed."""
         self.process.send_signal(signal.SIGHUP)
-        if math.isfinite(interval_s):
-            code = "import os,sys,time\nwhile True: os.kill(int(sys.argv[1]), 1); time.sleep(0.2)"
-            with running(PYTHON, "-c", code, str(self.process.pid)):
-                yield
-            return
         time.sleep(RELOAD_S)
         yield
         self.process.send_signal(signal.SIGHUP)
+
+    @contextmanager
+    def reloaded(self) -> Iterator[None]:
+        """Add and remove that client repeatedly."""
+        ended = threading.Event()
+
+        def reload() -> None:
+            while not ended.is_set():
+                for _ in ("add", "remove"):
+                    self.process.send_signal(signal.SIGHUP)
+                    time.sleep(RELOAD_S)
+
+        thread = threading.Thread(target=reload)
+        thread.start()
+        yield
+        ended.set()
+        thread.join()
 
     @contextmanager
     def stopped(self, port: int, kind: str) -> Iterator[None]:
