@@ -172,11 +172,11 @@ class NewestRows:
         self._max_age_us, self._health = max_age_us, log.table.health
         self._rows: dict[tuple[str, int], LogRow] = {}
         self._firsts, self._primary = dict(log.primary), dict(log.primary)
-        self._lanes: dict[str, list[tuple[str, str]]] = {}
+        self._primary_fields: dict[str, list[tuple[str, str]]] = {}
         """Topics of several filters by the topic with the number of the filter, and its column."""
-        for topic, where in log.table.lanes.items():
+        for topic, where in log.table.primary_fields.items():
             name, _, column = where.partition(".")
-            self._lanes.setdefault(name, []).append((topic, column))
+            self._primary_fields.setdefault(name, []).append((topic, column))
 
     def add(self, row: LogRow) -> None:
         """Add the next row."""
@@ -186,9 +186,11 @@ class NewestRows:
         if topic not in self._firsts:
             self._firsts[topic] = instance
             self._primary.setdefault(topic, instance)
-        for of, column in self._lanes.get(topic, ()) if instance == self._firsts[topic] else ():
-            if isinstance(lane := row.values.get(column), int):
-                self._primary[of] = lane
+        for of, column in (
+            self._primary_fields.get(topic, ()) if instance == self._firsts[topic] else ()
+        ):
+            if isinstance(number := row.values.get(column), int):
+                self._primary[of] = number
 
     def has(self, topic: str) -> bool:
         """Return whether there was a row of a topic."""

@@ -280,7 +280,7 @@ class MessageTable:
     """Columns of a table by the kind of sample: imu, mag, baro, gps, nav."""
     aliases: dict[str, tuple[str, int]] = field(default_factory=dict)
     """Topic and instance by former topic name."""
-    lanes: dict[str, str] = field(default_factory=dict)
+    primary_fields: dict[str, str] = field(default_factory=dict)
     """Topics of several filters; value: the field with the number of the filter in use."""
     health: dict[str, int] = field(default_factory=dict)
     """Bits of MAV_SYS_STATUS_SENSOR by topic."""
@@ -297,7 +297,7 @@ class MessageTable:
         """All topics in use, by their names in the log."""
         used = {t for one in self.messages for t in one.of} | self.known | {*self.health}
         used |= {source.topic for source in self.sources}
-        used |= {where.partition(".")[0] for where in self.lanes.values()}
+        used |= {where.partition(".")[0] for where in self.primary_fields.values()}
         return frozenset(used | {old for old, (new, _) in self.aliases.items() if new in used})
 
     @property
@@ -318,7 +318,10 @@ class MessageTable:
             for value in values
             for source in value.sources
         }
-        return frozenset(used | {self.lanes[one].partition(".")[0] for one in used & {*self.lanes}})
+        return frozenset(
+            used
+            | {self.primary_fields[one].partition(".")[0] for one in used & {*self.primary_fields}}
+        )
 
     @property
     def columns(self) -> dict[str, set[str]]:
@@ -326,7 +329,7 @@ class MessageTable:
         found: dict[str, set[str]] = {}
         for source in self.sources:
             found.setdefault(source.topic, set()).add(source.name)
-        for where in self.lanes.values():
+        for where in self.primary_fields.values():
             topic, _, name = where.partition(".")
             found.setdefault(topic, set()).add(name)
         return found
@@ -373,9 +376,11 @@ def read_table(text: bytes) -> MessageTable:
         for section in ("messages", "samples")
     )
     aliases = {old: (topic, int(n)) for old, (topic, n) in raw.get("aliases", {}).items()}
-    lanes = {topic: where for where, topics in raw.get("lanes", {}).items() for topic in topics}
+    primary_fields = {
+        topic: where for where, topics in raw.get("primary_fields", {}).items() for topic in topics
+    }
     return MessageTable(
-        messages, samples, aliases, lanes, raw.get("health", {}),
+        messages, samples, aliases, primary_fields, raw.get("health", {}),
         frozenset(raw.get("also_used", ())), raw.get("modes", {}), raw.get("vehicle_types", {}),
         {state: tuple(given) for state, given in raw.get("nav_states", {}).items()},
     )  # fmt: skip

@@ -160,7 +160,7 @@ def test_every_frame_of_any_bytes_can_be_read(data: bytes, sequence: int) -> Non
 
 
 @given(st.integers(0, 255), st.binary(max_size=255), st.integers(0, (1 << 24) - 1))
-def test_a_truncated_payload_is_read_as_zeros(flags: int, payload: bytes, message_id: int) -> None:
+def test_bytes_cut_off_a_payload_are_zeros(flags: int, payload: bytes, message_id: int) -> None:
     head = bytes((len(payload), flags & 1, 0, 0, 9, 9)) + message_id.to_bytes(3, "little")
     frame = frame_of(b"\xfd" + head + payload + bytes(2))
     filled = frame_of(b"\xfd\xff" + head[1:] + payload.ljust(255, b"\0") + bytes(2))

@@ -208,9 +208,9 @@ def _used_columns(topic: Mapping[str, Any]) -> Topic:
 @cache
 def _used() -> frozenset[str]:
     known = table()
-    lanes = {where.partition(".")[2] for where in known.lanes.values()}
+    primary_fields = {where.partition(".")[2] for where in known.primary_fields.values()}
     others = {"timestamp", "timestamp_time_relative", "nav_state", "arming_state", "system_type"}
-    return frozenset({source.name for source in known.sources} | lanes | others)
+    return frozenset({source.name for source in known.sources} | primary_fields | others)
 
 
 def _boot_us(topics: Mapping[Instance, Topic]) -> int | None:
