@@ -9,6 +9,7 @@
 | `FrameClock` | the time of a capture without time stamps, from the times in its messages      |
 | `CivilClock` | civil time of the running gateway: GPS if available, else the machine's clock  |
 | `sound_times`| times of one topic that are near the median of those around them               |
+|`logged_times`| times of a log's topics, within those of the topics with several values        |
 | `LogClock`   | the time of an autopilot's log, whose clock may jump or restart                |
 | `Stamper`    | the increasing timestamps of a file that is written                            |
 
@@ -21,6 +22,7 @@ requires a new file.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Generic, TypeVar
 
@@ -108,6 +110,27 @@ def sound_times(times_us: NDArray[Any]) -> tuple[NDArray[np.bool_], IntArray]:
         far_us[0, : AROUND // 2] = far_us[1, -(AROUND // 2) :] = BACK_US
         sound &= (early_us < far_us[0]) & (-early_us < far_us[1])
     return sound, np.flatnonzero(sound)[np.argsort(time_us[sound], kind="stable")]
+
+
+def logged_times(topics_us: Sequence[NDArray[Any]]) -> list[IntArray]:
+    """Return the times of a log's topics, of which some hold values older than the log.
+
+    A logger begins with the newest value of each topic, whose time is that of its publication,
+    maybe long ago or on another clock. So a time outside those of the topics with at least
+    `AROUND` values is that of the begin.
+    """
+    times_us = [time_us.astype(np.int64) for time_us in topics_us]
+    several = [t[sound_times(t)[1]] for t in times_us if len(t) >= AROUND]
+    spans = [(int(t[0]), int(t[-1])) for t in several if len(t) and t[0] < t[-1]]
+    if not spans:
+        return times_us
+    begin_us, end_us = min(first for first, _ in spans), max(last for _, last in spans)
+    return [
+        np.where((time_us < begin_us) | (time_us > end_us), begin_us, time_us)
+        if len(time_us) < AROUND
+        else time_us
+        for time_us in times_us
+    ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -340,19 +340,20 @@ PX4_FORMATS = {
 }
 
 
-def px4_log(seconds: float = 4.0) -> bytes:
-    """The same flight by PX4, in HOLD and armed after 2 s."""
+def px4_log(seconds: float = 4.0, *, home_s: float = 0.0, text_s: float = 2.0) -> bytes:
+    """The same flight by PX4, in HOLD and armed after 2 s, with the times of home and of a text."""
     log = flown.Ulog(PX4_FORMATS, {"MAV_SYS_ID": 7})
     roll, yaw = math.radians(10.0), math.radians(-0.01)
     q = from_euler(roll, math.radians(-2.0), yaw)
     utc_us = 1_780_000_000_000_000
-    log.add("home_position", 0, 47.3977, 8.5456, 488.0)
+    log.add("home_position", round(home_s * 1e6), 47.3977, 8.5456, 488.0)
     for number in range(round(seconds * 10)):
         t = 1000 + number * 100_000
         if number in (0, 20):
             log.add("vehicle_status", t, *((0, 1, 13) if number == 0 else (4, 2, 13)))
         if number == 20:
-            text = struct.pack("<BQ", ord("4"), flown.BOOT_US + t) + b"Low battery"
+            text_us = flown.BOOT_US + round(text_s * 1e6)
+            text = struct.pack("<BQ", ord("4"), text_us) + b"Low battery"
             log.parts.append(flown.ulog_message(b"L", text))
         log.add("vehicle_local_position", t, 1.0, 2.0, -12.25, 3.0, 0.0, -0.5)
         log.add("battery_status", t, 15.8, 12.5, 0.75)
@@ -429,6 +430,23 @@ def test_state_of_px4_is_shown_with_its_mode(px4_records: list[RecordedFrame]) -
     (value,) = messages_of(px4_records, "PARAM_VALUE")
     assert struct.pack("<f", value["param_value"]) == struct.pack("<i", 7)
     assert messages_of(px4_records, "SYSTEM_TIME")[0]["time_unix_usec"] >= 1_780_000_000_000_000
+
+
+@pytest.mark.parametrize(
+    "times",
+    [{"home_s": -3.0}, {"home_s": 1150.0}, {"text_s": -3.0}, {"text_s": 1e6}],
+    ids=["value of before the log", "value of another boot", "early text", "text of a wrong time"],
+)
+def test_value_with_a_time_outside_the_log_does_not_lengthen_it(
+    tmp_path: Path, times: dict[str, float]
+) -> None:
+    path = flown.write(tmp_path / "flight.ulg", px4_log(**times))
+    info = read_summary(path, None, lambda: OPTIONS).info
+    assert 3.8 < info.duration_s < 5.0
+    assert not info.gaps
+    records = translated(path)
+    assert messages_of(records, "STATUSTEXT")[0]["text"] == b"Low battery"
+    assert messages_of(records, "HOME_POSITION")[0]["latitude"] == 473977000
 
 
 def test_info_lists_rows_without_counterpart(tmp_path: Path) -> None:

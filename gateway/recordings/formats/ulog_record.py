@@ -29,9 +29,9 @@ from gateway.recordings.autopilot_record import (
 from gateway.recordings.columns import LARGEST_WHOLE
 from gateway.recordings.formats.ulog import NEEDED, load
 from gateway.recordings.message_table import MessageTable, read_table
-from gateway.recordings.recorded_clock import FIRST_CIVIL_US, sound_times
+from gateway.recordings.recorded_clock import FIRST_CIVIL_US, logged_times, sound_times
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.units import FIX_2D, counted
+from gateway.units import FIX_2D, US_PER_S, counted
 from gateway.wire.vehicle_types import CLASSES
 
 Topic = Mapping[str, NDArray[Any]]
@@ -119,7 +119,7 @@ def _counts_of(log: Any) -> Counter[str]:
 
 def _topics_of(log: Any, wanted: frozenset[str]) -> tuple[dict[Instance, Topic], list[str]]:
     """Return the topics that are read, in order of time; also remarks on the others."""
-    topics: dict[Instance, Topic] = {}
+    found: dict[Instance, Topic] = {}
     left_out, dropped = set(), 0
     for data in reversed(log.data_list):
         if data.name not in wanted and data.name not in table().aliases:
@@ -127,9 +127,14 @@ def _topics_of(log: Any, wanted: frozenset[str]) -> tuple[dict[Instance, Topic],
         columns = _used_columns(data.data)
         if _lacks(data.name, columns):
             left_out.add(data.name)
-            continue
-        sound, order = sound_times(columns["timestamp"])
-        topics[data.name, data.multi_id] = {name: c[order] for name, c in columns.items()}
+        else:
+            found[data.name, data.multi_id] = columns
+    topics: dict[Instance, Topic] = {}
+    times = logged_times([columns["timestamp"] for columns in found.values()])
+    for (instance, columns), time_us in zip(found.items(), times, strict=True):
+        sound, order = sound_times(time_us)
+        timed = {**columns, "timestamp": time_us}
+        topics[instance] = {name: c[order] for name, c in timed.items()}
         dropped += int(np.count_nonzero(~sound))
     remarks = []
     if left_out:
@@ -285,7 +290,8 @@ def _entries(
     numbers = np.repeat(np.arange(len(streams)), [len(t["timestamp"]) for _, t in streams])
     order = np.argsort(times, kind="stable")
     rows = [_rows(topic) for _, topic in streams]
-    waiting = iter(events)
+    end_us = int(times.max()) + US_PER_S
+    waiting = iter([(min(time_us, end_us), event) for time_us, event in events])
     event = next(waiting, None)
     for time_us, number in zip(times[order].tolist(), numbers[order].tolist(), strict=True):
         while event is not None and event[0] <= time_us:
