@@ -2,6 +2,7 @@
 
 import json
 import math
+import random
 import struct
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -483,6 +484,22 @@ def test_damaged_log_gives_what_is_intact(tmp_path: Path) -> None:
     found = list(RecordTranslator(log).frames())
     assert len(messages_of(found, "ATTITUDE")) > 30
     assert any("ends within a message" in remark for remark in log.remarks)
+
+
+@pytest.mark.parametrize("part", [0.3, 0.6, 0.9])
+def test_damage_of_whole_blocks_loses_no_message_around_it(tmp_path: Path, part: float) -> None:
+    data = flown.dataflash_of(FORMATS, rows())
+    at = data.index(b"\xa3\x95", round(len(data) * part))
+    bits = random.Random(1)
+    # Some of the damage looks like messages of known and unknown types.
+    heads = [b"\xa3\x95" + bytes([kind]) + bits.randbytes(300) for kind in range(256)]
+    damage = bits.randbytes(2000) + b"".join(heads)
+    sound = flown.write(tmp_path / "sound.bin", data)
+    damaged = flown.write(tmp_path / "damaged.bin", data[:at] + damage + data[at:])
+    found, whole = (read_summary(path, None, lambda: OPTIONS).info for path in (damaged, sound))
+    assert any(f"left out {len(damage)} bytes" in remark for remark in found.remarks)
+    kept = replace(found, size=whole.size, remarks=whole.remarks)
+    assert kept == whole
 
 
 def test_log_without_rows_is_refused(tmp_path: Path) -> None:

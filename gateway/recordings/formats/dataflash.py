@@ -1,12 +1,13 @@
 """Open a DataFlash log, ArduPilot's, binary (.bin) or text (.log), with pymavlink."""
 
-import contextlib
 import io
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, redirect_stderr, redirect_stdout
 from itertools import chain
+from mmap import mmap
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import IO, Any, Final, TypeVar
 
 from pymavlink.DFReader import DFReader_binary, DFReader_text
 
@@ -19,6 +20,13 @@ Message = Any
 """A message with its columns as attributes, in the units of the format."""
 Item = TypeVar("Item")
 MAGIC: Final = b"\xa3\x95"
+HEAD_BYTES: Final = 3
+"""Magic number and type of a message."""
+FMT: Final = 128
+"""Type of the messages with the formats, which begin with type and size of one."""
+FMT_BYTES: Final = 89
+PART_BYTES: Final = 1 << 20
+"""Size of the parts in which a damaged log is copied."""
 SYSTEM_IDS: Final = ("SYSID_THISMAV", "MAV_SYSID")
 TITLE_BYTES: Final = 1 << 16
 """Bytes at the begin of a text log that are searched for the title line."""
@@ -52,28 +60,60 @@ class DataFlash:
         first = next(content, b"")
         self.is_text = not first.startswith(MAGIC)
         kind = DFReader_text if self.is_text else DFReader_binary
-        self._printed, self._broken = _Printed(), 0
+        self._printed, self._broken, self._skipped = _Printed(), 0, 0
         # Replace bytes that are not ASCII, so that reading continues.
         all_of_it = chain([first], content)
         sound = (data.translate(_AS_TEXT) for data in all_of_it) if self.is_text else all_of_it
-        with temporary_copy(path, sound) as plain:
-            self.log = log = kind.__new__(kind)
-            # The fast indexer prints to the terminal directly, not through Python's stdout.
-            log.init_arrays_fast = log.init_arrays
-            try:
-                self._quiet(lambda: kind.__init__(log, name_of(plain)))
-            except Exception as error:
-                log.close()
-                raise FlightError(f"{path}: its list of formats is damaged: {error}") from error
+        with temporary_copy(path, sound) as copy:
+            error = self._open(kind, copy)
+        if not self.is_text and (error or not self._printed.is_empty):
+            # pymavlink's index would end at the first damage that looks like a message.
+            damaged, self._printed = self.log, _Printed()
+            with closing(damaged), temporary_copy(path, self._messages(damaged.data_map)) as copy:
+                error = self._open(kind, copy)
+        if error:
+            self.log.close()
+            raise FlightError(f"{path}: its list of formats is damaged: {error}") from error
+
+    def _open(self, kind: Any, copy: IO[bytes]) -> Exception | None:
+        """Open a copy of a log; return why it cannot be opened."""
+        self.log = log = kind.__new__(kind)
+        # The fast indexer prints to the terminal directly, not through Python's stdout.
+        log.init_arrays_fast = log.init_arrays
+        try:
+            self._quiet(lambda: kind.__init__(log, name_of(copy)))
+        except Exception as error:  # noqa: BLE001 - see above
+            return error
+        return None
+
+    def _messages(self, data: mmap) -> Iterator[bytes]:
+        """Yield the parts of a damaged log that are messages, and count the other bytes.
+
+        Between damage and a message, only one that another follows is accepted.
+        """
+        sizes = {FMT: FMT_BYTES}
+        begin = at = 0
+        is_sure = True
+        while at >= 0 and (head := data[at : at + HEAD_BYTES]):
+            after = at + sizes.get(head[-1], 0) if head.startswith(MAGIC) else at
+            if after > at and (is_sure or data[after : after + HEAD_BYTES].startswith(MAGIC)):
+                if head[-1] == FMT and after <= len(data):
+                    sizes[data[at + HEAD_BYTES]] = data[at + HEAD_BYTES + 1]
+                at, is_sure = after, True
+                if at - begin >= PART_BYTES:
+                    yield data[begin:at]
+                    begin = at
+            else:
+                yield data[begin:at]
+                begin = data.find(MAGIC, at + 1)
+                self._skipped += (begin if begin >= 0 else len(data)) - at
+                at, is_sure = begin, False
+        if at >= 0:
+            yield data[begin:]
 
     def _quiet(self, call: Callable[[], Any]) -> Any:
-        with contextlib.redirect_stdout(self._printed), contextlib.redirect_stderr(self._printed):
+        with redirect_stdout(self._printed), redirect_stderr(self._printed):
             return call()
-
-    @property
-    def is_damaged(self) -> bool:
-        """Whether damage was found so far."""
-        return not self._printed.is_empty
 
     @property
     def system_id(self) -> int:
@@ -116,22 +156,13 @@ class DataFlash:
     def items_of(
         self, names: set[str], feed: Callable[[str, Message], list[Item]]
     ) -> Iterator[Item]:
-        """Feed the messages of these names; one that cannot be decoded is counted.
-
-        If the log is intact, only the needed messages are decoded. The index of a damaged one ends
-        at the damage, so it is read message by message.
-        """
+        """Feed the messages of these names; one that cannot be decoded is counted."""
         log = self.log
-
-        def wanted() -> Any:
-            return log.recv_match(type=names, strict=True)
-
-        take = log.recv_msg if self.is_damaged else wanted
         lines, end = 0, -1
         while True:
             begin = log.offset
             try:
-                message = self._quiet(take)
+                message = self._quiet(lambda: log.recv_match(type=names, strict=True))
                 # Instead of an invalid line pymavlink returns the next message, and again later.
                 is_again, end = log.offset == end, log.offset
                 is_new = message is not None and not is_again
@@ -152,7 +183,7 @@ class DataFlash:
     def damage(self, dropped: int) -> Iterator[str]:
         """Yield remarks for the user, given the number of messages with impossible times."""
         yield from self._before.remarks
-        if skipped := self._printed.size:
+        if skipped := self._skipped + self._printed.size:
             yield f"is damaged: left out {counted(skipped, 'byte')} that belong to no message"
         if (left := self.log.data_len - self.log.offset) > 0:
             yield f"ends within a message: left out {counted(left, 'byte')}"

@@ -350,9 +350,6 @@ def open_record(path: Path, options: ReadOptions, *, sampled: bool = False) -> A
         for name, kind in forms.items()
         if counts.get(name) and not _lacking(kind.topic, log.columns[name])
     }
-    if log.is_damaged and not present - {"FMT"}:
-        # The index ends at the damage, so the rest of the log may have rows of any format.
-        present = {kind.topic for kind in forms.values()} - {"FMT"} or {*known.topics}
     unused = _other_filter(log, present)
     chosen = _sensors_of(log) | dict(options.sensors)
     found = AutopilotLog(
