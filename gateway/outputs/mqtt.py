@@ -129,6 +129,11 @@ class Broker:
         if self._task is not None:
             self._task.cancel()
 
+    def fail(self, error: Exception) -> None:
+        """Disconnect after an unexpected error; `tick` connects again."""
+        self.state, self.reason = "unreachable", reason_of(error)
+        self.close()
+
     async def _run(self) -> None:
         try:
             await self._connect()

@@ -83,6 +83,11 @@ class Output(Client):
             self._timer = None
         self.carrier.close()
 
+    def fail(self, error: Exception) -> None:
+        """Close after an unexpected error; `tick` opens the carrier again."""
+        self.close()
+        self.carrier.fail(error)
+
     def put(self, data: bytes) -> None:
         """Send one message now."""
         self.carrier.send(data)

@@ -11,9 +11,7 @@ from fastcrc.crc16 import mcrf4xx
 
 from gateway.hub.hub import CONNECTIONS_IN_FULL
 from gateway.hub.stats import WINDOW_US
-from gateway.hub.transports.registry import LISTENERS
 from gateway.wire.mavlink_messages import CRC_EXTRA
-from tests.ports import free_port
 
 pytestmark = pytest.mark.io
 
@@ -85,40 +83,21 @@ async def test_interface_outage_loses_no_frame_of_other_clients(
     assert [await far.receive() for _ in range(2)] == [sent, last]
 
 
-class TestLinkThatRaises:
-    """An unexpected error closes its own link for a second and affects no other."""
+@pytest.mark.parametrize("kind", ["udp", "tcp"])
+async def test_invalid_name_is_reported_as_unresolved(
+    rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errors: list[Any] = []
+    loop = asyncio.get_running_loop()
+    loop.set_exception_handler(lambda _, context: errors.append(context))
 
-    @pytest.mark.parametrize("kind", ["udp", "tcp"])
-    async def test_listening_port_that_raises_is_bound_again_while_others_go_on(
-        self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        hub = await rig.open(f"{kind}-listen:127.0.0.1:0?name=port", f"udp:127.0.0.1:{free_port()}")
-        rig.publish(hub, rig.vehicle.attitude(), rig.vehicle.attitude())
-        assert hub.clients()[0].state == "refused"
-        with monkeypatch.context() as patched:
-            patched.setattr(LISTENERS[f"{kind}-listen"], "tick", lambda *_: 1 // 0)
-            for _ in range(3):
-                rig.tick(hub, 1)
-            assert (hub.listeners()[0].state, hub.clients()[0].state) == ("closed", "open")
-            assert "port is closed and opened again" in caplog.text
-        rig.tick(hub, 2)
-        assert hub.listeners()[0].state == "open"
+    async def choke(*_: object, **__: object) -> None:
+        raise UnicodeError("label empty or too long")
 
-    @pytest.mark.parametrize("kind", ["udp", "tcp"])
-    async def test_invalid_name_is_reported_as_unresolved(
-        self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        errors: list[Any] = []
-        loop = asyncio.get_running_loop()
-        loop.set_exception_handler(lambda _, context: errors.append(context))
-
-        async def choke(*_: object, **__: object) -> None:
-            raise UnicodeError("label empty or too long")
-
-        monkeypatch.setattr(loop, "getaddrinfo", choke)
-        hub = rig.hub(f"{kind}:no-such-place.invalid:14550")
-        await rig.until(lambda: hub.clients()[0].reason != "")
-        assert (hub.clients()[0].state, errors) == ("resolving", [])
+    monkeypatch.setattr(loop, "getaddrinfo", choke)
+    hub = rig.hub(f"{kind}:no-such-place.invalid:14550")
+    await rig.until(lambda: hub.clients()[0].reason != "")
+    assert (hub.clients()[0].state, errors) == ("resolving", [])
 
 
 async def test_truncated_heartbeats_are_accepted_without_error(rig: Any) -> None:

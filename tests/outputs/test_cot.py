@@ -12,11 +12,9 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.outputs.cot import UNKNOWN
 from gateway.units import US_PER_S
-from tests.hub.test_group import GROUP, member
-from tests.kit.hub import receive
 from tests.kit.messages import HERE, at, beat, gps
-from tests.kit.process import START_LIMIT_S
 from tests.outputs.conftest import UNIX_US, OutputRig
+from tests.ports import free_port
 
 BATTERY = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 12_400, -1, 80, 0, 0, 0, 0, 0, 0)
 
@@ -88,47 +86,12 @@ async def test_each_vehicle_with_a_valid_position_has_an_event(outputs: OutputRi
     assert await outputs.sends_nothing(), "old"
 
 
-async def test_events_are_sent_to_a_multicast_group(outputs: OutputRig) -> None:
-    listener = member(outputs)
-    port = listener.getsockname()[1]
-    await outputs.output(f"cot:udp-multicast:{GROUP}:{port}")
+async def test_events_for_a_server_are_lines_of_xml(outputs: OutputRig) -> None:
+    output = await outputs.output(f"cot:tcp:127.0.0.1:{free_port()}")
     outputs.hear(beat(), at())
-    outputs.turn()
-    assert read(await receive(listener)).type
-
-
-@pytest.mark.parametrize("is_tls", [False, True])
-async def test_events_are_streamed_to_a_server(
-    outputs: OutputRig, certificate: Path, *, is_tls: bool
-) -> None:
-    received: asyncio.Queue[tuple[bytes, Any]] = asyncio.Queue()
-
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        peer = writer.get_extra_info("peercert")
-        for _ in range(2):
-            received.put_nowait((await reader.readuntil(b"</event>\n"), peer))
-        writer.close()
-
-    context = None
-    if is_tls:
-        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=str(certificate))
-        context.load_cert_chain(certificate)
-        context.verify_mode = ssl.CERT_REQUIRED
-    server = await asyncio.start_server(serve, "127.0.0.1", 0, ssl=context)
-    port = server.sockets[0].getsockname()[1]
-    kind = "tls" if is_tls else "tcp"
-    files = f"?authority={certificate}&certificate={certificate}" if is_tls else ""
-    await outputs.output(f"cot:{kind}:127.0.0.1:{port}{files}")
-    assert outputs.shown.state == "open", outputs.shown.reason
-    outputs.hear(beat(), at())
-    for _ in range(2):
-        outputs.turn()
-        data, peer = await asyncio.wait_for(received.get(), START_LIMIT_S)
-        assert read(data).lat == pytest.approx(HERE[0])
-        assert bool(peer) == is_tls
-    await outputs.until(lambda: outputs.shown.state != "open")
-    server.close()
-    await server.wait_closed()
+    (data,) = output.compose(0)
+    assert data.endswith(b"</event>\n")
+    assert read(data).lat == pytest.approx(HERE[0])
 
 
 async def test_server_that_is_not_authentic_is_reported(

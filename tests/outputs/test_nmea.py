@@ -2,10 +2,7 @@
 
 import asyncio
 import json
-import os
-import pty
 import shutil
-import socket
 import subprocess
 from typing import Any
 
@@ -155,46 +152,6 @@ async def test_listening_port_serves_several_clients(outputs: OutputRig) -> None
     clients[0].close()
     await outputs.until(lambda: figures().clients == 1)
     assert outputs.shown.state == "open"
-
-
-async def test_stalled_client_loses_whole_messages(outputs: OutputRig) -> None:
-    figures, port = await listening(outputs)
-    client = await outputs.connect(port, room_bytes=2048)
-    await outputs.until(lambda: figures().clients == 1)
-    while not outputs.shown.dropped:
-        outputs.turn()
-    data = b""
-    while data.count(b"$GPGGA") < outputs.shown.sent:
-        data += await receive(client)
-    while not data.endswith(b"\n"):
-        data += await receive(client)
-    assert list(read(data)) == ["GGA", "RMC", "VTG", "HDT"]
-
-
-async def test_broken_connection_is_made_again(outputs: OutputRig) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        server.setblocking(False)
-        await outputs.output(f"nmea:tcp:127.0.0.1:{server.getsockname()[1]}")
-        for _ in range(2):
-            async with asyncio.timeout(START_LIMIT_S):
-                connection, _ = await asyncio.get_running_loop().sock_accept(server)
-            await outputs.until(lambda: outputs.shown.state == "open")
-            connection.close()
-            await outputs.until(lambda: outputs.shown.state == "connecting")
-            outputs.tick(outputs.of_hub, 2)
-
-
-async def test_sentences_are_written_to_a_serial_port(outputs: OutputRig) -> None:
-    main, line = pty.openpty()
-    await outputs.output(f"nmea:serial:{os.ttyname(line)}:4800")
-    outputs.hear(beat(), at(), gps())
-    outputs.turn()
-    data = b""
-    while data.count(b"\n") < 4:
-        data += os.read(main, 4096)
-    assert read(data)["GGA"].alt == 488.1
-    for end in (main, line):
-        os.close(end)
 
 
 @pytest.mark.io

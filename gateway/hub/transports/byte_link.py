@@ -52,6 +52,10 @@ class ByteLink:
         """Close the transport."""
         self.link.close()
 
+    def fail(self, error: Exception) -> None:
+        """Close the transport after an unexpected error; `tick` opens it again."""
+        self.link.fail(error)
+
     def appear(self, client: Client) -> None:
         """Add a peer."""
         client.sink = self.take

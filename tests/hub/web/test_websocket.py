@@ -177,37 +177,6 @@ class TestCalling:
 
 
 class TestTls:
-    async def test_frames_pass_over_tls_to_a_hub_and_to_a_page(
-        self, rig: Rig, visit: Visit, certificate: Path, secure: Hub
-    ) -> None:
-        url = f"wss:127.0.0.1:{secure.listening_ports()[0]}"
-        hub = await rig.open(url, tls_authority=str(certificate))
-        page = await visit(secure, tls=ssl.create_default_context(cafile=certificate))
-        rig.publish(hub, rig.sender(7).attitude())
-        (frame,) = await page.frames(1)
-        assert frame[5] == 7
-        rig.publish(secure, *(rig.vehicle.raw_imu() for _ in range(500)))
-        await rig.until(lambda: hub.clients()[0].received == 500)
-        assert len(await page.frames(501)) == 501
-
-    async def test_page_stalled_over_tls_resumes_without_a_gap(
-        self, rig: Rig, visit: Visit, certificate: Path
-    ) -> None:
-        hub = rig.hub(
-            "wss-listen:127.0.0.1:0?pack=1100", tls_certificate=str(certificate), queue_bytes=4096
-        )
-        page = await visit(hub, tls=ssl.create_default_context(cafile=certificate))
-        page.writer.transport.pause_reading()
-        while hub.clients()[0].dropped < 500:
-            rig.publish(hub, *(rig.vehicle.raw_imu() for _ in range(50)))
-            await asyncio.sleep(0)
-        page.writer.transport.resume_reading()
-        (slow,) = hub.clients()
-        size = slow.sent * len(rig.vehicle.raw_imu())
-        await page.until(lambda: sum(map(len, page.messages)) >= size)
-        frames = await page.frames(1)
-        assert [frame[4] for frame in frames] == [n & 255 for n in range(slow.sent)]
-
     @pytest.mark.parametrize(
         ("host", "authority", "reason"),
         [
