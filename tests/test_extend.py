@@ -25,6 +25,7 @@ from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.file_format import OTHER_FORMATS
 from gateway.recordings.reading import READERS
 from gateway.recordings.recorded_table import ReadOptions, header_for
+from gateway.recordings.recording import open_recording
 from gateway.recordings.table import encode_head
 from gateway.recordings.workshop.convert import WRITERS, FlightToWrite, Fusing
 from gateway.records import ImuRaw, Incoming, NavState
@@ -168,11 +169,11 @@ def test_added_format_is_written_and_read(install: Install, tmp_path: Path) -> N
     table = tmp_path / "flight.csv"
     lines = [row_to_line(TableRow(r.time_us, raw=r)) for r in samples]
     table.write_text(encode_head(header_for(settings, 1)) + "".join(lines))
-    refused = FlightToWrite([table], options, fusing=Fusing(wanted=True))
+    refused = FlightToWrite([open_recording(table)], options, fusing=Fusing(wanted=True))
     written = tmp_path / "flight.jsonl"
     written.write_bytes(b"".join(WRITERS[".jsonl"](refused)))
     assert len(written.read_text().splitlines()) == len(samples)
-    again = FlightToWrite([written], options)
+    again = FlightToWrite([open_recording(written)], options)
     frames = [record.frame for record in again.frames()]
     assert any(message_id_of(f) == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION for f in frames)
     assert b"".join(WRITERS[".jsonl"](again)) == written.read_bytes()
@@ -203,6 +204,7 @@ def test_stages_run_from_python(install: Install) -> None:
 
 TAKEN = """
 from gateway.estimation.select import add_estimator
+from gateway.recordings.recording import open_recording
 
 def extend():
     add_estimator("eskf", None)

@@ -49,8 +49,8 @@ from gateway.recordings.formats.maps import (
 )
 from gateway.recordings.formats.ulog_record import table as ulog_table
 from gateway.recordings.moment import parse_moment
-from gateway.recordings.reading import has_record, open_record
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.recording import open_recording
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.recordings.vehicle_reader import VehicleReader
@@ -545,10 +545,11 @@ def record(file: tuple[str, bytes]) -> None:
     path = _folder() / f"record.{ending}"
     path.write_bytes(data)
     current = PipelineSettings(AircraftSettings())
-    if not has_record(path):
+    recording = open_recording(path)
+    if not recording.is_log:
         return
     try:
-        log = open_record(path, ReadOptions(current))
+        log = recording.log(ReadOptions(current))
     except FlightError:
         return
     frames = list(RecordTranslator(log).frames())

@@ -28,11 +28,11 @@ from gateway.recordings.fuse import (
     samples_of_cells,
     with_estimator,
 )
-from gateway.recordings.reading import is_table, open_rows
 from gateway.recordings.recorded_fusion import aircraft_for, check_latency
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable
+from gateway.recordings.recording import open_recordings
 from gateway.recordings.table import TableBlock
-from gateway.recordings.workshop.joining import joined_tables
+from gateway.recordings.workshop.joining import joined_rows
 from gateway.records import BaroSample, FusionState, GpsFix, NavFlags
 from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut
 from gateway.sensing.chain import ImuLog, SensorChain
@@ -206,10 +206,11 @@ def flight_of_files(
     With `checked`, a remark is added if the motion contradicts the latency of a recording.
     FlightError or OSError if a file cannot be read, ValueError for fewer than two IMU samples.
     """
-    table = joined_tables([open_rows(file, options) for file in files])
-    aircraft = aircraft_for(files, table, options)
-    if checked and is_table(files[0]):
-        check_latency(files[0], table, aircraft)
+    recordings = open_recordings(files)
+    table = joined_rows(recordings, options)
+    aircraft = aircraft_for(recordings[0], table, options)
+    if checked and recordings[0].is_own:
+        check_latency(recordings[0], table, aircraft)
     fusion = FusionSettings(estimation=aircraft.estimation)
     flight = flight_of_blocks(
         table.blocks, aircraft.calibration, fusion, name=name, description=description
@@ -281,9 +282,10 @@ def tracks_by_estimator(
     The rows are not held in memory. Also returns the civil time of clock time zero, or 0. Raises
     FlightError or OSError if a file cannot be read, ValueError for fewer than two IMU samples.
     """
-    table = joined_tables([open_rows(file, options) for file in files])
-    aircraft = aircraft_for(files, table, options, keep=False)
-    table = joined_tables([open_rows(file, options) for file in files])
+    recordings = open_recordings(files)
+    table = joined_rows(recordings, options)
+    aircraft = aircraft_for(recordings[0], table, options, keep=False)
+    table = joined_rows(recordings, options)
     return table.header.unix_us_at_zero or 0, _tracks_of(table.blocks, aircraft, step_us)
 
 

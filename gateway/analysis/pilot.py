@@ -14,11 +14,11 @@ from gateway.recordings.columns import FloatArray
 from gateway.recordings.files import FlightError
 from gateway.recordings.flight_facts import FlightFacts, FlightTally, FlightTrackPoints
 from gateway.recordings.formats.maps import point_of_fix
-from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable
+from gateway.recordings.recording import open_recordings
 from gateway.recordings.tallies import MessageTally, RowTally
 from gateway.recordings.workshop.convert import FlightToWrite
-from gateway.recordings.workshop.joining import joined_tables
+from gateway.recordings.workshop.joining import joined_rows
 from gateway.records import NAN
 from gateway.units import US_PER_S
 from gateway.vehicle_state.positions import IntArray, LocalFrame, Position
@@ -123,9 +123,9 @@ def read_pilot_flight(files: Sequence[Path], options: ReadOptions, name: str) ->
     Of several vehicles, it is the one that `options` select, or else the first with a position.
     Raises FlightError if there is no vehicle, OSError if a file cannot be read.
     """
-    flight = FlightToWrite(files, options)
+    flight = FlightToWrite(open_recordings(files), options)
     if not flight.has_messages:
-        return pilot_flight_of(joined_tables([open_rows(file, options) for file in files]), name)
+        return pilot_flight_of(joined_rows(flight.recordings, options), name)
     batches = flight.chosen()
     found = MessageTally(flight.senders, with_attitude=True)
     for batch in batches:

@@ -21,11 +21,12 @@ import msgspec
 from gateway.batch.executors import Executor, WorkFailed
 from gateway.batch.facts import CataloguedFlight, Flown, Segments, flights_of
 from gateway.printable import UserError
-from gateway.recordings.file_format import NO_RECORDING, OTHER_FORMATS, first_bytes, format_of
-from gateway.recordings.files import GZIP, FlightError, open_recording
+from gateway.recordings.file_format import NO_RECORDING, has_signature
+from gateway.recordings.files import GZIP, FlightError, open_file
 from gateway.recordings.formats.maps import track_feature
 from gateway.recordings.index import as_text, recording_name
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.recording import open_recording
 from gateway.recordings.summary import read_summary
 from gateway.records import NAN
 from gateway.units import DEG_PER_DEGE7, M_PER_CM
@@ -392,8 +393,9 @@ def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedF
         found = replace(found, size=size, modified_ns=modified_ns, digest=digest_of(path))
         if found.digest == known_digest:
             return found
-        found = replace(found, kind=format_of(path))
-        flights = tuple(flights_of(read_summary(path, None, lambda: options)))
+        recording = open_recording(path)
+        found = replace(found, kind=recording.kind)
+        flights = tuple(flights_of(read_summary(recording, None, lambda: options)))
     except OSError as error:
         return replace(found, error=error.strerror or as_text(str(error)))
     except (FlightError, ValueError) as error:
@@ -403,7 +405,7 @@ def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedF
 
 def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file's bytes; raises OSError."""
-    with open_recording(path) as file:
+    with open_file(path) as file:
         return file_digest(file, "sha256").hexdigest()
 
 
@@ -431,7 +433,6 @@ def _may_be_recording(path: Path) -> bool:
     if path.name.removesuffix(GZIP).endswith(ENDINGS):
         return True
     try:
-        begin = first_bytes(path)
+        return has_signature(path)
     except OSError:
         return False
-    return any(knows(begin) for knows in OTHER_FORMATS.values())

@@ -29,6 +29,7 @@ from gateway.panel.state.vehicle import VehicleState
 from gateway.printable import printable, reason_of
 from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.recording import open_recordings
 from gateway.recordings.tallies import FACT_IDS, VehicleTally
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.recordings.workshop.convert import FlightToWrite
@@ -133,7 +134,7 @@ def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageF
     Raises FlightError if it contains no position; OSError if it cannot be read.
     """
     flight = PageFlight(name)
-    recorded = FlightToWrite(files, options)
+    recorded = FlightToWrite(open_recordings(files), options)
     for message in recorded.vehicle_messages(READ | FACT_IDS):
         system_id = message.system_id
         if system_id not in flight.aircraft:

@@ -25,6 +25,7 @@ from gateway.recordings.file_format import TABLE
 from gateway.recordings.files import FlightError
 from gateway.recordings.flight_facts import FlightTrackPoints
 from gateway.recordings.index import RecordingError, find_recording, parts_together
+from gateway.recordings.recording import open_recording
 from gateway.recordings.summary import read_summary
 from gateway.units import US_PER_S
 from gateway.vehicle_state.senders import FIRST_GROUND_STATION
@@ -88,7 +89,7 @@ def free_ids(count: int, taken: Collection[int]) -> range:
 
 
 def _aircraft_of(parts: Sequence[Path]) -> list[RecordedAircraft]:
-    found = [read_summary(part) for part in parts]
+    found = [read_summary(open_recording(part)) for part in parts]
     begin_us = next((one.info.first_us for one in found if one.info.first_us is not None), 0)
     origin = FUSED_AGAIN if found[0].info.kind == TABLE else RECORDED
     points: defaultdict[int, list[FlightTrackPoints]] = defaultdict(list)

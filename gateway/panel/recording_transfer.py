@@ -25,8 +25,9 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 from gateway.panel.access import RECORDINGS, ROLE
 from gateway.panel.admission import Role
 from gateway.recordings.columns import TableRow
-from gateway.recordings.file_format import TABLE, TLOG, format_of
+from gateway.recordings.file_format import TABLE, TLOG
 from gateway.recordings.index import RecordingError, check_free, find_recording
+from gateway.recordings.recording import open_recording
 from gateway.recordings.table import TableReader
 from gateway.recordings.tlog import TlogScanner
 from gateway.recordings.workshop.convert import Pieces
@@ -148,7 +149,7 @@ def _recording_name(name: str, path: Path) -> str:
 
 def _kind(path: Path) -> str | None:
     """Return the kind of an upload by its first bytes; None if it is not a recording."""
-    kind = format_of(path)
+    kind = open_recording(path).kind
     with path.open("rb") as file:
         head = file.read(LOOKED_AT)
     if kind == TLOG:

@@ -25,6 +25,7 @@ from gateway.records import NAN
 from gateway.units import US_PER_S
 from gateway.vehicle.encoding import Encoder
 from gateway.vehicle.plan import MISSION, Item, write_item
+from gateway.vehicle_state.senders import FIRST_GROUND_STATION
 from gateway.wire.recorded_frames import RecordedFrame
 
 UINT32: Final = 0xFFFFFFFF
@@ -141,6 +142,11 @@ class AutopilotLog:
     def unit(self, topic: str, name: str) -> str | None:
         """Return the unit that the log itself states; None if it states none."""
         return self.units.get((topic, name))
+
+    @property
+    def beside_id(self) -> int:
+        """System id of a second vehicle, which has the states of mavgate."""
+        return self.vehicle_id % (FIRST_GROUND_STATION - 1) + 1
 
     @property
     def is_shown(self) -> bool:

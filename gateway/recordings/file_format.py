@@ -4,11 +4,13 @@ import codecs
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from gateway.recordings.files import open_unpacked
+from gateway.extras import how_to_add
+from gateway.recordings.files import FlightError, open_unpacked
 from gateway.units import counted
 
 SNIFF: Final = 512
@@ -24,6 +26,8 @@ NO_RECORDING: Final = (
 )
 TLOG, TABLE, CSV, PARQUET = "tlog", "table", "csv", "Parquet"
 """Names of formats; a CSV is one of another program, with columns of its own."""
+LOGS: Final = {"DataFlash": "dataflash_record", "ULog": "ulog_record"}
+"""Module that reads an autopilot's log, by the name of the format."""
 ULOG_HEAD: Final = b"ULog\x01\x12\x35"
 ULOG_BEGIN: Final = re.compile(
     rb"\A[^\xfd\xfe]*?(?=ULog\x01\x12\x35|..F[a-z0-9_]+:uint64_t timestamp;)", re.DOTALL
@@ -80,6 +84,22 @@ def format_of(path: Path) -> str:
     has_cells = any(delimiter in first for delimiter in (b",", b";", b"\t"))
     is_markup = head.lstrip()[:1] in (b"{", b"[", b"<")  # JSON, HTML and other XML
     return CSV if has_cells and not is_binary and not is_markup else TLOG
+
+
+def has_signature(path: Path) -> bool:
+    """Return whether a file begins with the bytes of a format that is known by them."""
+    head = first_bytes(path)
+    return any(knows(head) for knows in OTHER_FORMATS.values())
+
+
+def import_format(module: str, name: str) -> Any:
+    """Import the module of a format, which requires an extra; raises FlightError if missing."""
+    try:
+        return import_module(f"gateway.recordings.formats.{module}")
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("gateway"):
+            raise
+        raise FlightError(how_to_add(name, "formats")) from error
 
 
 def first_bytes(path: Path) -> bytes:

@@ -49,7 +49,7 @@ def is_packed(path: Path) -> bool:
 @contextmanager
 def open_unpacked(path: Path) -> Iterator[tuple[BinaryIO, BinaryIO]]:
     """Open a file, gzipped or not, for reading to its end; yields the content and the raw file."""
-    with _readable(path), open_recording(path) as raw:
+    with _readable(path), open_file(path) as raw:
         packed = raw.peek(len(GZIP_MAGIC)).startswith(GZIP_MAGIC)
         yield (cast(BinaryIO, io.BufferedReader(_Unpacker(path, raw))) if packed else raw), raw
 
@@ -78,7 +78,7 @@ class _Unpacker(io.RawIOBase):
         return len(data)
 
 
-def open_recording(path: Path) -> io.BufferedReader:
+def open_file(path: Path) -> io.BufferedReader:
     """Open a file for reading to its end; raises OSError as `open_descriptor`."""
     return os.fdopen(open_descriptor(path), "rb")
 

@@ -10,10 +10,10 @@ import numpy as np
 from gateway.recordings.columns import FloatArray
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import Samples, samples_of
-from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_fusion import aircraft_for
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.workshop.joining import joined_tables
+from gateway.recordings.recording import open_recordings
+from gateway.recordings.workshop.joining import joined_rows
 from gateway.records import BaroSample
 from gateway.simulator.recorded import RecordedFlight
 from gateway.units import DEG_PER_DEGE7, US_PER_S
@@ -34,8 +34,9 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
 
     Raises FlightError if it contains no flight; OSError if it cannot be read at all.
     """
-    table = joined_tables([open_rows(file, options) for file in files])
-    aircraft = aircraft_for(files, table, options)
+    recordings = open_recordings(files)
+    table = joined_rows(recordings, options)
+    aircraft = aircraft_for(recordings[0], table, options)
     cells = _cells(samples_of(table.blocks, aircraft.calibration))
     for remark in table.remarks:
         log.warning(remark)

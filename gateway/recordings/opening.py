@@ -13,7 +13,7 @@ from typing import Final
 
 from gateway.answers.log_answers import LogAnswers
 from gateway.recordings.autopilot_record import RecordTranslator
-from gateway.recordings.file_format import NO_RECORDING, TLOG, format_of
+from gateway.recordings.file_format import NO_RECORDING
 from gateway.recordings.files import (
     MAX_UNPACKED,
     FlightError,
@@ -24,9 +24,9 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.index import parts_together
 from gateway.recordings.play import Source, Track
-from gateway.recordings.reading import Estimates, beside_id, estimates_of, open_record
-from gateway.recordings.recorded_fusion import RecordedFusion, end_of
+from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.recording import Estimates, RecordedFile, estimates_of, open_recordings
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.recordings.tlog_index import TlogIndex
 from gateway.recordings.tlog_source import Layout, open_tlog
@@ -220,15 +220,16 @@ def open_flights(
     """
     flights = []
     for parts in parts_together(files):
-        flight = OpenFlight()
-        if format_of(parts[0]) == TLOG:
+        flight, recordings = OpenFlight(), open_recordings(parts)
+        if recordings[0].is_mavlink:
             for file in parts:
                 tlog = TlogFile(file, options.progress, flight.answers, options.unpacked_limit)
                 opened.callback(tlog.close)
                 flight.sources.append(tlog)
                 flight.remarks += [f"{file}: {remark}" for remark in tlog.remarks]
         else:
-            _open_made(flight, parts, options, opened, estimates_of(parts, fuse=fuse, both=both))
+            estimates = estimates_of(recordings, fuse=fuse, both=both)
+            _open_made(flight, recordings, options, opened, estimates)
         for source, file in zip(flight.sources, parts, strict=False):
             if not source.index.count:
                 raise FlightError(f"{file}: {NO_RECORDING}")
@@ -238,7 +239,7 @@ def open_flights(
 
 def _open_made(
     flight: OpenFlight,
-    parts: Sequence[Path],
+    recordings: Sequence[RecordedFile],
     options: ReadOptions,
     opened: ExitStack,
     estimates: Estimates,
@@ -251,19 +252,19 @@ def _open_made(
         flight.sources.append(made)
 
     if estimates != "fused":
-        for part in parts:
-            log = open_record(part, options)
+        for recording in recordings:
+            log = recording.log(options)
             translator = RecordTranslator(log)
             for frame in translator.introduction():
                 flight.answers.add_frame(frame, 0)
             add(translator.frames())
             flight.remarks += log.remarks
-            options = replace(options, system_id=beside_id(log.vehicle_id), progress=None)
+            options = replace(options, system_id=log.beside_id, progress=None)
     if estimates != "own":
-        fusion = RecordedFusion(parts, options)
+        fusion = RecordedFusion(recordings, options)
         for frame in fusion.introduction():
             flight.answers.add_frame(frame, 0)
-        add(fusion.frames(), end_of(parts[-1], options))
+        add(fusion.frames(), recordings[-1].end_us(options))
         flight.remarks += fusion.remarks
 
 

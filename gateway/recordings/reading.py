@@ -1,34 +1,30 @@
-"""Open any recording as a table, with the reader of its format.
-
-Readers that require large packages are imported with the first file of their format.
-"""
+"""Read the rows of each format; `recording` chooses the reader."""
 
 import codecs
+import re
 from collections.abc import Callable, Iterable, Iterator
-from importlib import import_module
+from contextlib import suppress
 from importlib.resources import files
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final
 
 import msgspec
 
-from gateway.extras import how_to_add
-from gateway.recordings.autopilot_record import AutopilotLog
 from gateway.recordings.columns import TIMES
 from gateway.recordings.file_format import (
     CSV,
+    LOGS,
     OTHER_FORMATS,
     PARQUET,
     TABLE,
     TLOG,
     encoding_of,
-    format_of,
+    import_format,
 )
-from gateway.recordings.files import FlightError, Progress, read_blocks, read_chunks
+from gateway.recordings.files import FlightError, Progress, read_blocks, read_chunks, read_ends
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.formats.mavlink import AutopilotReader
-from gateway.recordings.logged_samples import read_samples
 from gateway.recordings.recorded_clock import RestartClock
 from gateway.recordings.recorded_table import (
     ReadOptions,
@@ -37,18 +33,15 @@ from gateway.recordings.recorded_table import (
     table_of_blocks,
 )
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
-from gateway.recordings.tlog_source import open_tlog
+from gateway.recordings.tlog_source import TlogSource
 from gateway.toml_file import TomlError, read_toml
 from gateway.units import counted
-from gateway.vehicle_state.senders import FIRST_GROUND_STATION
 
 TRACKER_LOG: Final = files("gateway.recordings.formats") / "tracker-log.toml"
 """Column map for logs with the columns time_s, ax, gx and so on."""
-RECORDS: Final = {"DataFlash": "dataflash_record", "ULog": "ulog_record"}
-"""Module that reads an autopilot's log, by the name of the format."""
-
-Estimates = Literal["own", "fused", "both"]
-"""Estimates to use from an autopilot's log: its own, those of mavgate, or both as two vehicles."""
+HEAD_LINES: Final = 20
+"""Lines of a CSV in which values are searched."""
+_KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
 
 Read = Callable[[Path, ReadOptions], RecordedTable]
 
@@ -58,75 +51,9 @@ READERS: dict[str, Read] = {}
 
 def add_reader(name: str, knows: Callable[[bytes], bool], read: Read) -> None:
     """Add a format that every command that takes a flight will be able to read."""
-    if name in READERS:
+    if name in {TLOG, *LOGS, *READERS}:
         raise ValueError(f"{name} files are read already")
     OTHER_FORMATS[name], READERS[name] = knows, read
-
-
-def import_format(module: str, name: str) -> Any:
-    """Import the module of a format, which requires an extra; raises FlightError if missing."""
-    try:
-        return import_module(f"gateway.recordings.formats.{module}")
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("gateway"):
-            raise
-        raise FlightError(how_to_add(name, "formats")) from error
-
-
-def has_record(path: Path) -> bool:
-    """Return whether a file is an autopilot's log, with its own estimates."""
-    return format_of(path) in RECORDS
-
-
-def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
-    """Open an autopilot's own log for playback; raises FlightError and OSError as `open_rows`."""
-    log = _open_log(path, options)
-    if not log.is_shown:
-        raise FlightError(f"{path}: nothing to play: {log.why_no_samples}")
-    return log
-
-
-def _open_log(path: Path, options: ReadOptions, *, sampled: bool = False) -> AutopilotLog:
-    kind = format_of(path)
-    module = import_format(RECORDS[kind], kind)
-    log: AutopilotLog = module.open_record(path, options, sampled=sampled)
-    return log
-
-
-def _open_samples(path: Path, options: ReadOptions) -> RecordedTable:
-    return read_samples(path, _open_log(path, options, sampled=True), options)
-
-
-def _open_parquet(path: Path, options: ReadOptions) -> RecordedTable:
-    table: RecordedTable = import_format("parquet", PARQUET).read(path, options)
-    return table
-
-
-def estimates_of(files: Iterable[Path], *, fuse: bool, both: bool) -> Estimates:
-    """Return which estimates of these files are sent; FlightError for `both` if none is a log."""
-    if not all(has_record(file) for file in files):
-        if both:
-            raise FlightError("--beside is for logs of autopilots, DataFlash and ULog")
-        return "fused"
-    return "both" if both else "fused" if fuse else "own"
-
-
-def beside_id(vehicle_id: int) -> int:
-    """Return the system id of the second vehicle, which has the states of mavgate."""
-    return vehicle_id % (FIRST_GROUND_STATION - 1) + 1
-
-
-def is_table(path: Path) -> bool:
-    """Return whether a file is a table of mavgate, with its own settings and states."""
-    return format_of(path) in (TABLE, PARQUET)
-
-
-def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
-    """Open any file that contains a flight as a table.
-
-    Raises FlightError if it contains no readable flight; OSError if it cannot be read at all.
-    """
-    return READERS[format_of(path)](path, options)
 
 
 def read_column_map(path: Path) -> ColumnMap:
@@ -218,9 +145,9 @@ def check_vehicle(paths: Iterable[Path], wanted: int | None, found: Iterable[int
         raise FlightError(f"{each}: no vehicle {wanted} in this file; it has {listed}")
 
 
-def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
-    source = open_tlog(path)
-    reader = AutopilotReader(options.system_id, source.senders)
+def read_mavlink(source: TlogSource, options: ReadOptions) -> RecordedTable:
+    """Read the samples of one vehicle in MAVLink as a flight; FlightError if there are none."""
+    path, reader = source.path, AutopilotReader(options.system_id, source.senders)
     batches = source.batches(options.progress, strict=True)
     blocks = chain(map(reader.feed, batches), [None])
     stream = (reader.flush() if cells is None else cells for cells in blocks)
@@ -235,5 +162,42 @@ def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
     return RecordedTable(header, map(TableBlock, chain([first], stream)), remarks)
 
 
-READERS |= {TABLE: _open_table, CSV: _open_csv, TLOG: _open_autopilot, PARQUET: _open_parquet}
-READERS |= dict.fromkeys(RECORDS, _open_samples)
+def facts_of_csv(path: Path) -> dict[str, float]:
+    """Read `key=value` in the comments of a CSV; FlightError if one is not a number."""
+    facts: dict[str, float] = {}
+    begin = next(read_chunks(path), b"")
+    head = begin.decode(encoding_of(begin), errors="replace")
+    for number, line in enumerate(head.split("\n", HEAD_LINES)[:HEAD_LINES], 1):
+        for key, value in _KEY_VALUE.findall(line) if line.startswith("#") else ():
+            try:
+                facts[key] = float(value)
+            except ValueError as error:
+                raise FlightError(
+                    f"{path}: line {number}: {key}={value} is not a number"
+                ) from error
+    return facts
+
+
+def _end_of_csv(path: Path, options: ReadOptions) -> int | None:
+    lines = b"".join(read_ends(path)).decode(errors="replace").splitlines()
+    with suppress(ValueError):
+        *_, last = csv_reader(options).blocks(lines)
+        return int(last.cells[-1, 0]) if len(last) else None
+    return None
+
+
+def _end_of_table(path: Path, _: ReadOptions) -> int | None:
+    reader = TableReader()
+    rows = reader.feed_block(b"".join(read_ends(path)), final=True)
+    zero_us = (reader.header.unix_us_at_zero or 0) if reader.header else 0
+    return zero_us + int(rows.cells[-1, 0]) if len(rows) else None
+
+
+def _open_parquet(path: Path, options: ReadOptions) -> RecordedTable:
+    table: RecordedTable = import_format("parquet", PARQUET).read(path, options)
+    return table
+
+
+READERS |= {TABLE: _open_table, CSV: _open_csv, PARQUET: _open_parquet}
+END_READERS: Final = {TABLE: _end_of_table, CSV: _end_of_csv}
+"""Readers of the civil time of the last row, for formats in which it can be found."""

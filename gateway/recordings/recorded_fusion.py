@@ -5,12 +5,9 @@ else that of the log's comments; else the latency is estimated from the motion; 
 used, with a remark. mavgate's own recordings keep theirs.
 """
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from itertools import chain
-from pathlib import Path
 from typing import Final
 
 import msgspec
@@ -33,8 +30,7 @@ from gateway.recordings.columns import (
     has_group,
     write_lines,
 )
-from gateway.recordings.file_format import CSV, TABLE, encoding_of, format_of
-from gateway.recordings.files import FlightError, read_chunks, read_ends
+from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import (
     SMOOTHED_ESTIMATOR,
     Correct,
@@ -48,7 +44,6 @@ from gateway.recordings.fuse import (
     with_estimator,
     with_reference,
 )
-from gateway.recordings.reading import csv_reader, is_table, open_rows
 from gateway.recordings.recorded_clock import Stamper
 from gateway.recordings.recorded_table import (
     Line,
@@ -58,6 +53,7 @@ from gateway.recordings.recorded_table import (
     header_for,
     settings_of,
 )
+from gateway.recordings.recording import RecordedFile
 from gateway.recordings.table import (
     FORMAT_LINE,
     NO_ROWS,
@@ -66,11 +62,10 @@ from gateway.recordings.table import (
     TableComment,
     TableHeader,
     TableNote,
-    TableReader,
     encode_line,
 )
 from gateway.recordings.tlog import UNRECORDED
-from gateway.recordings.workshop.joining import joined_tables
+from gateway.recordings.workshop.joining import joined_rows
 from gateway.records import RECORDED_ONLY, FusionState, NodeStatus
 from gateway.sensing.chain import IntArray, SensorChain
 from gateway.units import US_PER_S, counted
@@ -83,11 +78,9 @@ SAMPLES: Final = 20_000
 """Samples in a piece of the estimation of the GPS latency: 4 MB of states."""
 LONGEST_GAP_US: Final = 1_000_000
 """In a longer gap the pipeline's timers are not run step by step."""
-HEAD_LINES: Final = 20
 LATENCY_TOLERANCE_S: Final = 0.03
 """The position may lag the velocity of the same fix by this much; the estimation compares only
 the velocity."""
-_KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
 USUAL: Final = ReferenceSettings()
 LINES: Final = 2000
 """Number of lines written at a time."""
@@ -144,26 +137,26 @@ class Replay:
 
 
 def aircraft_for(
-    files: Sequence[Path],
+    recording: RecordedFile,
     table: RecordedTable,
     options: ReadOptions,
     given_s: float | None = None,
     *,
     keep: bool = True,
 ) -> AircraftSettings:
-    """Choose the settings for a flight, and complete them from the values in its log.
+    """Choose the settings for a flight, and complete them from the values in its first file.
 
     `given_s` is the GPS latency that the user gives. If it must be estimated, the table is read
     here, and with `keep` its rows are kept for the next reader. FlightError if a value in a # line
     is out of range.
     """
     aircraft = aircraft_of(table, options)
-    facts = {} if is_table(files[0]) else facts_of(files[0])
+    facts = recording.facts()
     aircraft = with_facts(aircraft, facts)
     if given_s is not None:
         return with_reference(aircraft, gps_latency_s=given_s)
     latency_s = aircraft.estimation.reference.gps_latency_s
-    known = is_table(files[0]) or "gps_latency_s" in facts
+    known = recording.is_own or "gps_latency_s" in facts
     if known or latency_s != USUAL.gps_latency_s:
         return aircraft
     log = _log_of(table, aircraft, keep=keep)
@@ -175,11 +168,15 @@ def aircraft_for(
     else:
         how = f"estimated {_in_words(found)}"
         aircraft = with_reference(aircraft, gps_latency_s=found.latency_s)
-    table.remarks.append(f"{files[0]}: GPS latency not in log; {how} (override: gps_latency_s)")
+    table.remarks.append(
+        f"{recording.path}: GPS latency not in log; {how} (override: gps_latency_s)"
+    )
     return aircraft
 
 
-def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) -> None:
+def check_latency(
+    recording: RecordedFile, table: RecordedTable, aircraft: AircraftSettings
+) -> None:
     """Add a remark if the motion in a recording contradicts the GPS latency that is set."""
     set_s = aircraft.estimation.reference.gps_latency_s
     found = estimate_latency(_log_of(table, aircraft))
@@ -187,7 +184,7 @@ def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) 
         return
     if abs(found.latency_s - set_s) > max(LATENCY_TOLERANCE_S, 3.0 * found.std_s):
         table.remarks.append(
-            f"{file}: its manoeuvres show a GPS latency of {_in_words(found)}, "
+            f"{recording.path}: its manoeuvres show a GPS latency of {_in_words(found)}, "
             f"but gps_latency_s is {set_s:.2f} s"
         )
 
@@ -268,24 +265,6 @@ def _in_words(latency: FoundLatency) -> str:
     return f"{latency.latency_s:.3f} ± {latency.std_s:.3f} s"
 
 
-def facts_of(file: Path) -> dict[str, float]:
-    """Read `key=value` in the comments of another program's CSV; FlightError if not a number."""
-    facts: dict[str, float] = {}
-    if format_of(file) != CSV:
-        return facts
-    begin = next(read_chunks(file), b"")
-    head = begin.decode(encoding_of(begin), errors="replace")
-    for number, line in enumerate(head.split("\n", HEAD_LINES)[:HEAD_LINES], 1):
-        for key, value in _KEY_VALUE.findall(line) if line.startswith("#") else ():
-            try:
-                facts[key] = float(value)
-            except ValueError as error:
-                raise FlightError(
-                    f"{file}: line {number}: {key}={value} is not a number"
-                ) from error
-    return facts
-
-
 def with_facts(aircraft: AircraftSettings, facts: dict[str, float]) -> AircraftSettings:
     """Replace default settings by values of a log; raises FlightError if one is out of range."""
     reference = aircraft.estimation.reference
@@ -314,36 +293,36 @@ class RecordedFusion:
 
     def __init__(
         self,
-        files: Sequence[Path],
+        recordings: Sequence[RecordedFile],
         options: ReadOptions,
         *,
         smooth: bool = False,
         estimator: str | None = None,
         latency_s: float | None = None,
     ) -> None:
-        self._table = table = joined_tables([open_rows(file, options) for file in files])
-        self.aircraft = aircraft_for(files, table, options, latency_s)
+        first, quiet = recordings[0], replace(options, progress=None)
+        self._path = first.path
+        self._table = table = joined_rows(recordings, options)
+        self.aircraft = aircraft_for(first, table, options, latency_s)
         """The settings used for the fusion."""
         if smooth or estimator is not None:
             name = SMOOTHED_ESTIMATOR if smooth or estimator is None else estimator
             self.aircraft = with_estimator(self.aircraft, name)
-        is_own = options.choice == "recorded" and is_table(files[0])
+        is_own = options.choice == "recorded" and first.is_own
         self._follow = is_own and estimator is None and latency_s is None
         self._correct: Correct | None = None
         if smooth:
-            smoothed = self._smooth(_blocks_of(files, options), files[0])
-            self._correct = smoothed_states(*smoothed)
+            self._correct = smoothed_states(*self._smooth(joined_rows(recordings, quiet).blocks))
         elif options.position == "interpolated":
             latency_s = self.aircraft.estimation.reference.gps_latency_s
-            cells = (block.cells for block in _blocks_of(files, options))
+            cells = (block.cells for block in joined_rows(recordings, quiet).blocks)
             fixes = [some[has_group(some, GPS), GPS] for some in cells]
             self._correct = interpolated_positions(np.concatenate(fixes), latency_s)
         self._refused: list[str] = []
         self._time_us: list[IntArray] = []
         self._name = self.aircraft.estimation.estimator + (" and smoothed" if smooth else "")
-        self._files = files
 
-    def _smooth(self, blocks: Iterable[TableBlock], file: Path) -> tuple[IntArray, FloatArray]:
+    def _smooth(self, blocks: Iterable[TableBlock]) -> tuple[IntArray, FloatArray]:
         """Smooth the rows; a remark is added if the latency used is not the one that was set."""
         samples = samples_of(blocks, self.aircraft.calibration)
         try:
@@ -353,18 +332,18 @@ class RecordedFusion:
         try:
             fused = fuse(samples, estimator, smoothed=True)
         except ValueError as error:
-            raise FlightError(f"{file}: {error}") from error
+            raise FlightError(f"{self._path}: {error}") from error
         set_s = self.aircraft.estimation.reference.gps_latency_s
         if fused.latency_s != set_s:
             text = smoothed_latency_in_words(fused.latency_s, set_s)
-            self._table.remarks.append(f"{file}: {text}")
+            self._table.remarks.append(f"{self._path}: {text}")
             self.aircraft = with_reference(self.aircraft, gps_latency_s=fused.latency_s)
         return np.sort(samples.imu.time_us, kind="stable"), fused.states
 
     @property
     def remarks(self) -> list[str]:
         """Remarks for the user on the states, as far as the rows were read."""
-        refused = (f"{self._files[0]}: {NOT_RESTORED.format(why)}" for why in self._refused)
+        refused = (f"{self._path}: {NOT_RESTORED.format(why)}" for why in self._refused)
         return [*refused, *self._table.remarks, *self._of_rate()]
 
     @property
@@ -376,7 +355,7 @@ class RecordedFusion:
     def _of_rate(self) -> Iterator[str]:
         if 0.0 < (rate_hz := self._rate_hz()) < LEAST_RATE_HZ:
             yield (
-                f"{self._files[0]}: its IMU samples come at {rate_hz:.2g} Hz; below "
+                f"{self._path}: its IMU samples come at {rate_hz:.2g} Hz; below "
                 f"{LEAST_RATE_HZ:.0f} Hz rotation between them is not measured, so attitude and "
                 "position may be wrong"
             )
@@ -437,27 +416,3 @@ def header_of_states(known: TableHeader, aircraft: AircraftSettings) -> TableHea
         session=known.session,
         unix_us_at_zero=known.unix_us_at_zero,
     )
-
-
-def end_of(file: Path, options: ReadOptions) -> int | None:
-    """Return the civil time of a table's last row without reading it all; None if unknown."""
-    kind = format_of(file)
-    if kind not in (TABLE, CSV):
-        return None
-    head, tail = read_ends(file)
-    if kind == CSV:
-        lines = (head + tail).decode(errors="replace").splitlines()
-        with suppress(ValueError):
-            *_, last = csv_reader(options).blocks(lines)
-            return int(last.cells[-1, 0]) if len(last) else None
-        return None
-    reader = TableReader()
-    rows = reader.feed_block(head + tail, final=True)
-    zero_us = (reader.header.unix_us_at_zero or 0) if reader.header else 0
-    return zero_us + int(rows.cells[-1, 0]) if len(rows) else None
-
-
-def _blocks_of(files: Iterable[Path], options: ReadOptions) -> Iterator[TableBlock]:
-    """Read all files again, in addition to the reader of the rows."""
-    quiet = replace(options, progress=None)
-    return joined_tables([open_rows(file, quiet) for file in files]).blocks

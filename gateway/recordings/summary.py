@@ -5,21 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 
 from gateway.recordings.columns import BARO, GPS, MAG, NAV, RAW, SI, FloatArray, has_group
-from gateway.recordings.file_format import NO_RECORDING, TABLE, TLOG, format_of
+from gateway.recordings.file_format import NO_RECORDING, TABLE
 from gateway.recordings.files import FlightError, Progress, read_blocks
 from gateway.recordings.flight_facts import FlightFacts, FlightTally, checksum
 from gateway.recordings.recorded_clock import Gap, TimesSpan
+from gateway.recordings.recording import RecordedFile
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableNote, TableReader
 from gateway.recordings.tallies import MessageTally, RowTally
 from gateway.recordings.tlog_index import DAMAGED_TIME, TlogIndex
-from gateway.recordings.tlog_source import open_tlog
 from gateway.units import US_PER_S, counted
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
@@ -234,7 +233,7 @@ def _checksum(header: TableHeader | None) -> str | None:
 
 
 def read_summary(
-    file: Path,
+    recording: RecordedFile,
     progress: Progress | None = None,
     options: Callable[[], ReadOptions] | None = None,
 ) -> Summary:
@@ -242,20 +241,17 @@ def read_summary(
 
     `options` is called for other programs' files only, which are refused without it.
     """
-    kind, size = format_of(file), file.stat().st_size
-    if kind == TLOG:
-        source = open_tlog(file)
+    file, size = recording.path, recording.path.stat().st_size
+    if recording.is_mavlink:
+        source = recording.mavlink
         found = _of_messages(source.senders, source.batches(progress), size)
         if not found.info.records:
             raise FlightError(f"{file}: {NO_RECORDING}")
-        return _with(found, kind, (*source.remarks, *found.info.remarks))
-    if kind != TABLE:
+        return _with(found, recording, (*source.remarks, *found.info.remarks))
+    if recording.kind != TABLE:
         if options is None:
             raise FlightError(f"{file}: {NO_RECORDING}")
-        # These import all stages, which the summary of our own recordings does not need.
-        from gateway.recordings.reading import has_record
-
-        return (_of_log if has_record(file) else _of_rows)(file, kind, options())
+        return (_of_log if recording.is_log else _of_rows)(recording, options())
     table, reader = TableSummary(), TableReader()
     for block in read_blocks(file, reader, progress):
         table.add(block, reader.header)
@@ -269,30 +265,30 @@ def _of_messages(senders: Senders, batches: Iterable[Batch], size: int) -> Summa
     return summary.result(size)
 
 
-def _with(found: Summary, kind: str, remarks: Iterable[str]) -> Summary:
-    return replace(found, info=replace(found.info, kind=kind, remarks=tuple(remarks)))
+def _with(found: Summary, recording: RecordedFile, remarks: Iterable[str]) -> Summary:
+    return replace(found, info=replace(found.info, kind=recording.kind, remarks=tuple(remarks)))
 
 
-def _of_rows(file: Path, kind: str, options: ReadOptions) -> Summary:
-    from gateway.recordings.reading import is_table, open_rows
+def _of_rows(recording: RecordedFile, options: ReadOptions) -> Summary:
+    # This imports all stages, as reading the rows does.
     from gateway.recordings.workshop.joining import shifted
 
-    recorded, table = open_rows(file, options), TableSummary()
-    own = is_table(file)
+    recorded, table = recording.rows(options), TableSummary()
+    own = recording.is_own
     zero_us = 0 if own else recorded.header.unix_us_at_zero or 0
     for block in recorded.blocks:
         table.add(shifted(block, zero_us), recorded.header)
-    found = table.result(file.stat().st_size)
+    found = table.result(recording.path.stat().st_size)
     found = replace(found, info=replace(found.info, header=found.info.header if own else None))
-    return _with(found, kind, recorded.remarks)
+    return _with(found, recording, recorded.remarks)
 
 
-def _of_log(file: Path, kind: str, options: ReadOptions) -> Summary:
+def _of_log(recording: RecordedFile, options: ReadOptions) -> Summary:
     """Summarise an autopilot's log by the MAVLink that is made of it."""
     from gateway.recordings.workshop.convert import FlightToWrite
 
-    flight = FlightToWrite([file], options)
+    flight = FlightToWrite([recording], options)
     batches = flight.chosen()
-    found = _of_messages(flight.senders, batches, file.stat().st_size)
+    found = _of_messages(flight.senders, batches, recording.path.stat().st_size)
     lacks = filter(None, [log.lacks for log in flight.logs])
-    return _with(found, kind, [*flight.remarks, *lacks])
+    return _with(found, recording, [*flight.remarks, *lacks])

@@ -9,6 +9,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.answers.log_answers import LogAnswers
 from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.recording import RecordedFile
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.recordings.workshop.convert import FlightToWrite
 from gateway.recordings.workshop.extracts import RecordedPlan
@@ -25,16 +26,16 @@ class VehicleRecording:
     read.
     """
 
-    def __init__(self, files: Sequence[Path], options: ReadOptions) -> None:
-        self.flight = FlightToWrite(files, options)
+    def __init__(self, recordings: Sequence[RecordedFile], options: ReadOptions) -> None:
+        self.flight, path = FlightToWrite(recordings, options), recordings[0].path
         if not self.flight.has_messages:
-            raise FlightError(f"{files[0]}: is neither MAVLink nor the log of an autopilot")
+            raise FlightError(f"{path}: is neither MAVLink nor the log of an autopilot")
         self.first_us = 0
         """Time of the first record; 0 before it is read."""
         self._answers = LogAnswers()
         senders = self.flight.senders
         chosen = options.system_id if self.flight.is_mavlink else None
-        self.system_id = chosen or _only_vehicle(files, senders)
+        self.system_id = chosen or _only_vehicle(path, senders)
 
     def batches(self) -> Iterator[Batch]:
         """Yield the records of all senders; afterwards parameters and plans are known."""
@@ -67,14 +68,14 @@ class VehicleRecording:
         return RecordedPlan(self._answers, self.flight.senders.vehicle(self.system_id))
 
 
-def _only_vehicle(files: Sequence[Path], senders: Senders) -> int:
+def _only_vehicle(path: Path, senders: Senders) -> int:
     systems = senders.systems()
     beats = {one: senders.vehicle(one).heartbeat for one in systems}
     piloted = [one for one, beat in beats.items() if beat and beat[1] != NO_AUTOPILOT]
     found = piloted or systems
     if not found:
-        raise FlightError(f"{files[0]}: contains no vehicle")
+        raise FlightError(f"{path}: contains no vehicle")
     if len(found) > 1:
         listed = ", ".join(map(str, found))
-        raise FlightError(f"{files[0]}: several vehicles; choose one with --system: {listed}")
+        raise FlightError(f"{path}: several vehicles; choose one with --system: {listed}")
     return found[0]

@@ -21,6 +21,7 @@ from gateway.recordings.opening import TlogFile
 from gateway.recordings.play import Player, Track
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions, header_for
+from gateway.recordings.recording import open_recordings
 from gateway.recordings.table import TableHeader, TableReader
 from gateway.recordings.tlog import UNRECORDED
 from gateway.records import RECORDED_ONLY, FusedSample, FusionState, NavState
@@ -177,7 +178,9 @@ def check_tables(folder: Path, states: list[NavState], flight: Flight) -> None:
     assert repr([row.state for row in rows if row.state is not None]) == repr(states)
     options = ReadOptions(PipelineSettings(flight.settings.default_aircraft))
     again = [
-        row for row in RecordedFusion(paths, options).table().rows if isinstance(row, TableRow)
+        row
+        for row in RecordedFusion(open_recordings(paths), options).table().rows
+        if isinstance(row, TableRow)
     ]
     assert repr(again) == repr(rows)
     # A later part alone begins in flight, and goes on from what the fusion remembered there.

@@ -19,8 +19,8 @@ from gateway.recordings.autopilot_record import RecordTranslator
 from gateway.recordings.files import FlightError
 from gateway.recordings.message_table import UNITS
 from gateway.recordings.opening import open_flights
-from gateway.recordings.reading import open_record
-from gateway.recordings.summary import read_summary
+from gateway.recordings.recording import open_recording
+from gateway.recordings.summary import FileInfo, read_summary
 from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
@@ -95,8 +95,12 @@ def write(path: Path, extra: Sequence[flown.Row] = (), formats: dict[str, Any] =
     return flown.write(path, flown.dataflash_of(formats, [*extra, *rows()]))
 
 
+def info_of(path: Path) -> FileInfo:
+    return read_summary(open_recording(path), None, lambda: OPTIONS).info
+
+
 def translated(path: Path) -> list[RecordedFrame]:
-    return list(RecordTranslator(open_record(path, OPTIONS)).frames())
+    return list(RecordTranslator(open_recording(path).log(OPTIONS)).frames())
 
 
 def messages_of(records: Sequence[RecordedFrame], name: str) -> list[dict[str, Any]]:
@@ -404,7 +408,7 @@ PX4_EXPECTED: dict[str, dict[str, float]] = {
 @pytest.fixture(scope="module")
 def px4_records(tmp_path_factory: pytest.TempPathFactory) -> list[RecordedFrame]:
     path = flown.write(tmp_path_factory.mktemp("log") / "flight.ulg", px4_log())
-    log = open_record(path, OPTIONS)
+    log = open_recording(path).log(OPTIONS)
     assert log.without_counterpart == {"odd_topic": 40}
     return list(RecordTranslator(log).frames())
 
@@ -442,7 +446,7 @@ def test_value_with_a_time_outside_the_log_does_not_lengthen_it(
     tmp_path: Path, times: dict[str, float]
 ) -> None:
     path = flown.write(tmp_path / "flight.ulg", px4_log(**times))
-    info = read_summary(path, None, lambda: OPTIONS).info
+    info = info_of(path)
     assert 3.8 < info.duration_s < 5.0
     assert not info.gaps
     records = translated(path)
@@ -460,7 +464,7 @@ def test_log_and_the_tlog_made_of_it_have_the_same_summary(tmp_path: Path, name:
     log, tlog = tmp_path / name, tmp_path / "made.tlog"
     flown.write(log, px4_log()) if log.suffix == ".ulg" else write(log)
     run("convert", log, "-o", tlog)
-    found, made = (read_summary(path, None, lambda: OPTIONS).info for path in (log, tlog))
+    found, made = map(info_of, (log, tlog))
     assert found.records > 100
     assert replace(found, kind="", size=0, remarks=()) == replace(made, kind="", size=0, remarks=())
 
@@ -480,7 +484,7 @@ def test_tlog_has_own_estimates_fused_ones_or_both(tmp_path: Path) -> None:
 def test_damaged_log_gives_what_is_intact(tmp_path: Path) -> None:
     data = flown.dataflash_of(FORMATS, rows())
     path = flown.write(tmp_path / "cut.bin", data[:-700])
-    log = open_record(path, OPTIONS)
+    log = open_recording(path).log(OPTIONS)
     found = list(RecordTranslator(log).frames())
     assert len(messages_of(found, "ATTITUDE")) > 30
     assert any("ends within a message" in remark for remark in log.remarks)
@@ -496,7 +500,7 @@ def test_damage_of_whole_blocks_loses_no_message_around_it(tmp_path: Path, part:
     damage = bits.randbytes(2000) + b"".join(heads)
     sound = flown.write(tmp_path / "sound.bin", data)
     damaged = flown.write(tmp_path / "damaged.bin", data[:at] + damage + data[at:])
-    found, whole = (read_summary(path, None, lambda: OPTIONS).info for path in (damaged, sound))
+    found, whole = map(info_of, (damaged, sound))
     assert any(f"left out {len(damage)} bytes" in remark for remark in found.remarks)
     kept = replace(found, size=whole.size, remarks=whole.remarks)
     assert kept == whole
@@ -505,7 +509,7 @@ def test_damage_of_whole_blocks_loses_no_message_around_it(tmp_path: Path, part:
 def test_log_without_rows_is_refused(tmp_path: Path) -> None:
     path = flown.write(tmp_path / "empty.bin", flown.dataflash_of(FORMATS, []))
     with pytest.raises(FlightError, match="nothing to play"):
-        open_record(path, OPTIONS)
+        open_recording(path).log(OPTIONS)
 
 
 @pytest.mark.parametrize("name", ["dataflash", "ulog"])

@@ -14,9 +14,9 @@ from gateway.cli.support.recordings import load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.flown import open_flown
-from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_fusion import RecordedFusion, aircraft_for
 from gateway.recordings.recorded_table import ReadOptions, settings_of
+from gateway.recordings.recording import open_recording
 from tests.kit.cli import run
 from tests.recordings.flights import OPTIONS
 
@@ -35,13 +35,15 @@ def without_latency(tmp_path: Path) -> Path:
 
 
 def test_every_command_uses_the_latency_estimated_from_manoeuvres(without_latency: Path) -> None:
-    table = open_rows(without_latency, OPTIONS)
-    latency_s = aircraft_for([without_latency], table, OPTIONS).estimation.reference.gps_latency_s
+    table = open_recording(without_latency).rows(OPTIONS)
+    latency_s = aircraft_for(
+        open_recording(without_latency), table, OPTIONS
+    ).estimation.reference.gps_latency_s
     assert latency_s == pytest.approx(0.16, abs=0.02)
     assert "GPS latency not in log; estimated 0.1" in table.remarks[0]
     assert load_flight(without_latency, TODAY, read_options(TODAY)).latency_s == latency_s
     assert read_batch_flight([without_latency], OPTIONS, "log")[0].latency_s == latency_s
-    fusion = RecordedFusion([without_latency], OPTIONS)
+    fusion = RecordedFusion([open_recording(without_latency)], OPTIONS)
     assert fusion.remarks == table.remarks
     assert open_flown([without_latency], OPTIONS).gps_latency_s == latency_s
     settings = settings_of(fusion.table().header)
@@ -50,8 +52,11 @@ def test_every_command_uses_the_latency_estimated_from_manoeuvres(without_latenc
 
 def test_rows_are_read_once_to_estimate_the_latency(without_latency: Path) -> None:
     """The first reader leaves them to the next."""
-    table, again = open_rows(without_latency, OPTIONS), open_rows(without_latency, OPTIONS)
-    aircraft_for([without_latency], table, OPTIONS)
+    table, again = (
+        open_recording(without_latency).rows(OPTIONS),
+        open_recording(without_latency).rows(OPTIONS),
+    )
+    aircraft_for(open_recording(without_latency), table, OPTIONS)
     assert sum(map(len, table.blocks)) == sum(map(len, again.blocks)) > 0
 
 
@@ -69,8 +74,10 @@ def test_recording_fused_with_another_latency_is_reported(
 
 def test_latency_of_user_log_or_settings_is_used(without_latency: Path) -> None:
     def latency_s(path: Path, options: ReadOptions, given_s: float | None = None) -> float:
-        table = open_rows(path, options)
-        found = aircraft_for([path], table, options, given_s).estimation.reference.gps_latency_s
+        table = open_recording(path).rows(options)
+        found = aircraft_for(
+            open_recording(path), table, options, given_s
+        ).estimation.reference.gps_latency_s
         assert table.remarks == []
         return found
 
@@ -88,10 +95,10 @@ def test_every_command_smooths_with_the_latency_that_contradicts_the_one_set(
     path.write_text(text.replace("gps_latency_s=0.16", "gps_latency_s=0.4"))
     remark = "smoothed with a GPS latency of 0.1"
     assert remark in run("fuse", path, "-o", out, "--smooth")
-    table = open_rows(out, OPTIONS)
+    table = open_recording(out).rows(OPTIONS)
     latency_s = settings_of(table.header).estimation.reference.gps_latency_s
     assert latency_s == pytest.approx(0.16, abs=0.02)
-    fusion = RecordedFusion([path], OPTIONS, smooth=True)
+    fusion = RecordedFusion([open_recording(path)], OPTIONS, smooth=True)
     assert remark in fusion.remarks[0]
     settings = settings_of(fusion.table().header)
     assert settings.estimation.reference.gps_latency_s == latency_s

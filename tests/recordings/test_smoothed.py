@@ -14,6 +14,7 @@ from gateway.recordings.columns import NAV, has_group
 from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import header_for
+from gateway.recordings.recording import open_recording
 from gateway.records import NavFlags
 from tests.kit.cli import run
 from tests.kit.recordings import write_table
@@ -29,7 +30,7 @@ def rows_of_golden() -> tuple[list[str], list[str]]:
 
 
 def smoothed(path: Path) -> tuple[IntArray, FloatArray]:
-    return states_of(RecordedFusion([path], OPTIONS, smooth=True, latency_s=0.0))
+    return states_of(RecordedFusion([open_recording(path)], OPTIONS, smooth=True, latency_s=0.0))
 
 
 def states_of(fusion: RecordedFusion) -> tuple[IntArray, FloatArray]:
@@ -61,7 +62,7 @@ def test_clock_set_back_is_refused_with_advice(tmp_path: Path) -> None:
     text = "own.csv: its clock goes back by 20.0 s at IMU sample 1877"
     assert text in run("fuse", own, "-o", out, "--smooth", code=2)
     with pytest.raises(FlightError, match=f"{text}.*leave out --smooth"):
-        RecordedFusion([own], OPTIONS, smooth=True)
+        RecordedFusion([open_recording(own)], OPTIONS, smooth=True)
 
 
 def recording_from_the_middle(
@@ -78,8 +79,10 @@ def test_recording_begun_in_flight_is_smoothed_from_its_stored_state(tmp_path: P
     firsts = {}
     for state in (False, True):
         path = recording_from_the_middle(tmp_path, np.random.default_rng(3), state=state)
-        firsts[state] = states_of(RecordedFusion([path], OPTIONS, smooth=True))[1][0]
-        causal = states_of(RecordedFusion([path], OPTIONS))[1][0]
+        firsts[state] = states_of(RecordedFusion([open_recording(path)], OPTIONS, smooth=True))[1][
+            0
+        ]
+        causal = states_of(RecordedFusion([open_recording(path)], OPTIONS))[1][0]
     assert firsts[False][NAV_ATTITUDE_STD] > 0.3
     assert firsts[True][NAV_ATTITUDE_STD] < 0.1
     np.testing.assert_allclose(firsts[True][:4], causal[:4], atol=0.05)
@@ -95,7 +98,7 @@ def test_flags_of_smoothed_rows_claim_nothing_that_is_not_known(
     tmp_path: Path, rng: np.random.Generator, state: bool
 ) -> None:
     path = recording_from_the_middle(tmp_path, rng, state=state)
-    fusion = RecordedFusion([path], OPTIONS, smooth=True)
+    fusion = RecordedFusion([open_recording(path)], OPTIONS, smooth=True)
     cells = states_of(fusion)[1]
     flags = cells[:, NAV_FLAGS].astype(int)
     for flag, column in (
@@ -113,6 +116,6 @@ def test_recording_with_an_unsuitable_state_is_smoothed_from_its_rows_and_report
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     path = recording_from_the_middle(tmp_path, rng, state=True, lost_bytes=40)
-    fusion = RecordedFusion([path], OPTIONS, smooth=True)
+    fusion = RecordedFusion([open_recording(path)], OPTIONS, smooth=True)
     assert len(states_of(fusion)[0])
     assert sum("truncated" in remark for remark in fusion.remarks) == 1

@@ -34,7 +34,7 @@ from gateway.live.control_verbs import raw_of
 from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import SerialPort, SerialSettings, find_receiver
 from gateway.printable import figure
-from gateway.recordings.reading import open_rows
+from gateway.recordings.recording import open_recording
 from gateway.records import ImuRaw, LinkReport, NodeStatus, RawRecord
 from gateway.sensing import calibrating
 from gateway.sensing.calibrating import CalibrationError, NodeSamples, node_samples
@@ -324,7 +324,7 @@ def _missing(samples: list[NodeSamples]) -> list[str]:
 def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSamples:
     raws, moving, moved_us = list[ImuRaw](), list[bool](), -MOVING_US
     (path, *_) = files_of([path], folder_of(settings), "tables")
-    table = open_rows(path, read_options(settings))
+    table = open_recording(path).rows(read_options(settings))
     for row in table.plain_rows:
         fix = row.gps
         if fix is not None and fix.node.vehicle_id == vehicle:

@@ -22,6 +22,7 @@ from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.estimation.select import ESTIMATORS
 from gateway.output import write_new
 from gateway.recordings.files import FlightError
+from gateway.recordings.recording import open_recordings
 from gateway.recordings.workshop.anonymising import (
     FIRST_DAY,
     LAST_DAY,
@@ -179,7 +180,7 @@ def _write(
     """
     with progress_of(files) as advance:
         options = read_options(read_settings(), columns, progress=advance, **how)
-        flight = FlightToWrite(files, options, edits, fusing, title=output.stem)
+        flight = FlightToWrite(open_recordings(files), options, edits, fusing, title=output.stem)
         inputs = [*files, columns, CONFIG.get()]
         size = write_new(output, WRITERS[output.suffix](flight), overwrite=force, inputs=inputs)
     print_remarks(flight.remarks)

@@ -15,6 +15,7 @@ from gateway.cli.support.recordings import print_remarks, progress_of, recorded_
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.output import check_output, write_new
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.recording import open_recordings
 from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.recordings.workshop.comparison import (
     SECTIONS,
@@ -85,7 +86,7 @@ def _read(name: str, files: list[Path], options: ReadOptions) -> Contents:
         return _read_live(name, int(live[1]))
     if files[0].suffix in PARAM_ENDINGS:
         return read_param_file(files[0])
-    recording = VehicleRecording(files, options)
+    recording = VehicleRecording(open_recordings(files), options)
     found = read_recording(str(files[0]), recording)
     print_remarks(dict.fromkeys(recording.flight.remarks))
     return found

@@ -15,6 +15,7 @@ from gateway.cli.support.terminal import console_of, refuse
 from gateway.output import check_output, write_new
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, iso_time, parse_moment, time_us_of
+from gateway.recordings.recording import open_recordings
 from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.recordings.workshop.extracts import param_file, qgc_params, qgc_plan, waypoints
 from gateway.recordings.workshop.timed_extracts import (
@@ -98,7 +99,7 @@ def extract(
     chosen = _read_fields(fields)
     with progress_of(files) as advance:
         options = read_options(read_settings(), system_id=system, progress=advance)
-        recording = VehicleRecording(files, options)
+        recording = VehicleRecording(open_recordings(files), options)
         timed = ((text, texts), (event, events), (image, images))
         made: list[tuple[Path, Iterable[str]]] = [
             (path, [make(recording.messages(WANTED))]) for path, make in timed if path is not None

@@ -23,14 +23,14 @@ from gateway.cli.support.terminal import (
 )
 from gateway.output import write_new
 from gateway.printable import UNKNOWN, figure
-from gateway.recordings.file_format import CSV, NO_RECORDING, TLOG, format_of
+from gateway.recordings.file_format import CSV, NO_RECORDING
 from gateway.recordings.files import FlightError, Progress, read_blocks
 from gateway.recordings.index import Recording, list_recordings
 from gateway.recordings.moment import civil_time
+from gateway.recordings.recording import RecordedFile, open_recording
 from gateway.recordings.summary import FileInfo, VehicleInfo, read_summary
 from gateway.recordings.table import TableFault, TableHeader, TableReader, encode_block, encode_head
 from gateway.recordings.tlog_index import DAMAGED, DAMAGED_TIME, INCOMPLETE
-from gateway.recordings.tlog_source import open_tlog
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
@@ -99,7 +99,9 @@ def info(
         def options() -> ReadOptions:
             return read_options(read_settings(), columns, progress=advance)
 
-        found = [(each, read_summary(each, advance, options).info) for each in files]
+        found = [
+            (each, read_summary(open_recording(each), advance, options).info) for each in files
+        ]
     for number, (each, info_of_file) in enumerate(found):
         if json:
             print_json(info_of_file)
@@ -146,15 +148,14 @@ def recover(
     console = console_of()
     left_out: list[str] = []
     with progress_of([file]) as advance:
-        is_tlog = format_of(file) == TLOG
-        kept, other = (".tlog", ".csv") if is_tlog else (".csv", ".tlog")
+        recording = open_recording(file)
+        kept, other = (".tlog", ".csv") if recording.is_mavlink else (".csv", ".tlog")
         target = output or file.with_name(f"{file.stem}.recovered{kept}")
         if output is not None and output.suffix == other:
             refuse(f"{output}: {file} is repaired as a {kept}; then `mavgate convert` that")
-        sound = _sound_records if is_tlog else _sound_lines
-        size = write_new(
-            target, sound(file, advance, left_out.append), overwrite=force, inputs=[file]
-        )
+        sound = _sound_records if recording.is_mavlink else _sound_lines
+        pieces = sound(recording, advance, left_out.append)
+        size = write_new(target, pieces, overwrite=force, inputs=[file])
         before = file.stat().st_size
     _print_some(left_out, "more place")
     lost = f"{counted(max(before - size, 0), 'byte')} left out"
@@ -162,10 +163,10 @@ def recover(
     console.print(f"{target}: {size} of {before} bytes; {verdict}")
 
 
-def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[bytes]:
-    found, source = False, open_tlog(file)
+def _sound_records(recording: RecordedFile, advance: Progress, report: Report) -> Iterator[bytes]:
+    found, source = False, recording.mavlink
     for remark in source.remarks:
-        console_of().print(f"{file}: {remark}")
+        console_of().print(f"{source.path}: {remark}")
     for batch in source.batches(advance, strict=True):
         for run in batch.damage:
             report(f"at byte {run.offset}: {counted(run.size, 'byte')} without a record")
@@ -176,13 +177,13 @@ def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[by
         yield batch.encoded()
         found = found or len(batch.starts) > 0
     if not found:
-        raise FlightError(f"{file}: {NO_RECORDING}")
+        raise FlightError(f"{source.path}: {NO_RECORDING}")
 
 
-def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[bytes]:
+def _sound_lines(recording: RecordedFile, advance: Progress, report: Report) -> Iterator[bytes]:
     reader = TableReader()
     begun = False
-    for block in read_blocks(file, reader, advance):
+    for block in read_blocks(recording.path, reader, advance):
         faults = [comment for _, comment in block.comments if isinstance(comment, TableFault)]
         if not begun and (len(block) or len(block.comments) > len(faults)):
             begun = True
@@ -193,7 +194,7 @@ def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[byte
             report(f"line {fault.line}: {counted(fault.size, 'byte')}: {fault.reason}")
         yield encode_block(block)
     if not begun:
-        raise FlightError(f"{file}: contains no row that can be read")
+        raise FlightError(f"{recording.path}: contains no row that can be read")
 
 
 def _print_some(lines: Sequence[str], more: str) -> None:

@@ -12,10 +12,10 @@ from rich.progress import DownloadColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from gateway.cli.support.options import folder_of, recordings_folder
 from gateway.cli.support.terminal import console_of, progress_bar, refuse
-from gateway.recordings.file_format import TABLE, TLOG, format_of
 from gateway.recordings.files import FlightError
 from gateway.recordings.index import NEWEST, RecordingError, find_recording, recording_name
 from gateway.recordings.moment import Moment, parse_moment
+from gateway.recordings.recording import open_recording
 
 if TYPE_CHECKING:
     from gateway.analysis.flight import Flight
@@ -25,11 +25,10 @@ if TYPE_CHECKING:
 
 Wanted = Literal["tlogs", "tables", "all"]
 """Files of a recording to use; if it has none of these, the others are used."""
-OTHER_DESCRIPTION: Final = "Recorded by another program; its samples count as calibrated."
-DESCRIPTIONS: Final = {
-    TABLE: "Recorded by mavgate.",
-    TLOG: "Read from an autopilot's MAVLink log; its samples count as calibrated.",
-}
+OWN: Final = "Recorded by mavgate."
+OF_MAVLINK: Final = "Read from an autopilot's MAVLink log; its samples count as calibrated."
+OF_OTHERS: Final = "Recorded by another program; its samples count as calibrated."
+"""Descriptions of a flight by its recording."""
 
 
 def read_sensors(texts: Sequence[str] | None) -> tuple[tuple[str, int], ...]:
@@ -143,16 +142,15 @@ def load_flight(
     # Imported here: these import all stages, which commands without fusion need not wait for.
     from gateway.analysis.flight import compared_with, flight_of_files
     from gateway.analysis.simulated import simulated_flight
-    from gateway.recordings.reading import is_table, open_rows
 
     if path is None:
         return simulated_flight(settings.simulator, fusion_of(settings))
     parts = files_of([path], folder_of(settings), "tables")
     with progress_of([*parts, reference] if reference else parts) as advance:
         options = replace(options, progress=advance)
-        description = DESCRIPTIONS.get(
-            TABLE if is_table(parts[0]) else format_of(parts[0]), OTHER_DESCRIPTION
-        )
+        recording = open_recording(parts[0])
+        of_others = OF_MAVLINK if recording.is_mavlink else OF_OTHERS
+        description = OWN if recording.is_own else of_others
         try:
             flight, table, _ = flight_of_files(
                 parts, options, name=name_of(path, parts), description=description, checked=True
@@ -162,4 +160,4 @@ def load_flight(
         print_remarks(table.remarks)
         if reference is None:
             return flight
-        return compared_with(flight, open_rows(reference, options).blocks, reference.name)
+        return compared_with(flight, open_recording(reference).rows(options).blocks, reference.name)

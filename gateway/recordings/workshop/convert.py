@@ -13,7 +13,7 @@ from typing import Any, Final
 from weakref import finalize
 
 from gateway.recordings.autopilot_record import AutopilotLog, RecordTranslator
-from gateway.recordings.file_format import NO_RECORDING, TABLE, TLOG, format_of
+from gateway.recordings.file_format import NO_RECORDING, TABLE, import_format
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats import message_csv
 from gateway.recordings.formats.maps import (
@@ -25,24 +25,17 @@ from gateway.recordings.formats.maps import (
     tracks_of_messages,
     tracks_of_table,
 )
-from gateway.recordings.reading import (
-    beside_id,
-    check_vehicle,
-    estimates_of,
-    import_format,
-    is_table,
-    open_record,
-    open_rows,
-)
+from gateway.recordings.reading import check_vehicle
 from gateway.recordings.recorded_clock import Stamper
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, aircraft_of
+from gateway.recordings.recording import RecordedFile, estimates_of
 from gateway.recordings.table import encode_block, encode_head
 from gateway.recordings.tlog import encode_record
 from gateway.recordings.tlog_source import TlogSource, open_tlog
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.recordings.workshop.editing import NOTHING_LEFT, TlogEdits
-from gateway.recordings.workshop.joining import joined_tables, trimmed
+from gateway.recordings.workshop.joining import joined_rows, trimmed
 from gateway.recordings.workshop.merging import batched, intact, joined
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.recorded_frames import Batch, RecordedFrame
@@ -81,33 +74,40 @@ class FlightToWrite:
 
     def __init__(
         self,
-        files: Sequence[Path],
+        recordings: Sequence[RecordedFile],
         options: ReadOptions,
         edits: TlogEdits = NO_EDITS,
         fusing: Fusing = AS_RECORDED,
         *,
         title: str = "flight",
     ) -> None:
-        self.files, self.options, self.title = files, options, title
+        self.recordings = recordings
+        self.options, self.title = options, title
         self._edits, self._fusing = edits, fusing
-        kinds = {format_of(file) for file in files}
-        if len(kinds) > 1:
-            each = ", ".join(f"{file}: {format_of(file)}" for file in files)
+        if any(one.kind != recordings[0].kind for one in recordings):
+            each = ", ".join(f"{one.path}: {one.kind}" for one in recordings)
             raise FlightError(f"the files differ in format; give files of one format ({each})")
-        self.is_mavlink = kinds == {TLOG}
+        self.is_mavlink = recordings[0].is_mavlink
         """Whether the files contain MAVLink; the rows are then derived from it."""
-        self._estimates = estimates_of(files, fuse=fusing.wanted, both=fusing.both)
+        self._estimates = estimates_of(recordings, fuse=fusing.wanted, both=fusing.both)
         self.has_messages = self.is_mavlink or self._estimates != "fused"
         """Whether the files contain messages of vehicles, in MAVLink or an autopilot's log."""
-        self._as_recorded = not fusing.wanted and all(is_table(file) for file in files)
+        self._as_recorded = not fusing.wanted and recordings[0].is_own
         self.fusions: list[RecordedFusion] = []
         """The fusions made to write the file."""
         self._tables: list[RecordedTable] = []
         self.logs: list[AutopilotLog] = []
         """The logs of autopilots among the files, once they are read."""
         self._remarks: list[str] = []
-        if kinds == {TABLE} and options.system_id is not None:
-            self.files = self._files_of(options.system_id)
+        if recordings[0].kind == TABLE and options.system_id is not None:
+            by_vehicle = self._by_vehicle()
+            check_vehicle(self.files, options.system_id, by_vehicle)
+            self.recordings = by_vehicle[options.system_id]
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that are read."""
+        return [recording.path for recording in self.recordings]
 
     @property
     def message_id(self) -> int | None:
@@ -165,7 +165,7 @@ class FlightToWrite:
             with (folder / "made.tlog").open("wb") as file:
                 file.writelines(encode_record(one.time_us, one.frame) for one in self._sent())
             return [open_tlog(folder / "made.tlog")]
-        sources = [open_tlog(file) for file in self.files]
+        sources = [recording.mavlink for recording in self.recordings]
         for source in sources:
             # A part that had just been created when the power failed may be empty.
             if not source.senders.origins and ".tlog" not in source.path.suffixes:
@@ -192,7 +192,7 @@ class FlightToWrite:
     def table(self) -> RecordedTable:
         """Return the rows: as recorded, or fused again from the start and then cut."""
         if self._as_recorded:
-            table = joined_tables([open_rows(file, self.options) for file in self.files])
+            table = joined_rows(self.recordings, self.options)
             self._tables.append(table)
         else:
             table = self.fused().table()
@@ -200,26 +200,21 @@ class FlightToWrite:
 
     def by_aircraft(self) -> "list[FlightToWrite]":
         """Split tables by aircraft."""
-        if len(self.files) == 1:
+        if len(self.recordings) == 1:
             return [self]
-        files, parts = self._files_by_vehicle(), []
-        for vehicle_id in sorted(files):
+        parts = []
+        for _, recordings in sorted(self._by_vehicle().items()):
             part = copy(self)
-            part.files = files[vehicle_id]
+            part.recordings = recordings
             parts.append(part)
         return parts
 
-    def _files_by_vehicle(self) -> dict[int, list[Path]]:
-        files: dict[int, list[Path]] = {}
+    def _by_vehicle(self) -> dict[int, list[RecordedFile]]:
+        found: dict[int, list[RecordedFile]] = {}
         quiet = replace(self.options, progress=None)
-        for file in self.files:
-            files.setdefault(open_rows(file, quiet).header.vehicle_id, []).append(file)
-        return files
-
-    def _files_of(self, vehicle_id: int) -> list[Path]:
-        files = self._files_by_vehicle()
-        check_vehicle(self.files, vehicle_id, files)
-        return files[vehicle_id]
+        for recording in self.recordings:
+            found.setdefault(recording.rows(quiet).header.vehicle_id, []).append(recording)
+        return found
 
     @property
     def remarks(self) -> list[str]:
@@ -250,7 +245,7 @@ class FlightToWrite:
         """Fuse these files again."""
         how = self._fusing
         fusion = RecordedFusion(
-            self.files, self.options,
+            self.recordings, self.options,
             smooth=how.smooth, estimator=how.estimator, latency_s=how.latency_s,
         )  # fmt: skip
         self.fusions.append(fusion)
@@ -263,12 +258,12 @@ class FlightToWrite:
         """
         streams: list[Iterator[RecordedFrame]] = []
         if self._estimates != "fused":
-            for file in self.files:
-                log = open_record(file, self.options)
+            for recording in self.recordings:
+                log = recording.log(self.options)
                 streams.append(RecordTranslator(log).frames())
                 self.logs.append(log)
         if self._estimates == "both":
-            second = beside_id(self.logs[0].vehicle_id)
+            second = self.logs[0].beside_id
             self.options = replace(self.options, system_id=second, progress=None)
         if self._estimates != "own":
             streams += [part.fused().frames() for part in self.by_aircraft()]

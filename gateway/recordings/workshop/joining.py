@@ -1,7 +1,7 @@
 """Join tables of one aircraft on the clock of the first, and cut them to a start and an end."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 import msgspec
@@ -11,7 +11,8 @@ from gateway.recordings.columns import TIMES, BoolArray
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import time_us_of
 from gateway.recordings.recorded_clock import JUMP_US
-from gateway.recordings.recorded_table import RecordedTable
+from gateway.recordings.recorded_table import ReadOptions, RecordedTable
+from gateway.recordings.recording import RecordedFile
 from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader, TableNote
 from gateway.recordings.workshop.selection import NOTHING_WITHIN, Limits
 from gateway.records import FusionState, NodeStatus
@@ -21,6 +22,11 @@ OLDER: Final = "a recording is older than the one before it; give the oldest fir
 OVERLAP: Final = "left out {} that overlap with the previous recording"
 LATE_US: Final = 1_000_000
 """Rows that are older than the previous ones by less than this are late, not of another clock."""
+
+
+def joined_rows(recordings: Iterable[RecordedFile], options: ReadOptions) -> RecordedTable:
+    """Open the rows of recordings of one aircraft, and join them; see `joined_tables`."""
+    return joined_tables([recording.rows(options) for recording in recordings])
 
 
 def joined_tables(tables: list[RecordedTable]) -> RecordedTable:

@@ -15,11 +15,10 @@ from gateway.cli.support.options import read_options
 from gateway.cli.support.recordings import load_flight
 from gateway.config import GatewaySettings
 from gateway.recordings.columns import TableRow
-from gateway.recordings.file_format import TLOG, format_of
 from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
-from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_table import RecordedTable
+from gateway.recordings.recording import open_recording
 from gateway.recordings.table import TableReader
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
 from tests.kit.cli import run
@@ -57,7 +56,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows_of(path: Path) -> tuple[RecordedTable, list[TableRow]]:
-    table = open_rows(path, OPTIONS)
+    table = open_recording(path).rows(OPTIONS)
     return table, list(table.plain_rows)
 
 
@@ -239,7 +238,7 @@ def test_download_of_a_log_in_a_tlog_is_a_tlog(short: Path, tmp_path: Path) -> N
     frame = b"\xfd\x09\0\0\0\x01\x01\0\0\0" + bytes(11)
     for name in ("new.ulg", "flight.bin"):
         data = bytes(8) + frame + bytes(8) + frame[:12] + (short / name).read_bytes()[:500]
-        assert format_of(flown.write(tmp_path / "download.tlog", data)) == TLOG
+        assert open_recording(flown.write(tmp_path / "download.tlog", data)).is_mavlink
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -250,7 +249,7 @@ def test_log_cut_before_its_samples_is_refused(
     data = (short / name).read_bytes()
     stub = flown.write(tmp_path / name, data[: 100 + int(share * 8000)])
     with pytest.raises(FlightError, match=name):
-        list(open_rows(stub, OPTIONS).rows)
+        list(open_recording(stub).rows(OPTIONS).rows)
     assert name in run("info", stub, code=2)
 
 
@@ -330,7 +329,7 @@ def test_log_truncated_while_read_is_still_read_whole(
     short: Path, tmp_path: Path, name: str
 ) -> None:
     log = flown.write(tmp_path / name, (short / name).read_bytes())
-    table = open_rows(log, OPTIONS)
+    table = open_recording(log).rows(OPTIONS)
     rows = table.plain_rows
     first = next(rows)
     os.truncate(log, 0)

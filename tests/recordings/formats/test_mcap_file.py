@@ -15,6 +15,7 @@ from mcap.summary import Summary
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import rotate
+from gateway.recordings.recording import open_recording
 from gateway.recordings.workshop.convert import WRITERS, FlightToWrite, Fusing
 from tests.kit.cli import invoke
 from tests.kit.recordings import records_sent, write_tlog
@@ -50,7 +51,11 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     log = flown.write(folder / "flight.ulg", flown.make_ulog())
     out = folder / "flight.mcap"
     out.write_bytes(
-        b"".join(WRITERS[".mcap"](FlightToWrite([log], OPTIONS, fusing=Fusing(wanted=True))))
+        b"".join(
+            WRITERS[".mcap"](
+                FlightToWrite([open_recording(log)], OPTIONS, fusing=Fusing(wanted=True))
+            )
+        )
     )
     return out
 
@@ -194,9 +199,9 @@ def test_layout_names_topics_of_the_file(flight: Path) -> None:
 def test_times_later_than_the_format_holds_are_written_as_the_latest(tmp_path: Path) -> None:
     log = flown.write(tmp_path / "flight.ulg", flown.make_ulog())
     table = tmp_path / "flight.csv"
-    table.write_bytes(b"".join(WRITERS[".csv"](FlightToWrite([log], OPTIONS))))
+    table.write_bytes(b"".join(WRITERS[".csv"](FlightToWrite([open_recording(log)], OPTIONS))))
     zero = r'"unix_us_at_zero":(null|-?[0-9]+)'
     table.write_text(re.sub(zero, f'"unix_us_at_zero":{2 * 10**16}', table.read_text()))
     out = tmp_path / "flight.mcap"
-    out.write_bytes(b"".join(WRITERS[".mcap"](FlightToWrite([table], OPTIONS))))
+    out.write_bytes(b"".join(WRITERS[".mcap"](FlightToWrite([open_recording(table)], OPTIONS))))
     assert {ns for _, _, ns, _ in messages_of(out)} == {(2**64 - 1) // 1000 * 1000}

@@ -10,6 +10,7 @@ import pytest
 from gateway.recordings import files
 from gateway.recordings.columns import COLUMNS
 from gateway.recordings.formats import parquet as parquet_file
+from gateway.recordings.recording import open_recording
 from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
 from gateway.recordings.workshop.editing import TlogEdits
 from gateway.recordings.workshop.selection import FrameChoice
@@ -84,7 +85,7 @@ def test_parquet_is_written_piece_by_piece(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(files, "CHUNK", 5000)
     path = write_tlog(tmp_path / "a.tlog", make_records(3000))
     edits = TlogEdits(choice=FrameChoice(messages=frozenset({0})))
-    flight = FlightToWrite([path], OPTIONS, edits)
+    flight = FlightToWrite([open_recording(path)], OPTIONS, edits)
     sizes = [len(piece) for piece in WRITERS[".parquet"](flight)]
     assert len(sizes) > 10
     assert max(sizes[:-1]) < 10_000

@@ -24,8 +24,8 @@ from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats import parquet
 from gateway.recordings.formats.maps import tracks_of_messages, tracks_of_table
-from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_table import aircraft_of
+from gateway.recordings.recording import open_recording
 from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
@@ -82,7 +82,7 @@ def content(name: str) -> bytes:
 
 
 def written(path: Path, ending: str) -> bytes:
-    return b"".join(WRITERS[ending](FlightToWrite([path], OPTIONS)))
+    return b"".join(WRITERS[ending](FlightToWrite([open_recording(path)], OPTIONS)))
 
 
 def convert(name: str, data: bytes, ending: str) -> bytes:
@@ -95,17 +95,17 @@ def convert(name: str, data: bytes, ending: str) -> bytes:
 
 @cache
 def frames_of(path: Path) -> list[RecordedFrame]:
-    return list(FlightToWrite([path], OPTIONS).frames())
+    return list(FlightToWrite([open_recording(path)], OPTIONS).frames())
 
 
 @cache
 def table_of(path: Path) -> list[TableRow]:
-    return list(FlightToWrite([path], OPTIONS).table().plain_rows)
+    return list(FlightToWrite([open_recording(path)], OPTIONS).table().plain_rows)
 
 
 def points_of(path: Path) -> int:
     """Count the points of the tracks that a map has to show."""
-    flight = FlightToWrite([path], OPTIONS)
+    flight = FlightToWrite([open_recording(path)], OPTIONS)
     if flight.has_messages:
         tracks = tracks_of_messages(flight.vehicle_messages())
     else:
@@ -159,7 +159,7 @@ def checks(*endings: str) -> Callable[[Callable[[Path, bytes, Path], None]], Any
 
 @checks(".csv", ".parquet")
 def same_rows(source: Path, data: bytes, out: Path) -> None:
-    rows = open_rows(out, OPTIONS).plain_rows
+    rows = open_recording(out).rows(OPTIONS).plain_rows
     assert [*map(row_to_line, rows)] == [*map(row_to_line, table_of(source))]
     # A table is read as it was written, and written as it was read.
     assert written(out, out.suffix) == data
@@ -231,7 +231,7 @@ def test_damaged_source_is_read_in_part_or_refused(
     path = tmp_path / name
     path.write_bytes(bytes(data[: int(rng.integers(3000, len(data)))]))
     try:
-        found = open_rows(path, OPTIONS)
+        found = open_recording(path).rows(OPTIONS)
         rows = list(found.plain_rows)
     except (FlightError, OSError):
         return
