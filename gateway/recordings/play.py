@@ -26,10 +26,9 @@ from typing import Final, Protocol
 import numpy as np
 
 from gateway.answers.log_answers import answers_of, key_of, telemetry_of
-from gateway.recordings.recorded_clock import DAY_US
+from gateway.recordings.recorded_clock import DAY_US, is_step
 from gateway.recordings.tlog import SEEK_BYTES, STRIDE, TlogScanner
 from gateway.recordings.tlog_index import TlogIndex
-from gateway.units import US_PER_S
 from gateway.wire.frame_editing import edit_frame, renumbered
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
@@ -404,9 +403,9 @@ class Player:
         time_us = track.peek_us() or 0
         gap_us = time_us - self.position_us
         longest_us = DAY_US if self.max_gap_us is None else self.max_gap_us
-        went_back = gap_us < -US_PER_S
-        if gap_us <= longest_us and not went_back:
+        if not is_step(gap_us, ahead_us=longest_us):
             return
+        went_back = gap_us < 0
         kept_us = 0 if went_back or self.max_gap_us is None else self.max_gap_us
         due_last_us = self._anchor[0] + math.ceil((self.position_us - self._anchor[1]) / self.speed)
         self._anchor = (max(due_last_us, now_us) if went_back else due_last_us, time_us - kept_us)

@@ -1,20 +1,25 @@
 """The clocks of recorded MAVLink: which times are damaged, steps of a clock, dates, timestamps.
 
-| clock        | rule                                                                           |
-| ------------ | ------------------------------------------------------------------------------ |
-| `is_damaged` | a time that is not between those of its neighbours, by more than `ORDER_US`    |
-|`RestartClock`| the time of another program's log, whose clock may restart: it continues       |
-| `TimesSpan`  | duration and gaps of any recording, without jumps of its clock                 |
-| `Timeline`   | the time of a tlog whose clock was set while it was written: steps are removed |
-| `FrameClock` | the time of a capture without time stamps, from the times in its messages      |
-| `CivilClock` | civil time of the running gateway: GPS if available, else the machine's clock  |
-| `sound_times`| times of one topic that are near the median of those around them               |
-|`logged_times`| times of a log's topics, within those of the topics with several values        |
-| `LogClock`   | the time of an autopilot's log, whose clock may jump or restart                |
-| `Stamper`    | the increasing timestamps of a file that is written                            |
+| clock          | rule                                                                         |
+| -------------- | ---------------------------------------------------------------------------- |
+| `is_damaged`   | a time that is not between those of its neighbours, by `ORDER_US`            |
+| `is_step`      | consecutive times between which a clock was set; playback uses it, too       |
+| `RestartClock` | the time of another program's log, whose clock may restart: it continues     |
+| `DayClock`     | the same of times of day without a date: they continue after midnight        |
+| `TimesSpan`    | duration and gaps of any recording, without jumps of its clock               |
+| `Timeline`     | the time of a tlog without the steps of a clock that was set                 |
+| `FrameClock`   | the time of a capture without time stamps, from the times in its messages    |
+| `CivilClock`   | civil time of the running gateway: that of GPS, or else the machine's        |
+| `sound_times`  | times of one topic that are near the median of those around them             |
+| `logged_times` | times of a log's topics, within those of the topics with several values      |
+| `LogClock`     | the time of an autopilot's log, whose clock may jump or restart              |
+| `SampleClock`  | the time of a vehicle's samples in MAVLink, by its own clock                 |
+| `civil_shift_us` | the difference of two recordings' clocks that are joined                     |
+| `Stamper`      | the increasing timestamps of a file that is written                          |
 
-A step of more than `DAY_US`, or back by more than `BACK_US`, is a change of a clock. Times from
-`FIRST_CIVIL_US` to `LAST_CIVIL_US` are civil; earlier ones count from the start of a clock.
+A step of more than `DAY_US`, or back by more than `LATE_US`, is a change of a clock; in MAVLink, of
+which two links reorder the frames, one back by more than `BACK_US`. Times from `FIRST_CIVIL_US` to
+`LAST_CIVIL_US` are civil; earlier ones count from the start of a clock.
 
 Ground stations consider a tlog corrupt if its times are in the future or do not increase. So the
 offset from the gateway clock to civil time is constant while a file is open, and a clock jump
@@ -22,6 +27,7 @@ requires a new file.
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Generic, TypeVar
@@ -39,8 +45,12 @@ from gateway.wire.timesync import GpsTime
 Times = TypeVar("Times", int, NDArray[np.int64])
 Item = TypeVar("Item")
 
-DAY_US: Final = 86_400 * US_PER_S
+DAY_S, HOUR_S = 86_400, 3600
+DAY_US: Final = DAY_S * US_PER_S
 """Records further apart are of different days: the time between them is not counted."""
+LATE_US: Final = US_PER_S
+"""Maximum backward step of records that arrive late. It is also the maximum distance of the
+messages of one loop of an autopilot, which are not quite in order."""
 ORDER_US: Final = 2 * US_PER_S
 """A time before that of the previous record, or after that of the next, by more is damaged."""
 
@@ -57,11 +67,9 @@ LINE_BPS: Final = 57_600
 LAST_CIVIL_US: Final = 4_102_444_800 * US_PER_S
 """The year 2100; later times are not civil time."""
 AROUND: Final = 5
-"""Number of a topic's times around a time whose median it is compared with."""
-FAR_US: Final = US_PER_S
-"""Maximum difference from that median, and of the messages of one loop of an autopilot, which are
-not quite in order; at the ends of a topic it is `BACK_US`, as a gap makes it large there."""
-AHEAD_US: Final = 3_600 * US_PER_S
+"""Number of a topic's times around a time whose median it is compared with. The maximum difference
+is `LATE_US`; at the ends of a topic it is `BACK_US`, as a gap makes it large there."""
+AHEAD_US: Final = HOUR_S * US_PER_S
 """Maximum step of an autopilot's clock; a message further ahead has a damaged time as well."""
 AGREEING: Final = 50
 """Consecutive messages with consistent deviating times that prove a jump of the clock."""
@@ -91,6 +99,22 @@ def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDAr
     return is_in_order & is_outside
 
 
+def is_step(step_us: Times, back_us: int = LATE_US, ahead_us: int = DAY_US) -> Any:
+    """Return whether the difference of consecutive times is a step of their clock."""
+    return (step_us < -back_us) | (step_us > ahead_us)
+
+
+def civil_shift_us(zero_us: int | None, first_zero_us: int | None) -> int | None:
+    """Return the difference of two clocks by their civil times at zero; None if one is unknown.
+
+    A difference of at most `JUMP_US` is an error of the civil times.
+    """
+    if zero_us is None or first_zero_us is None:
+        return None
+    shift_us = zero_us - first_zero_us
+    return 0 if abs(shift_us) <= JUMP_US else shift_us
+
+
 def is_civil(time_us: int | IntArray) -> bool | NDArray[np.bool_]:
     """Return whether a time is civil; others count from the start of a clock."""
     return (time_us > FIRST_CIVIL_US) & (time_us < LAST_CIVIL_US)
@@ -106,7 +130,7 @@ def sound_times(times_us: NDArray[Any]) -> tuple[NDArray[np.bool_], IntArray]:
     if len(time_us) >= AROUND:
         around = np.median(sliding_window_view(time_us, AROUND), axis=1)
         early_us = np.pad(around, AROUND // 2, mode="edge") - time_us
-        far_us = np.full((2, len(time_us)), FAR_US)
+        far_us = np.full((2, len(time_us)), LATE_US)
         far_us[0, : AROUND // 2] = far_us[1, -(AROUND // 2) :] = BACK_US
         sound &= (early_us < far_us[0]) & (-early_us < far_us[1])
     return sound, np.flatnonzero(sound)[np.argsort(time_us[sound], kind="stable")]
@@ -178,7 +202,7 @@ class TimesSpan:
         for i in np.flatnonzero(steps_us > GAP_US)[: MAX_GAPS - len(self.gaps)].tolist():
             step_us = int(steps_us[i])
             self.gaps.append(Gap(int(times_us[i]) - step_us, step_us / US_PER_S))
-        for part, times in enumerate(np.split(times_us, np.flatnonzero(abs(steps_us) > DAY_US))):
+        for part, times in enumerate(np.split(times_us, np.flatnonzero(is_step(steps_us, DAY_US)))):
             if part or self.first_us is None:
                 self._before_us = self.length_us
                 self._begin_us = self._newest_us = int(times[0])
@@ -204,6 +228,21 @@ class RestartClock:
         self.restarts += int(np.count_nonzero(back_us))
         self._last_us, self._shift_us = times_us[-1], shifts_us[-1]
         return shifts_us
+
+
+class DayClock:
+    """Continue times of day after midnight."""
+
+    def __init__(self) -> None:
+        self.day_s = 0
+        """Time from the first midnight to the newest one."""
+        self._newest_s = 0.0
+
+    def update(self, of_day_s: float) -> None:
+        """Process the next time of day."""
+        is_early, was_late = of_day_s < HOUR_S, self._newest_s >= DAY_S - HOUR_S
+        self.day_s += DAY_S * (is_early and was_late)
+        self._newest_s = of_day_s
 
 
 class Timeline:
@@ -232,7 +271,7 @@ class Timeline:
             self._begin(batch, 0, 0)
             self._last_us = self._first_us
         steps_us = np.diff(times_us, prepend=self._last_us)
-        for record in np.flatnonzero((steps_us > DAY_US) | (steps_us < -BACK_US)).tolist():
+        for record in np.flatnonzero(is_step(steps_us, BACK_US)).tolist():
             if len(self.jumps) == MAX_JUMPS:
                 break
             step_us, shift_us = int(steps_us[record]), self._shifts_us[-1]
@@ -282,10 +321,10 @@ class LogClock(Generic[Item]):
             return [(self._newest_us, item)]
         if self.zero_us is None:
             self.zero_us = own_us
-        if -FAR_US <= own_us - self.zero_us - self._newest_us <= AHEAD_US:
+        if not is_step(own_us - self.zero_us - self._newest_us, ahead_us=AHEAD_US):
             self._drop_held()
             return [self._timed(own_us, item)]
-        if self._held and abs(own_us - self._held[-1][0]) > FAR_US:
+        if self._held and abs(own_us - self._held[-1][0]) > LATE_US:
             self._drop_held()
         self._held.append((own_us, item))
         return self._follow() if len(self._held) == AGREEING else []
@@ -314,6 +353,44 @@ class LogClock(Generic[Item]):
         # After a restart, times continue from the last one.
         self.zero_us = (self.zero_us or 0) + min(step_us, 0)
         return [self._timed(*one) for one in held]
+
+
+class SampleClock:
+    """Times of the samples, fixes and states of a vehicle, counted from its first message.
+
+    The IMU keeps its own time whatever times the other messages contain: those may be from another
+    clock, for example a GPS receiver's. Time never decreases within a kind of message.
+    """
+
+    def __init__(self) -> None:
+        self.unix_us_at_zero: int | None = None
+        """Civil time at zero, from the recorded times."""
+        self._zero_us = 0
+        """The vehicle's own time at zero."""
+        self._newest_us: defaultdict[int | None, int] = defaultdict(int)
+        """Newest time by the kind of message; None is the IMU."""
+        self._sampled_us = 0
+        """Recorded time of the newest IMU sample; before the first one, of the first message."""
+
+    def time_us(self, kind: int | None, own_us: int, recorded_us: int) -> int:
+        """Return the time of a message; an `own_us` of 0 means none."""
+        newest_us = self._newest_us
+        if self.unix_us_at_zero is None:
+            self.unix_us_at_zero = self._sampled_us = recorded_us
+            self._zero_us = own_us or recorded_us
+        elapsed_us = (own_us or recorded_us) - self._zero_us
+        if is_step(elapsed_us - newest_us[None], 0, US_PER_S):
+            # Another clock than the IMU's, or a restart: use the recorded time, but only the time
+            # since the newest sample, since the two clocks drift.
+            elapsed_us = (
+                recorded_us - self.unix_us_at_zero
+                if kind is None
+                else newest_us[None] + max(recorded_us - self._sampled_us, 0)
+            )
+        newest_us[kind] = max(newest_us[kind], elapsed_us)
+        if kind is None:
+            self._sampled_us = recorded_us
+        return newest_us[kind]
 
 
 class CivilClock:
@@ -402,7 +479,7 @@ class FrameClock:
             self.civil_us_at_zero = own_us - self._now_us
         self.is_timed = True
         base_us, newest_us = self._bases_us.get(key, (self._now_us - own_us, own_us))
-        if not -US_PER_S <= own_us - newest_us <= DAY_US:
+        if is_step(own_us - newest_us):
             base_us = self._now_us - own_us
         self._now_us = max(self._now_us, base_us + own_us)
         self._bases_us[key] = (base_us, own_us)

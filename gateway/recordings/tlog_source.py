@@ -16,7 +16,7 @@ from typing import Final
 
 from gateway.recordings.file_format import first_bytes
 from gateway.recordings.files import Progress, read_chunks
-from gateway.recordings.recorded_clock import LINE_BPS, FrameClock, Timeline
+from gateway.recordings.recorded_clock import DAY_S, LINE_BPS, FrameClock, Timeline
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.units import US_PER_S, counted
 from gateway.vehicle_state.senders import Senders
@@ -26,7 +26,6 @@ from gateway.wire.recorded_frames import Batch
 
 PIECE: Final = 1 << 12
 SHOWN_JUMPS: Final = 3
-_DAY_S: Final = 86_400
 
 
 class Layout(IntEnum):
@@ -162,7 +161,7 @@ def _stamped(data: Iterator[bytes]) -> Iterator[bytes]:
 def _jumps_in_words(timeline: Timeline) -> Iterator[str]:
     for jump in timeline.jumps[:SHOWN_JUMPS]:
         step_s = jump.step_us / US_PER_S
-        days = abs(step_s) / _DAY_S
+        days = abs(step_s) / DAY_S
         size = f"{days:.1f} days" if days >= 1 else f"{abs(step_s):.0f} s"
         direction = "forward" if step_s > 0 else "back"
         yield (

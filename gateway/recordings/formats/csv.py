@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from gateway.geometry.atmosphere import pressure_at_height
 from gateway.recordings.columns import BARO, COLUMNS, GPS, MAG, NAV, RAW, SI, FloatArray, normalise
-from gateway.recordings.recorded_clock import BACK_US, is_damaged
+from gateway.recordings.recorded_clock import BACK_US, HOUR_S, DayClock, is_damaged
 from gateway.recordings.table import BLOCK_ROWS, NO_ROWS, TableBlock
 from gateway.records import NAN, GpsFixType, ImuFlags
 from gateway.settings import Settings, setting
@@ -39,7 +39,7 @@ EMPTY: Final = frozenset({"-", "--", "?", "null", "nil", "none", "n/a", "#n/a", 
 """Cells without a value, lower case, in addition to empty ones and NaN."""
 CLOCK: Final = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:[.,]\d*)?)")
 """Pattern of a time of day."""
-DAY_S, HOUR_S, MINUTE_S = 86_400, 3600, 60
+MINUTE_S: Final = 60
 EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 MAX_CELL: Final = 40
 """Characters of an unreadable cell that are quoted in a message."""
@@ -108,8 +108,7 @@ class CsvReader:
         self.first_fault = ""
         """The first of these faults: line, column and text."""
         self._has_decimal_comma = False
-        self._day_s, self._clock_s = 0, 0.0
-        """For times without dates: days since the first line and newest time of day, both in s."""
+        self._clock = DayClock()
 
     def blocks(self, lines: Iterable[str]) -> Iterator[TableBlock]:
         """Read a whole file; raises ValueError if it lacks needed columns."""
@@ -208,11 +207,10 @@ class CsvReader:
         """Read a time of day, or a date and time in ISO 8601; UTC if it has no zone."""
         if clock := CLOCK.fullmatch(text):
             hours, minutes, seconds = (float(part.replace(",", ".")) for part in clock.groups())
-            clock_s = hours * HOUR_S + minutes * MINUTE_S + seconds
+            of_day_s = hours * HOUR_S + minutes * MINUTE_S + seconds
             if ours == "time_us":
-                self._day_s += DAY_S * (clock_s < HOUR_S and self._clock_s >= DAY_S - HOUR_S)
-                self._clock_s = clock_s
-            return (self._day_s + clock_s) * US_PER_S
+                self._clock.update(of_day_s)
+            return (self._clock.day_s + of_day_s) * US_PER_S
         try:
             date = datetime.fromisoformat(text.replace("/", "-").replace(",", "."))
         except ValueError:

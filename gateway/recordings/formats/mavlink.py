@@ -3,8 +3,7 @@
 The IMU samples come from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends it (in the
 units of SCALED_IMU) and SCALED_IMU; once one was received, inferior ones are left out. The axes are
 body FRD by definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), minus the first one
-received; it never decreases within a kind of message. The IMU keeps its own time whatever times the
-other messages contain: those may be from another clock, for example a GPS receiver's.
+received; see `SampleClock`.
 
 GPS_RAW_INT has no down velocity: that of GLOBAL_POSITION_INT is used, or it is unknown. It is not
 derived from heights, because a receiver's height jumps by any amount when it gains or loses its
@@ -12,7 +11,6 @@ fix. Of the autopilot's own estimates (ATTITUDE, with the position known at that
 before each sample is kept.
 """
 
-from collections import defaultdict
 from typing import Final
 
 import numpy as np
@@ -22,7 +20,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.geometry.quaternion import from_euler_array
 from gateway.recordings.columns import BARO, COLUMNS, GPS, LARGEST_WHOLE, NAV, SI, FloatArray
 from gateway.recordings.formats.csv import level_velocity
-from gateway.recordings.recorded_clock import FIRST_CIVIL_US
+from gateway.recordings.recorded_clock import FIRST_CIVIL_US, SampleClock
 from gateway.records import NAN, GpsFixType, ImuFlags, NavFlags
 from gateway.units import (
     DEG_PER_DEGE7,
@@ -193,15 +191,8 @@ class AutopilotReader:
     def __init__(self, system_id: int | None = None, senders: Senders | None = None) -> None:
         self.system_id = system_id
         self._senders = senders or Senders()
-        self.unix_us_at_zero: int | None = None
-        """Civil time of the rows' time zero, from the recorded times."""
         self._rank = 0
-        self._zero_us = 0
-        """The vehicle's own time at the rows' time zero."""
-        self._newest_us: defaultdict[int, int] = defaultdict(int)
-        """Newest time on the rows' clock of each of `_OWN_CLOCKS`, and of the IMU under `_IMU`."""
-        self._sampled_us = 0
-        """Recorded time of the newest IMU sample; before the first one, of the first message."""
+        self._clock = SampleClock()
         self._positions = np.empty(0, _POSITION_LAYOUT)
         self._positions_us = np.empty(0, np.int64)
         """The newest GLOBAL_POSITION_INT, if any, and its recorded time."""
@@ -209,6 +200,11 @@ class AutopilotReader:
         """The newest estimate of the autopilot; NaN once it is stored with a sample."""
         self._open = np.empty((0, len(COLUMNS)))
         """The row that is still without its sample, if any."""
+
+    @property
+    def unix_us_at_zero(self) -> int | None:
+        """Civil time of the rows' time zero, from the recorded times."""
+        return self._clock.unix_us_at_zero
 
     def feed(self, batch: Batch) -> FloatArray:
         """Process the next records of the recording; their checksums must have been verified."""
@@ -260,31 +256,10 @@ class AutopilotReader:
             own_us[message_ids == message_id] = own
         time_us = np.zeros(len(message_ids), np.int64)
         columns = (message_ids.tolist(), own_us.tolist(), recorded_us.tolist())
-        for k, message in enumerate(zip(*columns, strict=True)):
-            if message[0] != POSITION:
-                time_us[k] = self._time(*message)
+        for k, (kind, *times_us) in enumerate(zip(*columns, strict=True)):
+            if kind != POSITION:
+                time_us[k] = self._clock.time_us(kind if kind in _OWN_CLOCKS else None, *times_us)
         return time_us
-
-    def _time(self, message_id: int, own_us: int, recorded_us: int) -> int:
-        """Convert the time of a message to the rows' clock; an `own_us` of 0 means none."""
-        newest_us = self._newest_us
-        if self.unix_us_at_zero is None:
-            self.unix_us_at_zero = self._sampled_us = recorded_us
-            self._zero_us = own_us or recorded_us
-        stream = message_id if message_id in _OWN_CLOCKS else _IMU
-        elapsed_us = (own_us or recorded_us) - self._zero_us
-        if not 0 <= elapsed_us - newest_us[_IMU] <= US_PER_S:
-            # Another clock than the IMU's, or a restart: use the recorded time, but only the time
-            # since the newest sample, since the two clocks drift.
-            elapsed_us = (
-                recorded_us - self.unix_us_at_zero
-                if stream == _IMU
-                else newest_us[_IMU] + max(recorded_us - self._sampled_us, 0)
-            )
-        newest_us[stream] = max(newest_us[stream], elapsed_us)
-        if stream == _IMU:
-            self._sampled_us = recorded_us
-        return newest_us[stream]
 
     def _positions_at(
         self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]

@@ -10,7 +10,7 @@ import numpy as np
 from gateway.recordings.columns import TIMES, BoolArray
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import time_us_of
-from gateway.recordings.recorded_clock import JUMP_US
+from gateway.recordings.recorded_clock import LATE_US, civil_shift_us
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable
 from gateway.recordings.recording import RecordedFile
 from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader, TableNote
@@ -20,8 +20,6 @@ from gateway.units import counted
 
 OLDER: Final = "a recording is older than the one before it; give the oldest first"
 OVERLAP: Final = "left out {} that overlap with the previous recording"
-LATE_US: Final = 1_000_000
-"""Rows that are older than the previous ones by less than this are late, not of another clock."""
 
 
 def joined_rows(recordings: Iterable[RecordedFile], options: ReadOptions) -> RecordedTable:
@@ -85,13 +83,9 @@ def _is_behind(begin_us: float, shift_us: int | None, begun_us: float, newest_us
 
 def _shift_us(header: TableHeader, first: TableHeader) -> int | None:
     """Return the difference of two clocks by civil time; None if it is unknown."""
-    zero_us, first_zero_us = header.unix_us_at_zero, first.unix_us_at_zero
     if header.session != "" and header.session == first.session:
         return 0  # parts of a recording, whose time GPS may have corrected in between
-    if zero_us is None or first_zero_us is None:
-        return None
-    shift_us = zero_us - first_zero_us
-    return 0 if abs(shift_us) <= JUMP_US else shift_us
+    return civil_shift_us(header.unix_us_at_zero, first.unix_us_at_zero)
 
 
 def _without(block: TableBlock, count: int) -> TableBlock:
