@@ -10,6 +10,7 @@ from gateway.recordings.tlog_scan import (
     KNOWN_IDS,
     LARGEST_RECORD,
     SMALLEST_RECORD,
+    TIME,
     ExtraArray,
     IntArray,
     lacks_end,
@@ -69,7 +70,7 @@ class TlogScanner:
         self._rest = data[end:]
         self._offset += end
         found = columns[:, :count]
-        mended = self._mend(found[2], data[end : end + TIME_SIZE]) if count else 0
+        mended = self._mend(found[TIME], data[end : end + TIME_SIZE]) if count else 0
         begins, ends = runs[:, :damaged].tolist()
         damage = [Damage(offset + b, e - b) for b, e in zip(begins, ends, strict=True)]
         unfinished = 0

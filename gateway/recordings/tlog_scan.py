@@ -34,8 +34,11 @@ HEADER_SIZE: Final = 9
 SMALLEST_RECORD: Final = 16
 LARGEST_RECORD: Final = 8 + 12 + 255 + 13
 
+START, SIZE, TIME, ORIGIN, MESSAGE = range(5)
+"""Rows of `records`: start and size of the frame, time in µs, system << 8 | component, message."""
 COLUMNS: Final = 5
-"""Rows of `records`: start, frame size, time in µs, origin (system << 8 | component), message."""
+BEGIN, END = range(2)
+"""Rows of `damage`."""
 
 KNOWN_IDS: Final = 1 << 16
 _YES: Final = 1
@@ -192,7 +195,7 @@ def _walk(
             at += 1
             continue
         if bad_from >= 0:
-            damage[0, damaged], damage[1, damaged] = bad_from, at
+            damage[BEGIN, damaged], damage[END, damaged] = bad_from, at
             damaged += 1
             bad_from = -1
         frame = at + TIME_SIZE
@@ -200,13 +203,13 @@ def _walk(
         for i in range(at, frame):
             time_us = time_us << 8 | int(data[i])
         origin = frame + (3 if data[frame] == 0xFE else 5)
-        records[0, count], records[1, count], records[2, count] = at, size, time_us
-        records[3, count] = int(data[origin]) << 8 | int(data[origin + 1])
-        records[4, count] = _message_id(data, frame)
+        records[START, count], records[SIZE, count], records[TIME, count] = at, size, time_us
+        records[ORIGIN, count] = int(data[origin]) << 8 | int(data[origin + 1])
+        records[MESSAGE, count] = _message_id(data, frame)
         count += 1
         in_step = True
         at = frame + size
     if bad_from >= 0:
-        damage[0, damaged], damage[1, damaged] = bad_from, at
+        damage[BEGIN, damaged], damage[END, damaged] = bad_from, at
         damaged += 1
     return (at, count, damaged, in_step)
