@@ -16,7 +16,7 @@ FOUNDATION = {"records", "units", "gps_time", "settings", "token_bucket", "compi
 STAGES = {"wire", "sensing", "estimation", "vehicle", "simulator"}
 JOINED = {"aircraft", "pipeline"}
 BELOW = FOUNDATION | STAGES | JOINED | {"vehicle_state"}
-COLUMN_CODEC = {"recordings.columns", "recordings.formats"}
+COLUMN_CODEC = {"recordings.columns", "recordings.rows", "recordings.formats"}
 EDGES = {"hub", "live", "clock", "printable"}
 
 MAY_IMPORT: dict[str, set[str]] = {
@@ -92,7 +92,7 @@ PURE_FOLDERS = {"panel/state"}
 PURE_FILES = {"batch/facts.py"} | {
     f"recordings/{name}.py"
     for name in (
-        *("columns", "table", "tlog", "tlog_scan", "moment"),
+        *("columns", "rows", "table_lines", "table", "tlog", "tlog_scan", "moment"),
         *("play", "formats/csv", "formats/maps", "formats/mavlink"),
     )
 }

@@ -21,11 +21,11 @@ from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.hub.transports.registry import CLIENTS
 from gateway.panel.added_views import ADDED_VIEWS, add_view
-from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.file_format import OTHER_FORMATS
 from gateway.recordings.reading import READERS
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.recording import open_recording
+from gateway.recordings.rows import TableRow, row_to_line
 from gateway.recordings.table import encode_head
 from gateway.recordings.workshop.convert import WRITERS, FlightToWrite, Fusing
 from gateway.records import ImuRaw, Incoming, NavState

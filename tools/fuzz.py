@@ -38,7 +38,7 @@ from gateway.live.control_socket import ControlServer, Verbs
 from gateway.live.control_verbs import mark_verbs
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.autopilot_record import RecordTranslator
-from gateway.recordings.columns import COLUMNS, TableRow
+from gateway.recordings.columns import COLUMNS
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats.maps import (
     DRAWN_IDS,
@@ -51,6 +51,7 @@ from gateway.recordings.formats.ulog_record import table as ulog_table
 from gateway.recordings.moment import parse_moment
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.recording import open_recording
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.recordings.vehicle_reader import VehicleReader

@@ -31,7 +31,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.clock import GatewayClock, unix_time_us
 from gateway.live.recorder import Recorder
 from gateway.live.session import RecordingSettings
-from gateway.recordings.columns import TableRow
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import TableFault, TableHeader, TableReader
 from gateway.recordings.tlog import TlogScanner
 from gateway.records import FusedSample

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 
 from gateway.analysis.flight import Flight, FlightTrack, Reference, flight_of_blocks
-from gateway.recordings.columns import RowBuilder
 from gateway.recordings.fuse import FusionSettings, with_reference
+from gateway.recordings.rows import RowBuilder
 from gateway.recordings.table import block_of
 from gateway.records import BaroRaw, GpsFix, ImuRaw
 from gateway.sensing.calibration import NodeCalibration

@@ -6,8 +6,8 @@ from typing import Final
 import msgspec
 
 from gateway.hub.forwarding import Forwarding
-from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
 from gateway.recordings.recorded_clock import STEP_US, Stamper
+from gateway.recordings.rows import RowBuilder, TableRow, row_to_line
 from gateway.recordings.table import TableHeader, TableNote, encode_head, encode_line
 from gateway.recordings.tlog import encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus

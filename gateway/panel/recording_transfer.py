@@ -24,10 +24,10 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 
 from gateway.panel.access import RECORDINGS, ROLE
 from gateway.panel.admission import Role
-from gateway.recordings.columns import TableRow
 from gateway.recordings.file_format import TABLE, TLOG
 from gateway.recordings.index import RecordingError, check_free, find_recording
 from gateway.recordings.recording import open_recording
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import TableReader
 from gateway.recordings.tlog import TlogScanner
 from gateway.recordings.workshop.convert import Pieces

@@ -15,14 +15,12 @@ from gateway.recordings.columns import (
     SI_CODEC,
     WHOLE_COLUMNS,
     Codec,
-    Imported,
-    RowBuilder,
-    TableRow,
 )
 from gateway.recordings.files import FlightError
 from gateway.recordings.message_table import MessageRow, bind_columns
 from gateway.recordings.recorded_clock import FIRST_CIVIL_US
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, table_of_rows
+from gateway.recordings.rows import Imported, RowBuilder, TableRow
 from gateway.records import NAN, UNKNOWN_VEC3, GpsFixType, ImuFlags, NavFlags, NodeId, Vec3
 from gateway.units import US_PER_S
 

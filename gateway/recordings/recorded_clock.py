@@ -13,7 +13,7 @@
 | `sound_times`  | times of one topic that are near the median of those around them             |
 | `logged_times` | times of a log's topics, within those of the topics with several values      |
 | `LogClock`     | the time of an autopilot's log, whose clock may jump or restart              |
-| `SampleClock`  | the time of a vehicle's samples in MAVLink, by its own clock                 |
+| `VehicleClock` | the time of a vehicle's samples in MAVLink, by its own clock                 |
 | `civil_shift_us` | the difference of two recordings' clocks that are joined                     |
 | `Stamper`      | the increasing timestamps of a file that is written                          |
 
@@ -355,7 +355,7 @@ class LogClock(Generic[Item]):
         return [self._timed(*one) for one in held]
 
 
-class SampleClock:
+class VehicleClock:
     """Times of the samples, fixes and states of a vehicle, counted from its first message.
 
     The IMU keeps its own time whatever times the other messages contain: those may be from another

@@ -28,7 +28,6 @@ from gateway.recordings.columns import (
     WHOLE_COLUMNS,
     FloatArray,
     has_group,
-    write_lines,
 )
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import (
@@ -64,6 +63,7 @@ from gateway.recordings.table import (
     TableNote,
     encode_line,
 )
+from gateway.recordings.table_lines import write_lines
 from gateway.recordings.tlog import UNRECORDED
 from gateway.recordings.workshop.joining import joined_rows
 from gateway.records import RECORDED_ONLY, FusionState, NodeStatus

@@ -11,9 +11,9 @@ import msgspec
 from gateway import __version__
 from gateway.aircraft import AircraftSettings
 from gateway.pipeline import PipelineSettings
-from gateway.recordings.columns import TableRow
 from gateway.recordings.files import MAX_UNPACKED, FlightError, Progress
 from gateway.recordings.formats.csv import ColumnMap
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import (
     BLOCK_ROWS,
     HEAD_LINES,

@@ -24,19 +24,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.recordings.columns import (
-    COLUMNS,
-    Cell,
-    FloatArray,
-    TableRow,
-    cells_of,
-    normalise,
-    read_cells,
-    read_lines,
-    row_of_cells,
-    row_to_line,
-    write_lines,
-)
+from gateway.recordings.columns import COLUMNS, Cell, FloatArray
+from gateway.recordings.rows import TableRow, cells_of, row_of_cells, row_to_line
+from gateway.recordings.table_lines import normalise, read_cells, read_lines, write_lines
 from gateway.records import FusionState, NodeStatus
 
 FORMAT_PREFIX: Final = "# mavgate table "

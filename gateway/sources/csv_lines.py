@@ -10,8 +10,8 @@ import tomllib
 
 import msgspec
 
-from gateway.recordings.columns import TableRow, row_of_cells
 from gateway.recordings.formats.csv import DELIMITERS, ColumnMap, CsvReader
+from gateway.recordings.rows import TableRow, row_of_cells
 from gateway.records import NodeId
 from gateway.sources.sampling import SampleClock, imu_raw
 from gateway.sources.source import SourceRecord, unusable

@@ -23,8 +23,8 @@ from gateway.analysis.simulated import ideal_calibration
 from gateway.analysis.sweep import with_value
 from gateway.geometry.geodesy import displacement_m
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.recordings.columns import TableRow
 from gateway.recordings.fuse import FusionSettings, with_estimator
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import block_of
 from gateway.records import ImuCalibrated, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration

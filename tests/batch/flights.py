@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.simulated import ideal_calibration
-from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.recorded_table import header_for
+from gateway.recordings.rows import TableRow, row_to_line
 from gateway.recordings.table import encode_head
 from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
 from gateway.simulator.simulator_settings import SimulatorSettings

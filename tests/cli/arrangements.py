@@ -17,8 +17,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.aircraft import AircraftSettings
 from gateway.flashing import boards
 from gateway.live.serial_port import Port
-from gateway.recordings.columns import TableRow
 from gateway.recordings.recorded_table import header_for
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import TableHeader, encode_head
 from gateway.records import GpsFix, ImuCalibrated, ImuFlags, ImuRaw, NodeId
 from tests.analysis.test_flight import rows

@@ -16,12 +16,12 @@ from gateway.live import recorder as recorder_module
 from gateway.live.recorder import Recorder
 from gateway.live.session import Mode
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.recordings.columns import TableRow
 from gateway.recordings.opening import TlogFile
 from gateway.recordings.play import Player, Track
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.recording import open_recordings
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import TableHeader, TableReader
 from gateway.recordings.tlog import UNRECORDED
 from gateway.records import RECORDED_ONLY, FusedSample, FusionState, NavState

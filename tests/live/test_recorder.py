@@ -16,8 +16,8 @@ from gateway.live.part import PENDING_LIMIT
 from gateway.live.part_files import PartFiles
 from gateway.live.recorder import HELD_BYTES
 from gateway.live.session import RETRY_US, session_name
-from gateway.recordings.columns import TableRow
 from gateway.recordings.index import RecordingError, list_recordings
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import TableHeader, TableNote
 from gateway.records import FusedSample, FusionState
 from tests.kit.faults import refusing

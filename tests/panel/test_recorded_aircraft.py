@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.config import GatewaySettings
 from gateway.panel.playback import FUSED_AGAIN, RECORDED, free_ids, recorded_aircraft
-from gateway.recordings.columns import row_to_line
+from gateway.recordings.rows import row_to_line
 from gateway.recordings.table import encode_head
 from gateway.units import US_PER_S
 from tests.kit.messages import at, beat

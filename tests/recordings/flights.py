@@ -11,8 +11,8 @@ from gateway.aircraft import AircraftSettings, SettingsChanged
 from gateway.config import GatewaySettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.recordings.columns import RowBuilder, TableRow
 from gateway.recordings.recorded_table import Line, ReadOptions, header_for
+from gateway.recordings.rows import RowBuilder, TableRow
 from gateway.recordings.table import TableHeader, TableNote, TableReader, encode_head, encode_line
 from gateway.records import (
     BaroRaw,

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from gateway.recordings.columns import RowBuilder, TableRow
+from gateway.recordings.rows import RowBuilder, TableRow
 from gateway.records import (
     NAN,
     BaroRaw,

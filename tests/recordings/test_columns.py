@@ -11,15 +11,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from gateway.estimation.columns import nav_row
-from gateway.recordings.columns import (
-    COLUMNS,
-    NAV_CODEC,
-    RowBuilder,
-    TableRow,
-    read_lines,
-    row_to_line,
-    write_lines,
-)
+from gateway.recordings.columns import COLUMNS, NAV_CODEC
+from gateway.recordings.rows import RowBuilder, TableRow, row_to_line
 from gateway.recordings.table import (
     TableEvent,
     TableFault,
@@ -31,6 +24,7 @@ from gateway.recordings.table import (
     encode_head,
     encode_line,
 )
+from gateway.recordings.table_lines import read_lines, write_lines
 from gateway.records import FusedSample
 from tests.recordings.samples import (
     make_baro,

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.recordings.columns import COLUMNS, row_to_line
+from gateway.recordings.columns import COLUMNS
 from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
+from gateway.recordings.rows import row_to_line
 from gateway.recordings.table import encode_head
 from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.mavlink import packed

@@ -12,10 +12,11 @@ from gateway.aircraft import AircraftSettings, FusedStates
 from gateway.estimation.columns import NAV_ALT, NAV_LAT, NAV_LON, NAV_QUAT, nav_row
 from gateway.estimation.paper import PaperSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.recordings.columns import GPS_CODEC, TableRow
+from gateway.recordings.columns import GPS_CODEC
 from gateway.recordings.fuse import Fusion, interpolated_positions
 from gateway.recordings.recorded_fusion import Replay
 from gateway.recordings.recorded_table import header_for, settings_of
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import TableEvent, TableHeader, TableNote, TableReader, block_of
 from gateway.records import NavState
 from gateway.sensing.calibration import NodeCalibration

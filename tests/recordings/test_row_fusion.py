@@ -9,10 +9,10 @@ import pytest
 from gateway.aircraft import Aircraft, AircraftSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
 from gateway.recordings.fuse import Fusion
 from gateway.recordings.recorded_fusion import Replay
 from gateway.recordings.recorded_table import Line, header_for
+from gateway.recordings.rows import RowBuilder, TableRow, row_to_line
 from gateway.recordings.table import TableEvent, TableHeader, TableNote, block_of
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, ImuRaw
 from gateway.simulator.simulator_settings import SimulatorSettings

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.recordings.columns import RowBuilder, row_to_line
+from gateway.recordings.rows import RowBuilder, row_to_line
 from gateway.recordings.summary import FileInfo, Rate, TableSummary, TlogSummary
 from gateway.recordings.table import TableHeader, TableNote, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogScanner

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gateway.recordings.columns import TableRow, row_to_line
+from gateway.recordings.rows import TableRow, row_to_line
 from gateway.recordings.table import (
     MAX_LINE,
     TableEvent,

@@ -13,9 +13,10 @@ import numpy as np
 from msgspec.structs import replace
 
 from gateway.geometry.atmosphere import pressure_at_height
-from gateway.recordings.columns import BARO, COLUMNS, GPS, MAG, NAV, RAW, SI, FloatArray, normalise
+from gateway.recordings.columns import BARO, COLUMNS, GPS, MAG, NAV, RAW, SI, FloatArray
 from gateway.recordings.recorded_clock import BACK_US, HOUR_S, DayClock, is_damaged
 from gateway.recordings.table import BLOCK_ROWS, NO_ROWS, TableBlock
+from gateway.recordings.table_lines import normalise
 from gateway.records import NAN, GpsFixType, ImuFlags
 from gateway.settings import Settings, setting
 from gateway.units import US_PER_S

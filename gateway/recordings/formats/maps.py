@@ -14,9 +14,9 @@ from xml.sax import saxutils
 from gateway.aircraft import AircraftSettings
 from gateway.answers.log_answers import HOME_POSITION_ID
 from gateway.geometry.quaternion import to_euler
-from gateway.recordings.columns import TableRow
 from gateway.recordings.moment import iso_time
 from gateway.recordings.recorded_table import RecordedTable
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import NOTE, TableNote
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.records import FusionState, GpsFix, NavFlags, Quat

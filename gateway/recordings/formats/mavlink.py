@@ -3,7 +3,7 @@
 The IMU samples come from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends it (in the
 units of SCALED_IMU) and SCALED_IMU; once one was received, inferior ones are left out. The axes are
 body FRD by definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), minus the first one
-received; see `SampleClock`.
+received; see `VehicleClock`.
 
 GPS_RAW_INT has no down velocity: that of GLOBAL_POSITION_INT is used, or it is unknown. It is not
 derived from heights, because a receiver's height jumps by any amount when it gains or loses its
@@ -20,7 +20,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.geometry.quaternion import from_euler_array
 from gateway.recordings.columns import BARO, COLUMNS, GPS, LARGEST_WHOLE, NAV, SI, FloatArray
 from gateway.recordings.formats.csv import level_velocity
-from gateway.recordings.recorded_clock import FIRST_CIVIL_US, SampleClock
+from gateway.recordings.recorded_clock import FIRST_CIVIL_US, VehicleClock
 from gateway.records import NAN, GpsFixType, ImuFlags, NavFlags
 from gateway.units import (
     DEG_PER_DEGE7,
@@ -192,7 +192,7 @@ class AutopilotReader:
         self.system_id = system_id
         self._senders = senders or Senders()
         self._rank = 0
-        self._clock = SampleClock()
+        self._clock = VehicleClock()
         self._positions = np.empty(0, _POSITION_LAYOUT)
         self._positions_us = np.empty(0, np.int64)
         """The newest GLOBAL_POSITION_INT, if any, and its recorded time."""

@@ -14,10 +14,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from gateway.recordings.columns import COLUMNS, TRUTHS, WHOLE_COLUMNS, TableRow, cells_of, unit_of
+from gateway.recordings.columns import COLUMNS, TRUTHS, WHOLE_COLUMNS, unit_of
 from gateway.recordings.files import FlightError, is_packed, read_chunks, temporary_copy
 from gateway.recordings.formats import message_csv
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, table_of_blocks
+from gateway.recordings.rows import TableRow, cells_of
 from gateway.recordings.table import (
     FORMAT_LINE,
     HEADER_PREFIX,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gateway.config import GatewaySettings
-from gateway.recordings.columns import TableRow
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import TableFault, TableHeader, TableReader
 from gateway.wire.mavlink_splitter import origin_of
 from tests.kit.cli import run

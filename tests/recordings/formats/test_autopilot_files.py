@@ -14,11 +14,11 @@ from gateway.analysis.metrics import rms, rotation_error, total_error_rad
 from gateway.cli.support.options import read_options
 from gateway.cli.support.recordings import load_flight
 from gateway.config import GatewaySettings
-from gateway.recordings.columns import TableRow
 from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
 from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.recording import open_recording
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import TableReader
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
 from tests.kit.cli import run

@@ -8,8 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.geometry.quaternion import to_euler
-from gateway.recordings.columns import Imported, TableRow, row_of_cells
 from gateway.recordings.formats.mavlink import AutopilotReader
+from gateway.recordings.rows import Imported, TableRow, row_of_cells
 from gateway.recordings.tlog import TlogScanner
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuCalibrated, ImuFlags, NavFlags, NavState
 from gateway.wire.recorded_frames import RecordedFrame

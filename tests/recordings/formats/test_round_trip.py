@@ -20,12 +20,12 @@ import pytest
 from mcap.reader import make_reader
 
 from gateway.config import GatewaySettings
-from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats import parquet
 from gateway.recordings.formats.maps import tracks_of_messages, tracks_of_table
 from gateway.recordings.recorded_table import aircraft_of
 from gateway.recordings.recording import open_recording
+from gateway.recordings.rows import TableRow, row_to_line
 from gateway.recordings.workshop.convert import WRITERS, FlightToWrite
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import message_id_of, origin_of

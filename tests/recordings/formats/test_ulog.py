@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from gateway.estimation.record import FloatArray
-from gateway.recordings.columns import TableRow
 from gateway.recordings.formats import ulog_record
 from gateway.recordings.logged_samples import read_samples
+from gateway.recordings.rows import TableRow
 from tests.recordings.flights import OPTIONS
 
 ROWS = 60

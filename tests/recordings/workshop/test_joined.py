@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.recordings.columns import TableRow
 from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_table import RecordedTable
+from gateway.recordings.rows import TableRow
 from gateway.recordings.table import TableHeader, TableNote, block_of
 from gateway.recordings.workshop.joining import joined_tables
 
