@@ -139,6 +139,12 @@ class VehicleReader:
         if is_best or message_id in self._wanted:
             yield self._message(vehicle, message_id, record, fields)
 
+    def messages(self, batches: Iterable[Batch]) -> Iterator[VehicleMessage]:
+        """Yield the messages in all batches of the recording."""
+        for batch in batches:
+            yield from self.feed_batch(batch)
+        yield from self.flush()
+
     def flush(self) -> Iterator[VehicleMessage]:
         """Yield the texts that will not be continued."""
         return map(_of_text, self._joiner.flush())

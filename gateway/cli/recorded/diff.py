@@ -16,7 +16,6 @@ from gateway.cli.support.terminal import JsonOption, console_of, print_json, tab
 from gateway.output import check_output, write_new
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.recording import open_recordings
-from gateway.recordings.vehicle_recording import VehicleRecording
 from gateway.recordings.workshop.comparison import (
     SECTIONS,
     Comparison,
@@ -28,6 +27,7 @@ from gateway.recordings.workshop.comparison import (
     read_recording,
     rows_of,
 )
+from gateway.recordings.workshop.convert import FlightToWrite
 from gateway.recordings.workshop.extracts import RecordedPlan
 from gateway.vehicle_state.senders import AUTOPILOT, RecordedSender
 
@@ -86,9 +86,9 @@ def _read(name: str, files: list[Path], options: ReadOptions) -> Contents:
         return _read_live(name, int(live[1]))
     if files[0].suffix in PARAM_ENDINGS:
         return read_param_file(files[0])
-    recording = VehicleRecording(open_recordings(files), options)
-    found = read_recording(str(files[0]), recording)
-    print_remarks(dict.fromkeys(recording.flight.remarks))
+    flight = FlightToWrite(open_recordings(files), options)
+    found = read_recording(str(files[0]), flight)
+    print_remarks(dict.fromkeys(flight.remarks))
     return found
 
 

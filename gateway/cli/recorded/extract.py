@@ -1,6 +1,7 @@
 """`mavgate extract`: extract parameters, plans, texts, subtitles and geotags from a recording."""
 
 import re
+from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +17,7 @@ from gateway.output import check_output, write_new
 from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, iso_time, parse_moment, time_us_of
 from gateway.recordings.recording import open_recordings
-from gateway.recordings.vehicle_recording import VehicleRecording
+from gateway.recordings.workshop.convert import FlightToWrite
 from gateway.recordings.workshop.extracts import param_file, qgc_params, qgc_plan, waypoints
 from gateway.recordings.workshop.timed_extracts import (
     MAX_RATE_HZ,
@@ -99,31 +100,33 @@ def extract(
     chosen = _read_fields(fields)
     with progress_of(files) as advance:
         options = read_options(read_settings(), system_id=system, progress=advance)
-        recording = VehicleRecording(open_recordings(files), options)
+        flight = FlightToWrite(open_recordings(files), options)
         timed = ((text, texts), (event, events), (image, images))
         made: list[tuple[Path, Iterable[str]]] = [
-            (path, [make(recording.messages(WANTED))]) for path, make in timed if path is not None
+            (path, [make(flight.messages_of_vehicle(WANTED))])
+            for path, make in timed
+            if path is not None
         ]
         missing = list[str]()
-        made += _plans(recording, (params, mission, fence, rally), missing, is_read=bool(made))
+        made += _plans(flight, (params, mission, fence, rally), missing, is_read=bool(made))
         if subtitle is not None:
             begin = _video_begin(offset, video)
             shown = subtitles(
-                recording.messages(WANTED),
-                lambda: time_us_of(begin, recording.first_us), chosen, rate_hz,
+                flight.messages_of_vehicle(WANTED),
+                lambda: time_us_of(begin, flight.first_us), chosen, rate_hz,
             )  # fmt: skip
             made.append((subtitle, srt(shown) if subtitle.suffix == ".srt" else ass(shown)))
         for path, pieces in made:
             encoded = (piece.encode() for piece in pieces)
             write_new(path, encoded, overwrite=force, inputs=files)
             console_of().print(str(path))
-    print_remarks(dict.fromkeys([*recording.flight.remarks, *missing]))
+    print_remarks(dict.fromkeys([*flight.remarks, *missing]))
     if missing:
         raise typer.Exit(1 if made else 2)
 
 
 def _plans(
-    recording: VehicleRecording,
+    flight: FlightToWrite,
     paths: Sequence[Path | None],
     missing: list[str],
     *,
@@ -133,8 +136,8 @@ def _plans(
     if not any(paths):
         return
     if not is_read:
-        recording.read()
-    plan = recording.plan()
+        deque(flight.answered(), maxlen=0)
+    plan = flight.plan
     for (kind, name), path in zip(CONTENTS, paths, strict=True):
         if path is None:
             continue

@@ -12,7 +12,7 @@ from gateway.printable import printable
 from gateway.recordings.files import FlightError
 from gateway.recordings.flight_facts import FlightFacts
 from gateway.recordings.tallies import FACT_IDS, VehicleTally
-from gateway.recordings.vehicle_recording import VehicleRecording
+from gateway.recordings.workshop.convert import FlightToWrite
 from gateway.recordings.workshop.extracts import RecordedPlan, parameter_text
 from gateway.vehicle.plan import KINDS, Item
 
@@ -140,20 +140,20 @@ def read_param_file(path: Path) -> Contents:
     return found
 
 
-def read_recording(name: str, recording: VehicleRecording) -> Contents:
+def read_recording(name: str, flight: FlightToWrite) -> Contents:
     """Read the compared content of a recording; raises FlightError if it has no vehicle."""
-    reader = recording.reader(FACT_IDS)
-    tally = VehicleTally(reader.vehicle(recording.system_id))
-    for batch in recording.batches():
+    reader = flight.reader_of_vehicle(FACT_IDS)
+    tally = VehicleTally(reader.vehicle(flight.vehicle_id))
+    for batch in flight.answered():
         tally.add_batch(batch)
         for message in reader.feed_batch(batch):
             tally.update(message)
     for message in reader.flush():
         tally.update(message)
-    found = contents_of(name, recording.plan())
+    found = contents_of(name, flight.plan)
     found.figures |= figures_of(tally.facts())
     found.texts, found.is_flight = {text for _, _, text in tally.texts}, True
-    defaults = recording.flight.defaults.items()
+    defaults = flight.defaults.items()
     found.defaults = {name: parameter_text(value) for name, value in defaults}
     return found
 

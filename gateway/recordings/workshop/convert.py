@@ -12,6 +12,9 @@ from tempfile import mkdtemp
 from typing import Any, Final
 from weakref import finalize
 
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.answers.log_answers import LogAnswers
 from gateway.recordings.autopilot_record import AutopilotLog, RecordTranslator
 from gateway.recordings.file_format import NO_RECORDING, TABLE, import_format
 from gateway.recordings.files import FlightError
@@ -35,12 +38,14 @@ from gateway.recordings.tlog import encode_record
 from gateway.recordings.tlog_source import TlogSource, open_tlog
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.recordings.workshop.editing import NOTHING_LEFT, TlogEdits
+from gateway.recordings.workshop.extracts import RecordedPlan
 from gateway.recordings.workshop.joining import joined_rows, trimmed
 from gateway.recordings.workshop.merging import batched, intact, joined
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.recorded_frames import Batch, RecordedFrame
 
 NO_EDITS: Final = TlogEdits()
+NO_AUTOPILOT: Final = mavlink.MAV_AUTOPILOT_INVALID
 NOT_FUSED: Final = "raw samples, settings and the exact digits of states"
 NOT_IN_TABLE: Final = "all except samples, fixes and states of one vehicle"
 NOT_DRAWN: Final = (
@@ -71,6 +76,11 @@ class FlightToWrite:
     MAVLink is made of tables and of autopilots' logs in a temporary file, since its senders must be
     known before its frames are used. Raises OSError if a file cannot be read.
     """
+
+    plan: RecordedPlan
+    """Parameters and plans of the vehicle in the records that `answered` has yielded."""
+    first_us = 0
+    """Time of the first of these records."""
 
     def __init__(
         self,
@@ -180,14 +190,50 @@ class FlightToWrite:
             check_vehicle(self.files, self.options.system_id, sorted(vehicles))
         return sources
 
+    @cached_property
+    def vehicle_id(self) -> int:
+        """The vehicle that `options` select, or the only one with an autopilot.
+
+        Raises FlightError if there is none, or several to choose from.
+        """
+        path = self.recordings[0].path
+        if not self.has_messages:
+            raise FlightError(f"{path}: is neither MAVLink nor the log of an autopilot")
+        systems = self.senders.systems()
+        if self.is_mavlink and self.options.system_id is not None:
+            return self.options.system_id
+        beats = {one: self.senders.vehicle(one).heartbeat for one in systems}
+        found = [one for one, beat in beats.items() if beat and beat[1] != NO_AUTOPILOT] or systems
+        if not found:
+            raise FlightError(f"{path}: contains no vehicle")
+        if len(found) > 1:
+            listed = ", ".join(map(str, found))
+            raise FlightError(f"{path}: several vehicles; choose one with --system: {listed}")
+        return found[0]
+
+    def answered(self) -> Iterator[Batch]:
+        """Yield the records as `chosen`, and set `plan` and `first_us`."""
+        vehicle_id, answers, is_first = self.vehicle_id, LogAnswers(), True
+        self.plan = RecordedPlan(answers, self.senders.vehicle(vehicle_id))
+        for batch in self.chosen():
+            if len(batch) and is_first:
+                self.first_us, is_first = int(batch.time_us[0]), False
+            answers.add(batch, self.senders)
+            yield batch
+
+    def reader_of_vehicle(self, wanted: Iterable[int]) -> VehicleReader:
+        """Return a reader of positions, texts and wanted messages of the vehicle."""
+        return VehicleReader(self.senders, wanted, self.vehicle_id, with_attitude=False)
+
+    def messages_of_vehicle(self, wanted: Iterable[int]) -> Iterator[VehicleMessage]:
+        """Yield the messages of `reader_of_vehicle` in the records of `answered`."""
+        return self.reader_of_vehicle(wanted).messages(self.answered())
+
     def vehicle_messages(
         self, wanted: Iterable[int] = (), system_id: int | None = None
     ) -> Iterator[VehicleMessage]:
         """Yield the vehicles' positions, attitudes and texts, and other messages given by id."""
-        batches, reader = self.chosen(), VehicleReader(self.senders, wanted, system_id)
-        for batch in batches:
-            yield from reader.feed_batch(batch)
-        yield from reader.flush()
+        return VehicleReader(self.senders, wanted, system_id).messages(self.chosen())
 
     def table(self) -> RecordedTable:
         """Return the rows: as recorded, or fused again from the start and then cut."""

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings import files
 from gateway.recordings.recording import open_recording
-from gateway.recordings.vehicle_recording import VehicleRecording
+from gateway.recordings.workshop.convert import FlightToWrite
 from gateway.recordings.workshop.extracts import parameter_text
 from tests.kit.cli import run
 from tests.kit.mavlink import Sender
@@ -243,6 +243,6 @@ def test_recording_from_time_zero_begins_at_its_first_record(
     path = write_tlog(
         tmp_path / "a.tlog", [replace(r, time_us=1000 * k) for k, r in enumerate(make_records(60))]
     )
-    recording = VehicleRecording([open_recording(path)], OPTIONS)
-    recording.read()
-    assert recording.first_us == 0
+    flight = FlightToWrite([open_recording(path)], OPTIONS)
+    assert sum(map(len, flight.answered())) == 60
+    assert flight.first_us == 0
