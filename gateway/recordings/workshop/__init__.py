@@ -3,8 +3,7 @@
 | step           | modules                                                                        |
 | -------------- | ------------------------------------------------------------------------------ |
 | stream         | `merging`, `joining`: one stream of batches or rows from several files         |
-| chain          | `editing`: the chain; `selection`: which records; `anonymising`: their frames, |
-|                | by the table of fields of `private_fields`                                     |
+| chain          | `editing`: the chain; `selection`: which records; `anonymising`: their frames  |
 | writer         | `convert`: one writer per format, chosen by the ending of the file             |
 | single content | `extracts`, `timed_extracts`; `comparison` of two recordings                   |
 

@@ -17,8 +17,14 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.estimation.record import FloatArray
-from gateway.recordings.workshop.anonymising import PARAMETERS, Anonymiser, Anonymity
-from gateway.recordings.workshop.private_fields import parameters_of, treatment_of, unlisted_fields
+from gateway.recordings.workshop.anonymising import (
+    PARAMETERS,
+    Anonymiser,
+    Anonymity,
+    parameters_of,
+    treatment_of,
+    unlisted_fields,
+)
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, layout_of
 from gateway.wire.mavlink_splitter import MavFrame, frame_of, message_id_of, split_datagram
 from gateway.wire.recorded_frames import fields_of
