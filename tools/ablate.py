@@ -10,7 +10,6 @@ better if its own mean differs by more than 1 %. A score that only the full filt
 worse.
 """
 
-import argparse
 import math
 import warnings
 from collections.abc import Sequence
@@ -21,14 +20,12 @@ from statistics import fmean
 from typing import Final, NamedTuple
 from unittest.mock import patch
 
-from rich.console import Console
-from rich.table import Table
-
 from gateway.compiled import compiled
 from gateway.estimation.eskf.filter import begin_state, run
 from gateway.estimation.eskf.state import INTEGRALS, State
 from tools.build_kernels import compiled_again
 from tools.flights import Flight
+from tools.harness import arguments, show, write_json
 from tools.score_estimators import (
     SHARES,
     Scores,
@@ -161,7 +158,7 @@ def lines_of(parts: Sequence[str]) -> int:
 
 def main() -> None:
     """Score the full filter, then each variant, and print the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = arguments(__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of *.csv.gz flights")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -170,12 +167,11 @@ def main() -> None:
         raise SystemExit(f"{options.data} contains none of the flights {', '.join(FLIGHTS)}")
     boards: tuple[Board, Board] = {}, {}
     add_scores(*boards, FULL, flights)
-    table = Table("disabled mechanism", "lines", box=None, pad_edge=False)
+    heads = ["disabled mechanism", "lines"]
     for board, kind in zip(boards, ("recorded", "disturbed"), strict=True):
-        for title in (f"{len(board)} {kind}: worse", "better", "ratio", "within 2 sigma"):
-            table.add_column(title, justify="right")
-    table.add_column()
-    table.add_row("none", "", *(c for b in boards for c in ("", "", "1", share_within(b, FULL))))
+        heads += [f"{len(board)} {kind}: worse", "better", "ratio", "within 2 sigma"]
+    full = [cell for board in boards for cell in ("", "", "1", share_within(board, FULL))]
+    rows: list[list[object]] = [["none", "", *full, ""]]
     for number, (title, module, name, replacement, parts) in enumerate(MECHANISMS, 1):
         target = f"{FILTER}.{module}.{name}"
         with patch(target, replacement), compiled_again([begin_state, run]):
@@ -183,9 +179,10 @@ def main() -> None:
         cells = [c for b in boards for c in (*comparison(b, title), share_within(b, title))]
         equal = not any(int(cells[k]) for k in (0, 1, 4, 5))
         mark = "no measurable difference" if equal else ""
-        table.add_row(title, str(lines_of(parts)), *cells, mark)
+        rows.append([title, lines_of(parts), *cells, mark])
         print(f"{number} of {len(MECHANISMS)}: without {title}: {'  '.join(cells)}", flush=True)
-    Console(width=170).print(table)
+    show("errors without each mechanism", [*heads, ""], rows)
+    write_json(options, {"rows": rows})
 
 
 if __name__ == "__main__":

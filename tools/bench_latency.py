@@ -2,9 +2,8 @@
 
     python -m tools.bench_latency
 
-Several aircraft send all payloads of their nodes: IMU and barometer samples, fixes with their
-quality, the reports of nodes and receiver. A frame with an IMU sample is written to a
-pseudo-terminal and the resulting ATTITUDE_QUATERNION is awaited on a UDP port, at several rates;
+Several simulated aircraft send all payloads of their nodes. A frame with an IMU sample is written
+to a pseudo-terminal and the resulting ATTITUDE_QUATERNION is awaited on a UDP port, at some rates;
 for one aircraft the samples are lines of JSON. Programs take turns in short rounds, so that other
 load on the machine affects them equally: the median round counts. The baseline is a program that
 reads the same line and sends a datagram of the same size for every frame, without decoding, fusion
@@ -23,7 +22,6 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,9 +29,10 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 from rich.progress import track
 
-from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters
-from gateway.wire import payloads
-from gateway.wire.framing import encode_frame
+from gateway.simulator.receiver import simulate
+from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.wire.framing import FrameDecoder
+from gateway.wire.payloads import ImuPayload, RadioFrame, decode_content
 from tools.harness import (
     MAVGATE,
     PYTHON,
@@ -51,8 +50,6 @@ from tools.harness import (
 
 RATES_HZ = (100, 1000)
 VEHICLES = 3
-BARO_HZ, FIX_HZ, REPORT_HZ = 25, 5, 1
-"""Rates of each aircraft's other payloads; REPORT_HZ is that of the receiver's report too."""
 WARM_UP_S = 3.0
 START_LIMIT_S = 120.0
 GATEWAY = "mavgate"
@@ -86,74 +83,27 @@ class Moment(NamedTuple):
     others: list[bytes]
 
 
-class Nodes:
-    """Level aircraft that turn slowly, and their receiver."""
+def moments(rate_hz: int, vehicles: int) -> Iterator[Moment]:
+    """Yield frames of the simulated receiver without end, each time one IMU sample.
 
-    def __init__(self) -> None:
-        self._sequences: dict[NodeId, Iterator[int]] = {}
-        self._frames = itertools.count()
-
-    def moments(self, rate_hz: int, vehicles: int) -> Iterator[Moment]:
-        """Yield frames without end, at a total rate of IMU samples of all aircraft."""
-        for number in itertools.count():
-            system, tick = 1 + number % vehicles, number // vehicles
-            node_us = round(number * 1e6 / rate_hz)
-            sample = self._radio(NodeId(system, 0), node_us, imu_payload(number))
-            others = list(self._others(system, tick, rate_hz / vehicles, node_us))
-            yield Moment(system, sample, others)
-
-    def _others(self, system: int, tick: int, rate_hz: float, node_us: int) -> Iterator[bytes]:
-        def is_due(each_hz: int) -> bool:
-            return int(tick * each_hz / rate_hz) != int((tick - 1) * each_hz / rate_hz)
-
-        imu, gps = NodeId(system, 0), NodeId(system, 1)
-        if is_due(BARO_HZ):
-            yield self._radio(imu, node_us, payloads.BaroPayload(10_000_000, 215))
-        if is_due(FIX_HZ):
-            itow_ms = node_us // 1000
-            yield self._radio(gps, node_us, quality_payload(itow_ms))
-            yield self._radio(gps, node_us, fix_payload(itow_ms))
-        if is_due(REPORT_HZ):
-            report = payloads.NodeStatusPayload((1, 0), 1, 7, 0, 0, 0, 3, 900, 200, 3700)
-            yield self._radio(imu, node_us, report)
-            pipes = (PipeCounters(1000, 3, 0),) * payloads.PIPES
-            status = payloads.ReceiverStatusFrame(
-                next(self._frames) % 256, node_us % 2**32, 76, 4, 0, 1, pipes
-            )
-            yield encode_frame(payloads.encode_receiver_status(status))
-
-    def _radio(self, node: NodeId, node_us: int, payload: payloads.Payload) -> bytes:
-        sequence = next(self._sequences.setdefault(node, itertools.count()))
-        header = payloads.Header(node, sequence % 65536, node_us % 2**32)
-        packet = payloads.encode_payload(header, payload)
-        frame_seq, pipe = next(self._frames) % 256, node.node_id
-        return encode_frame(payloads.encode_radio(frame_seq, pipe, node_us % 2**32, packet))
-
-
-def imu_payload(number: int) -> payloads.ImuPayload:
-    """Make the counts of a level node that turns slowly."""
-    return payloads.ImuPayload(
-        accel=(20, -15, 4096),
-        gyro=(3, -2, round(300 * math.sin(number / 500))),
-        mag=(200, 30, -380),
-        temperature=-3900,
-        flags=ImuFlags.MAG_NEW if number % 3 == 0 else ImuFlags(0),
-        accel_range=2,
-        gyro_range=2,
-        mag_gain=1,
+    Each of the aircraft sends an equal, whole part of `rate_hz` samples a second.
+    """
+    settings = SimulatorSettings(
+        vehicles=vehicles,
+        imu_rate_hz=rate_hz // vehicles,
+        gps_first_fix_s=0.5,
+        radio_loss=0.0,
+        radio_duplicates=0.0,
     )
-
-
-def fix_payload(itow_ms: int) -> payloads.GpsFixPayload:
-    """Make a fix of a stationary aircraft."""
-    position = (-77_656_000, 1_103_728_000, 110_000)
-    return payloads.GpsFixPayload(itow_ms, *position, (0, 0, 0), GpsFixType.FIX_3D, True, 12)
-
-
-def quality_payload(itow_ms: int) -> payloads.GpsQualityPayload:
-    """Make the accuracies and the time of the fix."""
-    utc = datetime(2026, 1, 1, tzinfo=UTC)
-    return payloads.GpsQualityPayload(itow_ms, 150, 220, 30, 900, 140, 2500, utc)
+    decoder, others = FrameDecoder(), list[bytes]()
+    for frame in simulate(settings).frames():
+        for content in decoder.feed(frame.data):
+            found = decode_content(content) if isinstance(content, bytes) else content
+            if isinstance(found, RadioFrame) and isinstance(found.payload, ImuPayload):
+                yield Moment(found.header.node.vehicle_id, frame.data, others)
+                others = []
+            else:
+                others.append(frame.data)
 
 
 def line_moments(rate_hz: int) -> Iterator[Moment]:
@@ -172,7 +122,7 @@ def line_moments(rate_hz: int) -> Iterator[Moment]:
 
 def frames(rate_hz: int) -> Iterator[bytes]:
     """Yield the IMU frames of one aircraft without end."""
-    return (moment.sample for moment in Nodes().moments(rate_hz, 1))
+    return (moment.sample for moment in moments(rate_hz, 1))
 
 
 class Line:
@@ -182,8 +132,8 @@ class Line:
     program each frame.
     """
 
-    def __init__(self, command: list[str], moments: Iterator[Moment], *, is_gateway: bool) -> None:
-        self._is_gateway, self._moments = is_gateway, moments
+    def __init__(self, command: list[str], sent: Iterator[Moment], *, is_gateway: bool) -> None:
+        self._is_gateway, self._moments = is_gateway, sent
         self._waiting: dict[int, deque[float | None]] = {}
         """Times of unanswered frames, by system; None for frames that are not measured."""
         self._latencies_us: list[float] = []
@@ -260,10 +210,10 @@ class Line:
 
 
 def measure(
-    command: list[str], moments: Iterator[Moment], rate_hz: int, seconds: float, *, is_gateway: bool
+    command: list[str], sent: Iterator[Moment], rate_hz: int, seconds: float, *, is_gateway: bool
 ) -> Figures:
     """Run a program on a separate line and measure it."""
-    line = Line(command, moments, is_gateway=is_gateway)
+    line = Line(command, sent, is_gateway=is_gateway)
     try:
         line.await_answer(rate_hz)
         line.exchange(rate_hz, WARM_UP_S)
@@ -310,12 +260,14 @@ def main() -> None:
             gateways["mavgate, uvloop"] = gateway(folder, "uvloop", "--port", "{line}")
         commands = {"plain forwarder": [PYTHON, "-c", BASELINE, "{line}", "{port}"], **gateways}
         commands |= {command.split()[0]: shlex.split(command) for command in options.forwarder}
-        runs = [*itertools.product(range(options.rounds), RATES_HZ, commands)]
+        # An equal, whole rate for each aircraft.
+        rates_hz = [rate_hz - rate_hz % options.vehicles for rate_hz in RATES_HZ]
+        runs = [*itertools.product(range(options.rounds), rates_hz, commands)]
         for _, rate_hz, program in track(runs, "measuring"):
-            moments = Nodes().moments(rate_hz, options.vehicles)
+            is_of_lines = program == OF_LINES
             figures = measure(
                 commands[program],
-                line_moments(rate_hz) if program == OF_LINES else moments,
+                line_moments(rate_hz) if is_of_lines else moments(rate_hz, options.vehicles),
                 rate_hz,
                 options.seconds,
                 is_gateway=program in gateways,

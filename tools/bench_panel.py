@@ -26,7 +26,7 @@ from gateway.panel.panel_server import make_parts
 from gateway.panel.panel_settings import PanelSettings
 from tests.kit.process import Process
 from tests.ports import free_port
-from tools.bench_latency import Line, Nodes
+from tools.bench_latency import Line, moments
 from tools.harness import MAVGATE, Figures, arguments, cpu_s, memory_mb, show, write_json
 
 CHROMIUM = "/usr/bin/chromium"
@@ -189,19 +189,19 @@ def measure_gateway(browser: Browser, folder: Path, seconds: float) -> Figures:
     command = ["env", f"XDG_RUNTIME_DIR={folder}", *MAVGATE, *words]
     command += ["--endpoint", "udp:127.0.0.1:{port}"]
     late: dict[str, list[float]] = {"without": [], "read": [], "drawn": []}
-    moments = Nodes().moments(GATEWAY_HZ, 1)
+    sent = moments(GATEWAY_HZ, 1)
     ended = 0.0
 
     def turn(for_s: float) -> list[float]:
         """Exchange frames after a pause in which the node's frames were not read."""
         nonlocal ended
         for _ in range(round((time.perf_counter() - ended) * GATEWAY_HZ)):
-            next(moments)
+            next(sent)
         found = line.exchange(GATEWAY_HZ, for_s)
         ended = time.perf_counter()
         return found
 
-    line = Line(command, moments, is_gateway=True)
+    line = Line(command, sent, is_gateway=True)
     try:
         line.await_answer(GATEWAY_HZ)
         ended = time.perf_counter()

@@ -30,8 +30,9 @@ from gateway.config import load
 from gateway.live.daemon import Daemon
 from gateway.simulator.receiver import simulate
 from gateway.vehicle.services.ftp import Opcode
+from tests.kit.ground_station import command, ftp_request, to_vehicle
+from tests.kit.mavlink import STATION, Sender
 from tests.ports import free_ports
-from tools.fault_traffic import ftp, heartbeat, packed, request_message
 from tools.harness import PYTHON, arguments, running, show, write_json
 from tools.turns import LONG_US, TurnWatch, even_turns
 
@@ -59,16 +60,16 @@ HEADS = ("loop", "own ms", "of ms", "at s", "longest callback", "turns", f"above
 
 def questions() -> list[bytes]:
     """Encode the requests of a ground station at its start."""
-    rate = (mavlink.MAVLINK_MSG_ID_ATTITUDE, 20_000, 0, 0, 0, 0, 0)
-    return [
-        heartbeat(200),
-        packed(mavlink.MAVLink_param_request_list_message(1, 1)),
-        packed(mavlink.MAVLink_mission_request_list_message(1, 1, 0)),
-        request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, to_all=False),
-        packed(mavlink.MAVLink_command_long_message(1, 1, 511, 0, *rate)),
-        ftp(Opcode.OPEN_FILE_RO, 0, b"/general.json"),
-        ftp(Opcode.BURST_READ_FILE, 0),
+    station = Sender(200, STATION)
+    messages = [
+        to_vehicle("PARAM_REQUEST_LIST"),
+        to_vehicle("MISSION_REQUEST_LIST", 0),
+        command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION),
+        command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, 20_000),
+        ftp_request(Opcode.OPEN_FILE_RO, b"/general.json"),
+        ftp_request(Opcode.BURST_READ_FILE),
     ]
+    return [station.heartbeat(), *map(station.pack, messages)]
 
 
 async def visit_udp(port: int, stay_s: float) -> None:
@@ -80,7 +81,7 @@ async def visit_udp(port: int, stay_s: float) -> None:
         transport.sendto(question)
     for _ in range(round(stay_s)):
         await asyncio.sleep(1.0)
-        transport.sendto(heartbeat(200))
+        transport.sendto(Sender(200, STATION).heartbeat())
     transport.close()
 
 

@@ -12,6 +12,8 @@ a sleep before each message and each sample.
 """
 
 import time
+from collections.abc import Callable
+from functools import partial
 from itertools import islice
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -23,9 +25,9 @@ from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.kit.records import FIX, STATE, sample_at, state_at
 from tools.bench_latency import frames
+from tools.harness import arguments, show, write_json
 
 RATES_HZ = (60, 200, 1000)
-SECONDS = 20
 PACKS = 20_000
 LONGEST_WAIT_US = 100_000
 """Maximum interval of polls, as in the daemon."""
@@ -33,6 +35,8 @@ SLEEP_S = 0.0007
 """Sleep before each sample: about the rest of a millisecond."""
 SLEEPING_SECONDS = 3
 """Duration of the runs with sleeps."""
+
+Run = Callable[[int, int], tuple[float, int]]
 
 
 def pack_us(packs: int, sleep_s: float = 0.0) -> float:
@@ -72,39 +76,38 @@ def run_pipeline(rate_hz: int, seconds: int, sleep_s: float = 0.0) -> tuple[floa
     return time.process_time() - began_s - slept_s, sent
 
 
-def show(rate_hz: int, seconds: int, used_s: float, sent: int) -> None:
-    """Print one line of the table."""
-    print(
-        f"{rate_hz:6d} samples/s: {used_s / (seconds * rate_hz) * 1e6:5.1f} us a sample, "
-        f"{100 * used_s / seconds:5.2f} % of a core, {sent / seconds:.0f} messages/s"
-    )
+def run_vehicle(rate_hz: int, seconds: int) -> tuple[float, int]:
+    """Update the vehicle alone, and poll it; return as `run_pipeline`."""
+    vehicle = Vehicle(VehicleSettings(), 1)
+    vehicle.on_gps(FIX, 0)
+    times = range(0, seconds * US_PER_S, US_PER_S // rate_hz)
+    samples = [(state_at(t), sample_at(t)) for t in times]
+    sent = 0
+    began_s = time.process_time()
+    for state, sample in samples:
+        sent += len(vehicle.on_state(state, sample, state.time_us))
+        if vehicle.next_due_us() <= state.time_us:
+            sent += len(vehicle.poll(state.time_us))
+    return time.process_time() - began_s, sent
 
 
 def main() -> None:
-    """Print the table."""
-    print(f"baseline: one message built and packed {pack_us(PACKS):.1f} us")
-    print("the whole pipeline:")
-    for rate_hz in RATES_HZ:
-        show(rate_hz, SECONDS, *run_pipeline(rate_hz, SECONDS))
-    fastest, packs = max(RATES_HZ), SLEEPING_SECONDS * max(RATES_HZ)
-    print(f"after a sleep each: one message built and packed {pack_us(packs, SLEEP_S):.1f} us")
-    print("the whole pipeline after a sleep each:")
-    show(fastest, SLEEPING_SECONDS, *run_pipeline(fastest, SLEEPING_SECONDS, SLEEP_S))
-    print("the vehicle alone:")
-    for rate_hz in RATES_HZ:
-        vehicle = Vehicle(VehicleSettings(), 1)
-        vehicle.on_gps(FIX, 0)
-        times = range(0, SECONDS * US_PER_S, US_PER_S // rate_hz)
-        samples = [(state_at(t), sample_at(t)) for t in times]
-        sent = 0
-        began_s = time.process_time()
-        for state, sample in samples:
-            now_us = state.time_us
-            sent += len(vehicle.on_state(state, sample, now_us))
-            if vehicle.next_due_us() <= now_us:
-                sent += len(vehicle.poll(now_us))
-        used_s = time.process_time() - began_s
-        show(rate_hz, SECONDS, used_s, sent)
+    """Print the tables."""
+    options = arguments(__doc__, seconds=20).parse_args()
+    fastest = max(RATES_HZ)
+    runs: list[tuple[str, int, int, Run]]
+    runs = [("pipeline", rate, options.seconds, run_pipeline) for rate in RATES_HZ]
+    runs += [("after a sleep", fastest, SLEEPING_SECONDS, partial(run_pipeline, sleep_s=SLEEP_S))]
+    runs += [("vehicle alone", rate, options.seconds, run_vehicle) for rate in RATES_HZ]
+    rows: list[tuple[object, ...]] = []
+    for part, rate_hz, seconds, run in runs:
+        used_s, sent = run(rate_hz, seconds)
+        us, share = 1e6 * used_s / (seconds * rate_hz), 100 * used_s / seconds
+        rows.append((part, rate_hz, us, share, sent / seconds))
+    packing = pack_us(PACKS), pack_us(SLEEPING_SECONDS * fastest, SLEEP_S)
+    rows += [("message packed", "", packing[0]), ("message packed after a sleep", "", packing[1])]
+    show("processor time", ("part", "samples/s", "µs each", "% of a core", "messages/s"), rows)
+    write_json(options, {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -56,8 +56,6 @@ COMPILER: Final = Path(__file__).with_name("kernel_compiler.py")
 OTHERS_WRITE: Final = stat.S_IWGRP | stat.S_IWOTH
 MAX_CACHED: Final = 8
 """Maximum cached object files, of 0.2 MB each."""
-SHOW_S: Final = 0.2
-"""Interval of the progress on a terminal."""
 
 
 def main() -> None:
@@ -104,9 +102,11 @@ def build_installed(path: Path, architecture: str | None = None, *, rebuild: boo
     files = {sys.modules[name].__file__ for name in names if name not in NO_KERNELS}
     stamp = "\n".join(sorted(stamp_of(Path(file)) for file in files if file))
     cached = None if rebuild or architecture else cached_object(stamp)
-    build_library(
-        path, ENTRY_POINTS, stamp=stamp, architecture=architecture, cached=cached, show=True
-    )
+    begin_s = time.monotonic()
+    print(f"compiling {len(ENTRY_POINTS)} kernels, or taking them from the cache", flush=True)
+    build_library(path, ENTRY_POINTS, stamp=stamp, architecture=architecture, cached=cached)
+    elapsed_s, size_kb = time.monotonic() - begin_s, path.stat().st_size / 1e3
+    print(f"{path.name}: {size_kb:.0f} kB after {elapsed_s:.0f} s")
 
 
 def cached_object(stamp: str) -> Path | None:
@@ -154,7 +154,6 @@ def build_library(
     stamp: str = "",
     architecture: str | None = None,
     cached: Path | None = None,
-    show: bool = False,
 ) -> None:
     """Compile entry points, and all functions that they call, into a library.
 
@@ -169,18 +168,15 @@ def build_library(
         For a wheel: `x86_64` or `aarch64`. By default the library is for this machine only.
     cached : Path, optional
         Path of the object file, which is compiled and stored there unless it exists.
-    show : bool
-        Print the progress.
 
     Raises
     ------
     TypeError
         If a function needs the run-time library of Python or numba, because it allocates.
     """
-    progress = _Progress(len(entry_points)) if show else None
     machine_code = _kept(cached) if cached is not None else b""
     if not machine_code:
-        machine_code = _compiled(entry_points, stamp, architecture, progress)
+        machine_code = _compiled(entry_points, stamp, architecture)
         if cached is not None:
             _keep(cached, machine_code)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -189,15 +185,10 @@ def build_library(
         relocatable.write_bytes(machine_code)
         _link(relocatable, library, architecture)
         library.replace(path)
-    if progress is not None:
-        progress.end(path)
 
 
 def _compiled(
-    entry_points: Sequence[EntryPoint[...]],
-    stamp: str,
-    architecture: str | None,
-    progress: "_Progress | None",
+    entry_points: Sequence[EntryPoint[...]], stamp: str, architecture: str | None
 ) -> bytes:
     # Imported late: without numba, the command can still find that the library is current.
     from tools.kernel_compiler import compile_object
@@ -206,9 +197,7 @@ def _compiled(
     # The garbage collector would take a fifth of the time.
     gc.disable()
     try:
-        return compile_object(
-            entry_points, stamp, architecture, progress.step if progress else None
-        )
+        return compile_object(entry_points, stamp, architecture)
     finally:
         if was_enabled:
             gc.enable()
@@ -269,41 +258,6 @@ def _linker(architecture: str | None) -> list[str]:
         )
     target = f"{architecture or platform.machine()}-linux-gnu.{OLDEST_GLIBC}"
     return [sys.executable, "-m", "ziglang", "cc", "-target", target]
-
-
-class _Progress:
-    """Prints the number of compiled entry points."""
-
-    def __init__(self, total: int) -> None:
-        self._total = total
-        self._done = self._functions = 0
-        self._begin_s = self._shown_s = time.monotonic()
-        self._redraws = sys.stdout.isatty()
-
-    def step(self, what: str) -> None:
-        """Count a compiled function, or an entry point with all functions that it calls."""
-        self._functions += what == "function"
-        self._done += what == "entry point"
-        now_s = time.monotonic()
-        if self._redraws and now_s - self._shown_s > SHOW_S:
-            self._shown_s = now_s
-            print(f"\r{self._text()}", end="", flush=True)
-
-    def end(self, path: Path) -> None:
-        """Print the result."""
-        size = f"{path.stat().st_size / 1e3:.0f} kB"
-        if not self._done:
-            print(f"compiled kernels of the same sources are in the cache: {path.name}, {size}")
-            return
-        begin = "\r" if self._redraws else ""
-        print(f"{begin}{self._text()}: {path.name}, {size}")
-
-    def _text(self) -> str:
-        elapsed_s = time.monotonic() - self._begin_s
-        return (
-            f"compiling kernels: {self._done} of {self._total} entry points, "
-            f"{self._functions} functions, {elapsed_s:.0f} s"
-        )
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import json
+import math
 import os
 import socket
 import statistics
@@ -33,7 +34,9 @@ def arguments(doc: str | None, *, rounds: int = 0, seconds: float = 0.0) -> argp
     if rounds:
         parser.add_argument("--rounds", type=int, default=rounds, help="the median counts")
     if seconds:
-        parser.add_argument("--seconds", type=float, default=seconds, help="of each single run")
+        parser.add_argument(
+            "--seconds", type=type(seconds), default=seconds, help="of each single run"
+        )
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     return parser
 
@@ -46,18 +49,20 @@ def write_json(options: argparse.Namespace, report: Mapping[str, Any]) -> None:
 
 def show(title: str, columns: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
     """Print rows as a table; numbers have three digits or more."""
-    table = Table(box=box.SIMPLE_HEAD)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
         table.add_column(column, justify="right")
     for row in rows:
         table.add_row(*map(text_of, row))
-    Console(width=150).print(title, table, sep="\n")
+    Console(width=250).print(title, table, sep="\n")
 
 
 def text_of(value: object) -> str:
-    """Return a cell of a table."""
+    """Return a cell of a table; an unknown number is empty."""
     if not isinstance(value, float):
         return f"{value:,}" if isinstance(value, int) else str(value)
+    if math.isnan(value):
+        return ""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 

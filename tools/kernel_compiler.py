@@ -6,7 +6,7 @@ functions are linked into one module, which is optimised as a whole. The code us
 that every processor of its architecture has, and no fused multiply-add.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import cache
 from types import FunctionType
 from typing import Any, Final
@@ -21,8 +21,6 @@ from numba.extending import intrinsic, overload, typeof_impl
 
 from gateway.compiled import array_at, is_compiled, record_at, system_calls
 from gateway.compiled.entry_point import SOURCES_SYMBOL, EntryPoint
-
-Step = Callable[[str], None]
 
 STRICT: Final[dict[str, Any]] = {"fastmath": False, "error_model": "numpy"}
 """Options of numba, because offline fusion of a log must give exactly the result of live fusion."""
@@ -41,7 +39,6 @@ def compile_object(
     entry_points: Sequence[EntryPoint[...]],
     stamp: str,
     architecture: str | None = None,
-    step: Step | None = None,
 ) -> bytes:
     """Compile entry points, and all functions that they call, into an object file.
 
@@ -52,8 +49,6 @@ def compile_object(
         The value of `SOURCES_SYMBOL`.
     architecture : str, optional
         By default that of this machine.
-    step : callable, optional
-        Called with "function" or "entry point" whenever one is compiled.
 
     Returns
     -------
@@ -66,7 +61,7 @@ def compile_object(
     TypeError
         If a function allocates or uses Python objects.
     """
-    cpu_target.target_context._internal_codegen = _Codegen("kernels", step)  # noqa: SLF001
+    cpu_target.target_context._internal_codegen = _Codegen("kernels")  # type: ignore[no-untyped-call]  # noqa: SLF001
     # Numba binds global constants when it compiles; they may have been patched since an earlier
     # call.
     _called.cache_clear()
@@ -76,8 +71,6 @@ def compile_object(
         function: Any = numba.cfunc(signature, **STRICT)(entry_point.__wrapped__)  # type: ignore[attr-defined]
         symbols[function.native_name] = entry_point.symbol
         libraries.append(function._library)  # noqa: SLF001
-        if step is not None:
-            step("entry point")
     module = _linked(libraries)
     machine = _target_machine(architecture)
     module.triple, module.data_layout = machine.triple, str(machine.target_data)
@@ -94,10 +87,8 @@ class _Library(codegen.AOTCodeLibrary):
         pass
 
     def finalize(self) -> None:
-        """Note that the function is translated."""
+        """Leave the code as it was translated."""
         self._finalized = True
-        if (step := getattr(self._codegen, "step", None)) is not None:
-            step("function")
 
     def get_pointer_to_function(self, _: str) -> int:
         """Return no address: the code is not called in this process."""
@@ -108,10 +99,6 @@ class _Codegen(codegen.AOTCPUCodegen):
     """Creates the libraries above."""
 
     _library_class = _Library
-
-    def __init__(self, name: str, step: Step | None) -> None:
-        self.step = step
-        super().__init__(name)  # type: ignore[no-untyped-call]
 
     def set_env(self, env_name: str, env: object) -> None:
         """Ignore the environment, which only code with Python objects needs."""

@@ -1,9 +1,8 @@
-"""Kill a recorder at random times, and cut recordings at every byte: the rest must be readable.
+"""Kill a recorder at random times: its recordings must be readable.
 
 A child process records frames and fused samples at a true rate until it is killed (SIGKILL). Then
 its files are read: all records must be present in order from the first one on, only the truncated
-end may be damaged, and at most the last second may be missing. Then one small recording is cut
-after each of its bytes, and every prefix must be readable and contain all of its complete records.
+end may be damaged, and at most the last second may be missing.
 
 A second means the data that the child records in one, which may take longer on a busy machine.
 Syncs to its disk never end: a kill loses only data that was not yet passed to the kernel. If even
@@ -43,7 +42,6 @@ RATE_HZ = 200
 LONGEST_S = 3.0
 SHORTEST_S = 0.3
 MAX_LOST_S = 1.0
-CUT_BYTES = 2000
 NUMBERS = struct.Struct("QQ")
 """Data shared with a child: its samples, and the recorder's size of its larger file."""
 PATIENCE_S = 240.0
@@ -136,22 +134,8 @@ def check_table(data: bytes) -> None:
         assert row.time_us == number * 1000, f"row of {row.time_us} µs at place {number}"
 
 
-def cut_everywhere(folder: Path) -> tuple[int, int]:
-    """Cut the longest recording of the killed recorders after each of its first bytes."""
-    longest = [
-        max(folder.rglob(pattern), key=lambda path: path.stat().st_size)
-        for pattern in ("*.tlog", "*.csv")
-    ]
-    tlog, table = (path.read_bytes()[:CUT_BYTES] for path in longest)
-    for size in range(len(tlog)):
-        check_tlog(tlog[:size])
-    for size in range(len(table)):
-        check_table(table[:size])
-    return len(tlog), len(table)
-
-
 def main() -> None:
-    """Kill, cut, and print the result."""
+    """Kill, and print the result."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
@@ -165,10 +149,8 @@ def main() -> None:
         for number, life_s in enumerate(lives_s.tolist()):
             folder = Path(name) / str(number)
             lost_s.append(kill_one(folder, life_s))
-        tlog_cuts, table_cuts = cut_everywhere(Path(name))
     print(f"{args.kills} kills: every recording opens, only the cut end is damaged")
     print(f"lost: mean {np.mean(lost_s):.3f} s, most {max(lost_s):.3f} s")
-    print(f"cut at every byte: {tlog_cuts} prefixes of a tlog, {table_cuts} of a table, all open")
     if max(lost_s) > MAX_LOST_S and not args.any_loss:
         sys.exit(f"more than {MAX_LOST_S} s lost")
 

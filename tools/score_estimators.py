@@ -12,8 +12,6 @@ samples processed in a second, and the largest error 20 s after each disturbance
 `tools.spoil_flight` (--spoilt).
 """
 
-import argparse
-import json
 import math
 import time
 import warnings
@@ -25,7 +23,6 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
@@ -45,6 +42,7 @@ from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.estimation.smoother import smooth
 from gateway.geometry.angle import wrap_180, wrap_pi
 from tools.flights import Flight, north_east_m, read_flight, run_paper, simulated_flight
+from tools.harness import arguments, show, write_json
 from tools.peers import PEERS
 from tools.spoil_flight import RECOVERY_S, SPOILS, applies
 
@@ -67,6 +65,7 @@ ATTITUDE = ("roll", "pitch", "yaw", "total", "inclination", "heading", "turns")
 POSITION = ("pos", "pos_1hz", "out10", "out30", "alt", "alt_max", "climb")
 SHARES = ("tilt_2s", "heading_2s", "pos_2s", "alt_2s")
 SPEED = "million_per_s"
+COLUMNS = (*ATTITUDE, *POSITION, *SHARES, SPEED)
 
 
 def estimator_of(flight: Flight) -> KernelEstimator:
@@ -350,44 +349,26 @@ def geometric_means(board: dict[str, dict[str, Scores]], base: str) -> dict[str,
     return means
 
 
-def show(board: dict[str, dict[str, Scores]], base: str) -> None:
-    """Print one table."""
-    columns = (*ATTITUDE, *POSITION, *SHARES, SPEED)
-    table = Table("flight", "estimator", *columns, box=None, pad_edge=False)
-
-    def add(flight: str, name: str, scores: Scores) -> None:
-        cells = []
-        for key in columns:
-            value = scores.get(key, math.nan)
-            digits = f"{100 * value:.0f} %" if key in SHARES else f"{value:.2f}"
-            cells.append(digits if math.isfinite(value) else "")
-        table.add_row(flight, name, *cells)
-
-    for flight, scores in board.items():
-        for name, found in scores.items():
-            add(flight, name, found)
-    for name, found in geometric_means(board, base).items():
-        add(f"geometric mean, {base} = 1", name, found)
-    Console(width=250).print(table)
+def rows_of(board: dict[str, dict[str, Scores]], base: str) -> Iterator[tuple[object, ...]]:
+    """Yield the rows of a table, shares in percent, the geometric means last."""
+    means = {f"geometric mean, {base} = 1": geometric_means(board, base)}
+    for flight, by_name in (board | means).items():
+        for name, scores in by_name.items():
+            values = [(100 if key in SHARES else 1) * scores.get(key, math.nan) for key in COLUMNS]
+            yield flight, name, *values
 
 
 def main() -> None:
     """Read, run, print."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = arguments(__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of *.csv.gz flights")
     parser.add_argument("--only", action="append", help="flights whose names contain this")
-    parser.add_argument("--json", type=Path, help="write all numbers here too")
-    parser.add_argument(
-        "--estimator", action="append", choices=OWN | PEERS, help="run only this one"
-    )
+    parser.add_argument("--estimator", action="append", choices=OWN | PEERS, help="run only these")
     parser.add_argument("--spoilt", action="store_true", help="score the disturbed flights too")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    runs = {
-        name: run
-        for name, run in (OWN | PEERS).items()
-        if name in (options.estimator or OWN | PEERS)
-    }
+    known = OWN | PEERS
+    runs = {name: known[name] for name in known if name in (options.estimator or known)}
     board: dict[str, dict[str, Scores]] = {}
     spoilt: dict[str, dict[str, Scores]] = {}
     flights = list(flights_to_score(options.data, options.only))
@@ -399,11 +380,12 @@ def main() -> None:
         }
         if options.spoilt:
             spoilt[flight.name] = spoilt_scores(flight, run_eskf)
-    show(board, next(iter(runs)))
+    heads = ("flight", "estimator", *COLUMNS)
+    show("scores", heads, rows_of(board, next(iter(runs))))
     for name, ways in spoilt.items():
-        show({f"{name} {how}": {"eskf": scores} for how, scores in ways.items()}, "eskf")
-    if options.json:
-        options.json.write_text(json.dumps({"flights": board, "spoilt": spoilt}, indent=1))
+        by_way: dict[str, dict[str, Scores]] = {how: {"eskf": each} for how, each in ways.items()}
+        show(f"disturbances of {name}", heads, rows_of(by_way, "eskf"))
+    write_json(options, {"flights": board, "spoilt": spoilt})
 
 
 if __name__ == "__main__":
