@@ -9,10 +9,13 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
+from enum import Enum
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 import hypothesis
+import msgspec
 import numpy as np
 import pytest
 
@@ -26,6 +29,8 @@ USERS_OWN = (
 """Variables that name a user's folders, or mark a process as a service."""
 
 ROOT = Path(__file__).resolve().parent.parent
+LONGEST_ID = 80
+"""Maximum characters of a value in the name of a case."""
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
@@ -41,6 +46,35 @@ def pytest_configure() -> None:
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         # A handler is not inherited by a new program; an ignored signal is.
         signal.signal(signal.SIGHUP, lambda *_: None)
+
+
+def pytest_make_parametrize_id(val: object, argname: str) -> str | None:
+    """Name the cases of a test by the values, and numbers by their parameter too."""
+    if isinstance(val, bool):
+        return argname if val else f"not {argname}"
+    if isinstance(val, int | float) and not isinstance(val, Enum):
+        return f"{argname} {val}"
+    if isinstance(val, str | bytes):
+        return repr(val[:LONGEST_ID]) if len(val) > LONGEST_ID else None
+    return described(val)
+
+
+def described(value: object) -> str | None:
+    """Return a short text of a value that is the same in each worker, if there is one."""
+    if isinstance(value, msgspec.Struct):
+        value = {
+            field.name: here
+            for field in msgspec.structs.fields(value)
+            if (here := getattr(value, field.name)) != field.default
+        }
+    if isinstance(value, tuple | list | dict):
+        parts = value.items() if isinstance(value, dict) else value
+        texts = [described(part) for part in parts]
+        return None if None in texts else " ".join(map(str, texts))[:LONGEST_ID] or "empty"
+    if isinstance(value, str | bytes | int | float | Enum | NoneType):
+        return str(value)
+    # A function, a class, or a message of pymavlink.
+    return getattr(value, "__name__", None) or getattr(value, "msgname", None)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -76,22 +76,23 @@ def as_increments(flight: Flight, rate_hz: float) -> Flight:
     step_s = np.diff(log.imu_time_us, prepend=2 * log.imu_time_us[0] - log.imu_time_us[1]) * 1e-6
     every = max(1, round(1.0 / (rate_hz * float(np.median(step_s)))))
     ends = np.arange(every - 1, len(log.imu), every)
+    whole = len(ends) * every
+    parts = log.imu[:whole].reshape(len(ends), every, -1)
+    steps = step_s[:whole].reshape(len(ends), every, 1)
+    turned, velocity = Rotation.identity(len(ends)), np.zeros((len(ends), 3))
+    for k in range(every):
+        angle, gained = parts[:, k, 3:6] * steps[:, k], parts[:, k, 0:3] * steps[:, k]
+        velocity += (turned * Rotation.from_rotvec(0.5 * angle)).apply(gained)
+        turned = turned * Rotation.from_rotvec(angle)
+    half_way, span_s = Rotation.from_rotvec(0.5 * turned.as_rotvec()), steps.sum(axis=1)
     imu = log.imu[ends].copy()
-    for row, end in zip(imu, ends, strict=True):
-        part = slice(end - every + 1, end + 1)
-        steps, span_s = step_s[part, None], step_s[part].sum()
-        turned, velocity = Rotation.identity(), np.zeros(3)
-        for angle, gained in zip(
-            log.imu[part, 3:6] * steps, log.imu[part, 0:3] * steps, strict=True
-        ):
-            velocity += (turned * Rotation.from_rotvec(0.5 * angle)).apply(gained)
-            turned = turned * Rotation.from_rotvec(angle)
-        half_way = Rotation.from_rotvec(0.5 * turned.as_rotvec())
-        row[0:3] = half_way.inv().apply(velocity) / span_s
-        row[3:6] = turned.as_rotvec() / span_s
-        fields = log.imu[part, 6:size]
-        row[MEANS] = 1.0
-        row[6:size] = next((field for field in fields[::-1] if np.isfinite(field[0])), np.nan)
+    imu[:, 0:3] = half_way.inv().apply(velocity) / span_s
+    imu[:, 3:6] = turned.as_rotvec() / span_s
+    imu[:, MEANS] = 1.0
+    known = np.isfinite(parts[:, :, 6])
+    newest = every - 1 - np.argmax(known[:, ::-1], axis=1)
+    imu[:, 6:size] = parts[np.arange(len(ends)), newest, 6:size]
+    imu[~known.any(axis=1), 6:size] = np.nan
     return replace(
         flight,
         log=replace(log, imu_time_us=log.imu_time_us[ends], imu=imu),

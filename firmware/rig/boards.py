@@ -62,7 +62,7 @@ class Setup:
     loss: float = 0.0
     noise: float = 0.0
     world: World = field(default_factory=World)
-    build: Path = FIRMWARE / "build"
+    build: Path = FIRMWARE / "build" / "nrf24_16mhz"
     frequency_hz: int = 16_000_000
     gps_computing_s: float = COMPUTING_S
     parts: Parts = field(default_factory=Parts)

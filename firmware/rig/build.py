@@ -59,8 +59,9 @@ def build(
     """
     if missing := missing_tools():
         raise BuildError(f"{', '.join(missing)} not found: apt-get install {PACKAGES}")
-    folder = _BUILD
-    if settings or frequency_hz != 16_000_000 or radio != "nrf24":
+    # As `make images` names it, so that neither builds again.
+    folder = _BUILD / f"{radio}_{frequency_hz // 1_000_000}mhz"
+    if settings:
         name = hashlib.sha256(f"{settings} {frequency_hz} {radio}".encode()).hexdigest()[:12]
         folder = _BUILD / f"variant-{name}"
     options = (f"SETTINGS={settings}", f"F_CPU={frequency_hz}UL", f"RADIO={radio}")

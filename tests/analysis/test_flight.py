@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -99,12 +100,16 @@ def recorded(*, raw: bool, calibration: NodeCalibration | None = None) -> Flight
 
 def rows(*, raw: bool) -> list[TableRow]:
     """Rows as the recorder writes them, with states."""
+    return list(_rows()) if raw else [replace(row, raw=None) for row in _rows()]
+
+
+@cache
+def _rows() -> tuple[TableRow, ...]:
     estimation = short_case().fusion.estimation
     calibration = ideal_calibration(SIMULATED.errors)
     settings = AircraftSettings(estimation=estimation, calibration=calibration)
     lines, _ = record(Pipeline(PipelineSettings(settings)), [*SIMULATED.records()])
-    found = [line for line in lines if isinstance(line, TableRow)]
-    return found if raw else [replace(row, raw=None) for row in found]
+    return tuple(line for line in lines if isinstance(line, TableRow))
 
 
 @pytest.mark.parametrize("raw", [True, False])

@@ -1,7 +1,7 @@
 """Every chip that a board may carry under the name of another, and how it is reported."""
 
 import math
-from itertools import cycle, product
+from itertools import cycle, pairwise, product
 
 import pytest
 
@@ -257,12 +257,13 @@ def test_no_fix_is_reported_and_sent_on(gps_rig: MakeRig, name: str) -> None:
     assert (quality.h_acc_cm, quality.utc, rig.sensors[1]) == (65_535, None, 0)
 
 
-WORKING_RADIOS = ("nRF24L01+", "nRF24L01", "Si24R1", "clone with ACTIVATE")
+RADIO, CLONES = "nRF24L01+", ("nRF24L01", "Si24R1", "clone with ACTIVATE")
 ACTIVATED = {"nRF24L01", "clone with ACTIVATE"}
+RADIO_PAIRS = [(RADIO, RADIO), *product(CLONES, [RADIO]), *product([RADIO], CLONES),
+               *pairwise([*CLONES, CLONES[0]])]  # fmt: skip
 
 
-@pytest.mark.parametrize("receiver", WORKING_RADIOS)
-@pytest.mark.parametrize("node", WORKING_RADIOS)
+@pytest.mark.parametrize(("receiver", "node"), RADIO_PAIRS)
 def test_radio_clones_work_with_one_another(imu_rig: MakeRig, receiver: str, node: str) -> None:
     rig, _ = imu_rig(1.4, parts=Parts(radio=receiver, node_radio=node))
     assert len(rig.payloads(ImuPayload, since_s=1.0)) == pytest.approx(40, abs=3)

@@ -1,6 +1,7 @@
 """Small recordings: MAVLink frames, the records of a tlog, and files of both formats."""
 
 from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,12 @@ Sent = Iterable[tuple[tuple[int, int], Any]]
 
 def make_frames(count: int, system_id: int = 1) -> list[bytes]:
     """Pack a row of messages of changing kind and size."""
-    sender, frames = Sender(system_id), []
+    return list(_frames(count, system_id))
+
+
+@cache
+def _frames(count: int, system_id: int) -> tuple[bytes, ...]:
+    sender, frames = Sender(system_id), list[bytes]()
     for i in range(count):
         message = (
             mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3),
@@ -35,7 +41,7 @@ def make_frames(count: int, system_id: int = 1) -> list[bytes]:
             mavlink.MAVLink_statustext_message(6, f"number {i}".encode()),
         )[i % 3]
         frames.append(sender.pack(message))
-    return frames
+    return tuple(frames)
 
 
 def make_records(count: int, system_id: int = 1) -> list[RecordedFrame]:
