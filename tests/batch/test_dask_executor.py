@@ -12,12 +12,12 @@ import pytest
 from gateway.batch.executors import ClusterError, DaskCluster, WorkFailed
 from tests.kit.cli import run
 
-distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.io
 
 
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
+    distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1",
         dashboard_address="127.0.0.1:0", silence_logs=50,

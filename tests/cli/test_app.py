@@ -49,12 +49,13 @@ def leaves_of(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, ...]]
         yield from leaves_of(below, (*words, name))
 
 
-ALL = [words for name in COMMANDS for words in leaves_of(load_command(name), (name,))]
+def all_commands() -> list[tuple[str, ...]]:
+    return [words for name in COMMANDS for words in leaves_of(load_command(name), (name,))]
 
 
 @pytest.mark.parametrize("option", ["-h", "--help"])
 def test_every_command_and_group_shows_its_help(option: str) -> None:
-    for words in ((), *ALL):
+    for words in ((), *all_commands()):
         assert "Usage: " in invoke(*words, option, code=0).output, words
 
 

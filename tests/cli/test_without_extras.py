@@ -9,7 +9,7 @@ import pytest
 from gateway.cli.app import COMMANDS
 from gateway.cli.live.doctor import EXTRA_USES
 from gateway.extras import EXTRAS
-from tests.cli.test_app import ALL
+from tests.cli.test_app import all_commands
 from tests.kit.process import python
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -35,7 +35,6 @@ print(json.dumps(found))
 """
 
 
-LEAVES = [" ".join(words) for words in ALL if not any(words == other[:-1] for other in ALL)]
 ENDLESS = {"run", "demo"}
 """They serve until they are interrupted."""
 
@@ -43,7 +42,9 @@ ENDLESS = {"run", "demo"}
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("home")
-    lines = [*NEEDS, *(leaf for leaf in LEAVES if leaf not in ENDLESS)]
+    words = all_commands()
+    leaves = {" ".join(each) for each in words if not any(each == other[:-1] for other in words)}
+    lines = [*NEEDS, *sorted(leaves - ENDLESS)]
     blocked = [module for modules in EXTRAS.values() for module in modules]
     env = {"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder), "PATH": "/usr/bin:/bin"}
     program = PROGRAM.format(blocked=blocked, lines=lines)

@@ -5,19 +5,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 import httpx
-import pytest
 from fastapi import FastAPI
 from starlette.types import Receive, Scope, Send
 
-from gateway.panel import logins
 from gateway.panel.access import ROLE
 from gateway.panel.admission import Role
-from gateway.panel.panel_settings import LEAST_COST
 
-with pytest.MonkeyPatch.context() as patch:
-    # A hash contains its cost: checking these takes half of the time.
-    patch.setattr(logins, "COST", LEAST_COST)
-    OPERATOR, VIEWER = logins.hash_password("tower"), logins.hash_password("guest")
+OPERATOR = (
+    "scrypt$16384$6Gty0H0vHneGTO2S7azMDQ==$iiC0+hQH4sjVNjJatPWodxe2NbV/Fi9BXA3cxE57o6fn9SorAf3isZ/h"
+    "F4bDm2vFKiVSAQV37v3tjzesv0oReA=="
+)
+VIEWER = (
+    "scrypt$16384$SH6f7l4chnSfqtlBYZFqtA==$xJF6gX66vfuLuWuseaDQ3s3NvqjB7UMbX1OouRVfGCiwNf/+g1J2mWP9"
+    "mZx4tw39SW/xQrLtW3dPwKJTQQ2Jmw=="
+)
+"""Hashes of the passwords "tower" and "guest", of the least cost."""
 
 
 def client_of(serve: Callable[[FastAPI], object], role: Role = Role.OPERATOR) -> httpx.AsyncClient:

@@ -1,6 +1,5 @@
 import math
 import random
-from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -45,14 +44,14 @@ def test_numbers_beyond_their_fields_are_saturated(value: float) -> None:
     assert found.q[:2] == pytest.approx([hud.alt, 0.5], nan_ok=True), "item by item"
 
 
-@pytest.mark.parametrize("kind", mavlink.mavlink_map.values(), ids=lambda kind: kind.msgname)
-def test_every_message_of_the_dialect_is_framed_as_pymavlink_does(kind: Any) -> None:
-    chance, plain, ours = random.Random(kind.id), mavlink.MAVLink(None, 7, 1), Encoder(7)
-    for _ in range(8):
-        message = random_message(kind, chance)
-        expected = message.pack(plain)
-        plain.seq += 1
-        assert ours.encode(message).frame == expected
+def test_every_message_of_the_dialect_is_framed_as_pymavlink_does() -> None:
+    for kind in mavlink.mavlink_map.values():
+        chance, plain, ours = random.Random(kind.id), mavlink.MAVLink(None, 7, 1), Encoder(7)
+        for _ in range(8):
+            message = random_message(kind, chance)
+            expected = message.pack(plain)
+            plain.seq += 1
+            assert ours.encode(message).frame == expected, kind.msgname
 
 
 KINDS = mavlink.mavlink_map.values()

@@ -141,12 +141,11 @@ def test_unknown_message_is_not_edited() -> None:
         assert edit_frame(UNKNOWN, system=9, drop_signature=drop_signature) is None
 
 
-@pytest.mark.parametrize("message_id", sorted(mavlink.mavlink_map))
-def test_layout_has_the_offsets_of_the_dialect(message_id: int) -> None:
-    kind = mavlink.mavlink_map[message_id]
-    layout = layout_of(message_id)
-    assert layout.itemsize == kind.unpacker.size
-    assert list(layout.names or ()) == kind.ordered_fieldnames
+def test_layouts_have_the_offsets_of_the_dialect() -> None:
+    for message_id, kind in mavlink.mavlink_map.items():
+        layout = layout_of(message_id)
+        assert layout.itemsize == kind.unpacker.size, kind.msgname
+        assert list(layout.names or ()) == kind.ordered_fieldnames, kind.msgname
 
 
 @pytest.mark.parametrize("message_id", [300, 397, 512])
