@@ -12,11 +12,12 @@ two thousand items) fit into a full bucket; the rate matters only after that.
 """
 
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Final
 
 from gateway.records import Incoming
-from gateway.token_bucket import TokenBucket
+from gateway.token_bucket import ClientQuotas, TokenBucket
 
 REQUEST_COST: Final = 200
 """Cost of a request, bytes: reading and answering it takes as long as sending this many."""
@@ -32,69 +33,55 @@ SLACK_SHIFT: Final = 2
 """A limited frame may be a quarter of its interval early, or jitter would halve the rate."""
 
 
-@dataclass(slots=True, eq=False)
-class _Line:
-    """Waiting requests of one client."""
-
-    bucket: TokenBucket
-    waiting: deque[Incoming] = field(default_factory=deque)
-
-
 class RequestQueue:
     """Requests of all clients, served in turn and within each client's quota."""
 
     def __init__(self) -> None:
-        self._lines: dict[int, _Line] = {}
-        self._turns: dict[int, _Line] = {}
-        """Clients with waiting requests; the first was served longest ago."""
-        self._untrusted = TokenBucket(UNTRUSTED_RATE, UNTRUSTED_BURST)
+        self._quotas = ClientQuotas(CLIENT_RATE, CLIENT_BURST, UNTRUSTED_RATE, UNTRUSTED_BURST)
+        self._waiting: dict[int, deque[Incoming]] = {}
+        """Waiting requests by client; the first client was served longest ago."""
 
     def offer(self, incoming: Incoming, now_us: int) -> bool:
         """Queue a request; return whether there was room."""
-        line = self._lines.get(incoming.client_id)
-        if line is None or (line.bucket is self._untrusted) == incoming.trusted:
-            bucket = self._untrusted
-            if incoming.trusted:
-                bucket = TokenBucket(CLIENT_RATE, CLIENT_BURST, now_us)
-            line = self._lines[incoming.client_id] = _Line(bucket)
-            self._turns.pop(incoming.client_id, None)
-        if len(line.waiting) >= MAX_WAITING:
+        self._quotas.of(incoming.client_id, now_us, trusted=incoming.trusted)
+        waiting = self._waiting.setdefault(incoming.client_id, deque())
+        if len(waiting) >= MAX_WAITING:
             return False
-        line.waiting.append(incoming)
-        self._turns.setdefault(incoming.client_id, line)
+        waiting.append(incoming)
         return True
 
     def take(self, now_us: int) -> Incoming | None:
         """Return the next request; None if no client with quota left has one."""
-        for line in self._turns.values():
-            line.bucket.refill(now_us)
-            if line.bucket.level > 0:
-                return self._take_of(line)
+        for client_id, bucket in self._buckets(now_us):
+            if bucket.level > 0:
+                bucket.level -= REQUEST_COST
+                waiting = self._waiting.pop(client_id)
+                incoming = waiting.popleft()
+                if waiting:
+                    self._waiting[client_id] = waiting
+                return incoming
         return None
 
     def wait_us(self, now_us: int) -> int | None:
         """Return the time until `take` returns a request; None if the queue is empty."""
-        for line in self._turns.values():
-            line.bucket.refill(now_us)
-        return min((line.bucket.wait_us() for line in self._turns.values()), default=None)
+        return min((bucket.wait_us() for _, bucket in self._buckets(now_us)), default=None)
 
     def charge(self, client_id: int, size: int) -> None:
         """Charge a client for bytes that were sent because of it."""
-        if line := self._lines.get(client_id):
-            line.bucket.level -= size
+        if bucket := self._quotas.known(client_id):
+            bucket.level -= size
 
     def remove(self, client_id: int) -> None:
-        """Drop the requests of a client that has gone; a shared bucket keeps its level."""
-        self._lines.pop(client_id, None)
-        self._turns.pop(client_id, None)
+        """Drop the requests of a client that has gone."""
+        self._quotas.remove_client(client_id)
+        self._waiting.pop(client_id, None)
 
-    def _take_of(self, line: _Line) -> Incoming:
-        incoming = line.waiting.popleft()
-        del self._turns[incoming.client_id]
-        if line.waiting:
-            self._turns[incoming.client_id] = line
-        line.bucket.level -= REQUEST_COST
-        return incoming
+    def _buckets(self, now_us: int) -> Iterator[tuple[int, TokenBucket]]:
+        """Yield the clients with waiting requests in turn, each with its refilled bucket."""
+        for client_id in self._waiting:
+            if bucket := self._quotas.known(client_id):
+                bucket.refill(now_us)
+                yield client_id, bucket
 
 
 @dataclass(slots=True)

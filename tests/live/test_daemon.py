@@ -21,7 +21,8 @@ from gateway.live import daemon as daemon_module
 from gateway.live.control_socket import ControlError, request, socket_path
 from gateway.live.daemon import Daemon
 from gateway.live.kept_files import TIMESTAMPS_NAME
-from gateway.live.recording_budget import BURST_S, UNTRUSTED_RATE
+from gateway.live.operation import Operation
+from gateway.live.recorded_traffic import BURST_S, UNTRUSTED_RATE
 from gateway.live.serial_port import SerialSettings
 from gateway.live.service import ServiceNotifier
 from gateway.live.session import RecordingSettings
@@ -254,7 +255,7 @@ async def test_due_time_is_polled_neither_without_pause_nor_too_late(
     call_later = loop.call_later
 
     def note(delay_s: float, callback: Any, *words: Any) -> asyncio.TimerHandle:
-        if getattr(callback, "__self__", None) is running.daemon:
+        if isinstance(getattr(callback, "__self__", None), Operation):
             delays.append(delay_s)
         return call_later(delay_s, callback, *words)
 

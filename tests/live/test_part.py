@@ -2,15 +2,22 @@
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import pytest
+from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.live.recording_budget import BURST_S, TRUSTED_RATE, UNTRUSTED_RATE, RecordingBudget
+from gateway.live.recorded_traffic import BURST_S, TRUSTED_RATE, UNTRUSTED_RATE, RecordedTraffic
 from gateway.live.restamper import STEP, clear_copies, shift_times
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogScanner
+from gateway.records import Incoming, Outgoing
 from tests.kit.faults import SlowDisk
+from tests.kit.mavlink import packed
 from tests.kit.recordings import make_records, make_tlog
+
+if TYPE_CHECKING:
+    from gateway.live.recorder import Recorder
 
 pytestmark = pytest.mark.io
 
@@ -18,40 +25,73 @@ pytestmark = pytest.mark.io
 SECOND_US = 1_000_000
 
 
-def taken(budget: RecordingBudget, clients: list[int], seconds: int, size: int = 500) -> int:
-    """Let clients send 2 MB/s each; return the bytes that are recorded."""
-    total = 0
+class Bytes:
+    """A recorder that counts the bytes of the frames that it gets."""
+
+    count = 0
+
+    def frame(self, frame: bytes) -> None:
+        self.count += len(frame)
+
+
+def taken(traffic: RecordedTraffic, recorder: Bytes, clients: dict[int, bool], seconds: int) -> int:
+    """Let clients, trusted or not, send 2 MB/s each; return the bytes that are recorded."""
+    before = recorder.count
+    frame = packed(mavlink.MAVLink_statustext_message(6, b"x" * 50))
     for step in range(seconds * 100):
-        for client_id in clients:
-            for _ in range(20_000 // size):
-                total += size * budget.allows(client_id, size, step * SECOND_US // 100)
-    return total
+        for client_id, trusted in clients.items():
+            incoming = Incoming(client_id, frame, trusted)
+            for _ in range(20_000 // len(frame)):
+                traffic.received(incoming, step * SECOND_US // 100, had_effect=True)
+    return recorder.count - before
 
 
-def test_untrusted_clients_share_one_small_budget_and_a_trusted_one_has_its_own() -> None:
-    for clients in ([1], [1, 2, 3]):
-        budget = RecordingBudget()
-        budget.note(7, 0, trusted=True)
-        for client_id in clients:
-            budget.note(client_id, 0, trusted=False)
-        assert taken(budget, clients, 10) <= UNTRUSTED_RATE * (BURST_S + 10), clients
-        assert TRUSTED_RATE * BURST_S <= taken(budget, [7], 5) <= TRUSTED_RATE * (BURST_S + 5)
+@pytest.fixture
+def recorder() -> Bytes:
+    return Bytes()
 
 
-def test_ground_station_at_its_usual_rate_is_recorded_completely() -> None:
-    budget = RecordingBudget()
-    budget.note(1, 0, trusted=True)
-    assert all(budget.allows(1, 280, n * SECOND_US // 200) for n in range(20_000))
+@pytest.fixture
+def traffic(recorder: Bytes) -> RecordedTraffic:
+    return RecordedTraffic(cast("Recorder", recorder))
 
 
-def test_client_that_loses_trust_or_leaves_loses_its_own_budget() -> None:
-    budget = RecordingBudget()
-    for trusted in (True, False):
-        budget.note(1, 0, trusted=trusted)
-    assert taken(budget, [1], 1) <= UNTRUSTED_RATE * (BURST_S + 1)
-    budget.note(2, 0, trusted=True)
-    budget.remove_client(2)
-    assert not budget.allows(2, 60_000, SECOND_US)
+@pytest.mark.parametrize("clients", [[1], [1, 2, 3]], ids=["one", "three"])
+def test_untrusted_clients_share_one_small_budget_and_a_trusted_one_has_its_own(
+    traffic: RecordedTraffic, recorder: Bytes, clients: list[int]
+) -> None:
+    untrusted = dict.fromkeys(clients, False)
+    assert taken(traffic, recorder, untrusted, 10) <= UNTRUSTED_RATE * (BURST_S + 10)
+    found = taken(traffic, recorder, {7: True}, 5)
+    assert TRUSTED_RATE * (BURST_S - 1) <= found <= TRUSTED_RATE * (BURST_S + 5)
+
+
+def test_ground_station_at_its_usual_rate_is_recorded_completely(
+    traffic: RecordedTraffic, recorder: Bytes
+) -> None:
+    frame = bytes(280)
+    for n in range(20_000):
+        traffic.received(Incoming(1, frame, True), n * SECOND_US // 200, had_effect=False)
+    assert recorder.count == 20_000 * len(frame)
+
+
+def test_client_that_loses_trust_or_leaves_loses_its_own_budget(
+    traffic: RecordedTraffic, recorder: Bytes
+) -> None:
+    traffic.quotas.of(1, 0, trusted=True)
+    assert taken(traffic, recorder, {1: False}, 1) <= UNTRUSTED_RATE * (BURST_S + 1)
+    traffic.quotas.of(2, 0, trusted=True)
+    traffic.quotas.remove_client(2)
+    before = recorder.count
+    traffic.sent(Outgoing(bytes(60_000), 1, 2), SECOND_US)
+    assert recorder.count == before
+
+
+def test_key_of_signing_is_not_recorded(traffic: RecordedTraffic, recorder: Bytes) -> None:
+    secret = packed(mavlink.MAVLink_setup_signing_message(1, 1, [*range(32)], 1))
+    traffic.received(Incoming(1, secret, True), 0, had_effect=True)
+    traffic.forwarded((secret,))
+    assert recorder.count == 0
 
 
 SHIFT_US = 5_000_000
