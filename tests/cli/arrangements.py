@@ -96,6 +96,12 @@ def flight(folder: Path) -> None:
     (folder / "flight.csv").write_bytes(flown_table(20))
 
 
+def mixed(folder: Path) -> None:
+    """Write a tlog of systems 1, 2 and 7."""
+    found = [*make_records(90), *make_records(90, 2), *make_records(30, 7)]
+    write_tlog(folder / "a.tlog", sorted(found, key=lambda record: record.time_us))
+
+
 def half_minute(folder: Path, speed: str = "") -> None:
     """Write half a minute of flight, or of a receiver at rest."""
     made = rows(raw=False)
@@ -282,8 +288,8 @@ def turning(folder: Path) -> None:
 MAKE: dict[str, Callable[..., object]] = {
     made.__name__: made
     for made in (
-        log, odd_log, table, flight, short, half_minute, recordings, zipped, endless, introduced,
-        future, compared, mission, images, dataflash, empty_dataflash, dialect, turning,
+        log, odd_log, table, flight, mixed, short, half_minute, recordings, zipped, endless,
+        introduced, future, compared, mission, images, dataflash, empty_dataflash, dialect, turning,
         machines.link,
     )
 }  # fmt: skip

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mavsdk.asyncio import ComponentType
 from mavsdk.asyncio.plugins.component_metadata import (
     ComponentMetadataAsync,
     ComponentMetadataError,
@@ -27,11 +26,9 @@ from mavsdk.plugins.param import ParamError, ParamResult
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.end_to_end.processes import (
-    EXPECTED,
     HOME,
     NEAR_DEG,
     STEEPEST_DEG,
-    Client,
     Gateway,
     MavProxy,
     first_position,
@@ -108,15 +105,6 @@ def stations(gateway: Gateway) -> Iterator[Callable[..., Station]]:
     yield connect
     for station in opened:
         station.close()
-
-
-def test_every_message_arrives(gateway: Gateway, connect: Callable[..., Client]) -> None:
-    seen = connect(gateway.port).until(lambda seen: set(seen) >= EXPECTED)
-    heartbeat, position = seen["HEARTBEAT"], seen["GLOBAL_POSITION_INT"]
-    assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
-    assert heartbeat.autopilot == mavlink.MAV_AUTOPILOT_GENERIC
-    assert position.lat / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
-    assert position.lon / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
 
 
 def test_qgroundcontrol_start_up_is_answered(stations: Callable[..., Station]) -> None:
@@ -200,16 +188,6 @@ async def test_mavsdk_reads_local_position_altitude_odometry_and_imu(gateway: Ga
         assert origin.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=1e-3)
 
 
-async def test_mavsdk_companion_with_the_same_system_id_is_answered(gateway: Gateway) -> None:
-    """A companion computer is 1/191: the vehicle answers it as any other client."""
-
-    async with mavsdk_system(gateway.port, ComponentType.COMPANION_COMPUTER) as system:
-        info, telemetry = InfoAsync(system), TelemetryAsync(system)
-        version = await answered(info.get_version)
-        assert version.flight_sw_minor > 0
-        await answered(telemetry.set_rate_altitude, 5.0)
-
-
 def test_dronekit_uploads_and_downloads_a_mission(gateway: Gateway) -> None:
     """DroneKit knows only the older messages with floats."""
     dronekit = pytest.importorskip("dronekit")
@@ -251,23 +229,6 @@ async def test_mavsdk_reads_and_sets_parameters_within_their_ranges(gateway: Gat
         assert refused.value.result == ParamResult.VALUE_OUT_OF_RANGE
         with pytest.raises(ParamError):
             await answered(param.get_param_float, "NO_SUCH")
-
-
-async def test_mavsdk_moves_home_by_a_parameter(gateway: Gateway) -> None:
-    async with mavsdk_system(gateway.port) as system:
-        param = ParamAsync(system)
-        telemetry = TelemetryAsync(system)
-        homes = telemetry.subscribe_home()
-        before = await anext(homes)
-        await answered(param.set_param_float, "HOME_ALT", 432.5)
-        async for home in homes:
-            if home.absolute_altitude_m == pytest.approx(432.5, abs=0.01):
-                break
-        assert home.latitude_deg == before.latitude_deg
-        await answered(param.set_param_float, "HOME_SOURCE", 0.0)
-        async for home in homes:
-            if home.absolute_altitude_m != pytest.approx(432.5, abs=1.0):
-                break
 
 
 async def test_mavsdk_reads_the_parameters_metadata_over_ftp(gateway: Gateway) -> None:

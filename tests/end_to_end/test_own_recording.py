@@ -144,13 +144,6 @@ def test_maps_are_read_by_an_xml_parser(tlog: Path, tmp_path: Path, ending: str)
     assert all((e.text or "").strip() for e in leaves)
 
 
-def test_geojson_is_read_as_json(tlog: Path, tmp_path: Path) -> None:
-    found = json.loads(converted([tlog], tmp_path / "f.geojson").read_text())
-    lines = [f for f in found["features"] if f["properties"]["kind"] == "track"]
-    assert [line["properties"]["name"] for line in lines] == ["system 1", "system 2"]
-    assert all(line["geometry"]["type"] == "LineString" for line in lines)
-
-
 def test_mcap_is_read_by_its_library(tlog: Path, tmp_path: Path) -> None:
     path, topics, logs = converted([tlog], tmp_path / "f.mcap"), set(), []
     with path.open("rb") as file:
@@ -178,22 +171,6 @@ def test_every_record_is_read_by_mavlogdump(tlog: Path) -> None:
     dumped = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert len([line for line in dumped.splitlines() if " {" in line]) == len(batch)
     assert "BAD_DATA" not in dumped
-
-
-def test_tlog_is_written_as_it_is(tlog: Path, tmp_path: Path) -> None:
-    path = converted([tlog], tmp_path / "f.tlog")
-    assert path.read_bytes() == tlog.read_bytes()
-
-
-@pytest.mark.parametrize("ending", ["csv", "parquet"])
-def test_tables_of_tlog_and_of_table_are_written(
-    folder: Path, tlog: Path, tmp_path: Path, ending: str
-) -> None:
-    (table,) = folder.glob("*_01_v2.csv")
-    for source, options in ((tlog, ["--system", "1"]), (table, [])):
-        path = converted([source], tmp_path / f"f.{ending}", *options)
-        text = path.read_bytes()
-        assert (pq.read_table(path).num_rows if ending == "parquet" else text.count(b"\n")) > 50
 
 
 def test_summary_names_vehicles_and_gives_stations_no_distance(tlog: Path) -> None:
@@ -236,21 +213,6 @@ def test_tables_are_fused_again_and_recovered(folder: Path, tlog: Path, tmp_path
         assert kept.read_bytes() == file.read_bytes()
 
 
-def test_sweep_of_the_seconds_before_the_take_off_teaches_nothing(
-    folder: Path, tmp_path: Path
-) -> None:
-    *_, table = sorted(folder.glob("*_v1.csv"))
-    vary = ["--vary", "gps_latency_s=0,0.4", "--jobs", "1"]
-    done = invoke("sweep", table, *vary, "-o", tmp_path / "best.toml")
-    assert f"{table.name}: at rest throughout" in done.output
-
-
-def test_folder_is_evaluated_by_the_batch_command(folder: Path, tmp_path: Path) -> None:
-    invoke("report", "--quick", folder, "-o", tmp_path / "out", "--jobs", 1, code=0)
-    page = (tmp_path / "out" / "index.html").read_text()
-    assert all(table.name in page for table in folder.glob("*_01_v?.csv"))
-
-
 async def test_recording_is_played_in_the_panel(folder: Path, tlog: Path) -> None:
     fleet = FleetState()
     uplink = Uplink(None, fleet, ControlClient(None), GatewayClock())
@@ -271,16 +233,16 @@ async def test_recording_is_played_in_the_panel(folder: Path, tlog: Path) -> Non
             await player.communicate()
 
 
-def test_page_and_report_are_made(
+def test_page_and_reports_are_made(
     folder: Path, tlog: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One section stands for all of them, which take a minute to draw."""
     monkeypatch.setattr("gateway.analysis.reporting.compose.SECTIONS", (timing,))
     invoke("report", tlog, "-o", tmp_path / "f.html", "--quick", code=0)
     assert "<html" in (tmp_path / "f.html").read_text()[:500]
-    (table,) = folder.glob("*_01_v1.csv")
-    invoke("report", table, "-o", tmp_path / "report", "--quick", code=0)
-    assert list((tmp_path / "report").glob("*.html"))
+    invoke("report", "--quick", folder, "-o", tmp_path / "out", "--jobs", 1, code=0)
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert all(table.name in page for table in folder.glob("*_01_v?.csv"))
 
 
 def test_recording_is_played_as_fast_as_possible(tlog: Path, tmp_path: Path) -> None:

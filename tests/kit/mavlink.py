@@ -38,6 +38,19 @@ TIMESTAMP = 30_000_000_000_000
 """Signing timestamp at which the time of `signer` begins, and that of `strict` ends."""
 
 
+KIND = {kind.msgname: kind for kind in every_dialect.mavlink_map.values()}
+
+
+def message_of(name: str, **fields: Any) -> Any:
+    """Return a message by its name; fields that are not given are zero or empty."""
+    kind = KIND[name]
+    lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
+    for field, form in zip(kind.fieldnames, kind.fieldtypes, strict=True):
+        empty = b"" if form == "char" else [0] * lengths[field] if lengths[field] else 0
+        fields.setdefault(field, empty)
+    return kind(**fields)
+
+
 def packed(
     message: Any,
     system: int = 1,

@@ -5,6 +5,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from tests.kit.mavlink import message_of
+
 HERE = (47.397_742_0, -8.545_594_1, 488.13)
 """Latitude, longitude and height AMSL in m."""
 
@@ -31,10 +33,26 @@ def gps(kind: int = 3, satellites: int = 11, ellipsoid_m: float = HERE[2] + 47.5
 
 
 def home(lat_deg: float, lon_deg: float, alt_m: float) -> Any:
-    return mavlink.MAVLink_home_position_message(
-        round(lat_deg * 1e7), round(lon_deg * 1e7), round(alt_m * 1e3),
-        0, 0, 0, [1, 0, 0, 0], 0, 0, 0,
+    return message_of(
+        "HOME_POSITION", latitude=round(lat_deg * 1e7), longitude=round(lon_deg * 1e7),
+        altitude=round(alt_m * 1e3), q=[1, 0, 0, 0],
     )  # fmt: skip
+
+
+def text(words: str | bytes, severity: int = 4, number: int = 0, chunk: int = 0) -> Any:
+    data = words.encode() if isinstance(words, str) else words
+    return mavlink.MAVLink_statustext_message(severity, data, number, chunk)
+
+
+def chunks(words: str, severity: int = 4, number: int = 9) -> list[Any]:
+    """Return the texts that a long one is sent as."""
+    data = words.encode()
+    parts = [data[at : at + 50] for at in range(0, len(data) + (len(data) % 50 == 0), 50)]
+    return [text(part, severity, number, chunk) for chunk, part in enumerate(parts)]
+
+
+def attitude(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0, **known: float) -> Any:
+    return message_of("ATTITUDE", roll=roll, pitch=pitch, yaw=yaw, **known)
 
 
 def estimator(flags: int) -> Any:

@@ -1,4 +1,7 @@
-"""Payloads of the radio, read and written as the receiver's line brings them."""
+"""Payloads of the radio, read and written as the receiver's line brings them; frames of LTM."""
+
+from functools import reduce
+from operator import xor
 
 from gateway.records import NodeId
 from gateway.wire.framing import Fault, encode_frame
@@ -22,6 +25,10 @@ def decode_payload(data: bytes) -> tuple[Header, Payload] | Fault:
         return Fault(frame.kind, frame.size - len(content) + len(data))
     assert hasattr(frame, "payload")
     return frame.header, frame.payload
+
+
+def ltm(kind: bytes, payload: bytes) -> bytes:
+    return b"$T" + kind + payload + bytes([reduce(xor, payload, 0)])
 
 
 class Tracker:

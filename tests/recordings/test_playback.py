@@ -1,6 +1,7 @@
 """The player keeps time on a clock that the test moves."""
 
 import math
+from typing import Any
 
 import pytest
 
@@ -22,18 +23,13 @@ MANY = 10_000
 RECORDS = make_records(100)
 FRAMES = [record.frame for record in RECORDS]
 SPAN_US = 99 * STEP_US
+ALL = range(100)
 
 
 def make_player(
     records: list[RecordedFrame] = RECORDS, now_us: int = 0, **options: object
 ) -> Player:
     return Player([make_track(make_tlog(records))], now_us, **options)
-
-
-@pytest.fixture
-def clip() -> Player:
-    """Return a player of a part of the recording."""
-    return make_player(begin_us=START_US + 10 * STEP_US, end_us=START_US + 20 * STEP_US)
 
 
 def play_to_end(player: Player, now_us: int = 0) -> list[tuple[int, bytes]]:
@@ -53,11 +49,85 @@ def test_every_frame_is_played_at_its_time(speed: float) -> None:
     ]
 
 
-def test_infinite_speed_keeps_the_limit_of_frames_per_poll() -> None:
-    player = make_player(speed=math.inf)
-    assert player.poll(0, 30) == FRAMES[:30]
-    assert [frame for _, frame in play_to_end(player)] == FRAMES[30:]
-    assert player.state is PlayState.ENDED
+PART: dict[str, Any] = {"begin_us": START_US + 10 * STEP_US, "end_us": START_US + 20 * STEP_US}
+Script = list[tuple[str, Any, Any]]
+"""A verb, its time or position in intervals of the recording, and the numbers of the frames that
+come, the next due time, or the position."""
+SCRIPTS: dict[str, tuple[dict[str, Any], Script]] = {
+    "an infinite speed keeps the limit of frames per poll": (
+        {"speed": math.inf}, [("thirty", 0, range(30)), ("end", 0, range(30, 100))],
+    ),
+    "a late poll returns all due frames": ({}, [("poll", 10, range(11)), ("due", 0, 11)]),
+    "a pause stops the clock": ({}, [
+        ("poll", 0, [0]), ("pause", 0.5, ()), ("due", 0, None), ("poll", 10, ()),
+        ("resume", 10, ()), ("due", 0, 10.5),
+    ]),
+    "a step plays a number of frames and pauses": ({}, [
+        ("step", 1, [0]), ("step", 3, [1, 2, 3]), ("due", 0, None), ("resume", 2, ()),
+        ("due", 0, 3), ("step", MANY, range(4, 100)), ("step", 1, ()),
+    ]),
+    "the speed changes from the present position": ({}, [
+        ("poll", 0, [0]), ("double", 0.5, ()), ("due", 0, 0.75),
+    ]),
+    "a seek sends state messages first": ({}, [
+        ("poll", 0, [0]), ("seek", 50, ()), ("due", 0, 0), ("poll", 0, [48, 49, 50]),
+        ("position", 0, 50), ("due", 0, 1),
+    ]),
+    "a seek while paused sends the state and stays paused": ({}, [
+        ("pause", 0, ()), ("seek", 50, ()), ("due", 0, 0), ("poll", 0, [48, 49]),
+        ("due", 0, None),
+    ]),
+    "a seek before the range is clamped": (PART, [("seek", -1e9, ()), ("position", 0, 10)]),
+    "a seek behind the range is clamped": (PART, [("seek", 1e9, ()), ("position", 0, 20)]),
+    # Before the first message of a kind it is that message.
+    "the state is known at every position": ({}, [
+        ("pause", 0, ()), ("seek", 0, ()), ("held", 0, {0, 1}), ("seek", 2, ()),
+        ("held", 0, {0, 1}), ("seek", 50, ()), ("held", 0, {48, 49}),
+    ]),
+    "the state follows the played frames": ({}, [
+        ("poll", 50, range(51)), ("held", 0, {48, 49}), ("poll", 60, range(51, 61)),
+        ("held", 0, {60, 58}),
+    ]),
+    "a range begins with its state messages": (PART, [("end", 0, [7, 9, *range(10, 21)])]),
+    "a range is clamped to the recording": (
+        {"begin_us": START_US - 10**15, "end_us": START_US + 10**15}, [("end", 0, ALL)],
+    ),
+    "a loop restarts at once": ({"loop": True}, [("poll", 99, ALL), ("poll", 100, [0, 1])]),
+    "a resumed recording restarts after its end": ({}, [
+        ("end", 0, ALL), ("resume", 1000, ()), ("poll", 1000, [0]),
+    ]),
+}  # fmt: skip
+
+
+def perform(player: Player, verb: str, at: float) -> Any:
+    """Let the player act; return frames, or what it is asked for."""
+    at_us = round(at * STEP_US)
+    due_us = player.next_due_us()
+    verbs: dict[str, Any] = {
+        "poll": lambda: player.poll(at_us, MANY), "thirty": lambda: player.poll(at_us, 30),
+        "end": lambda: [frame for _, frame in play_to_end(player)],
+        "pause": lambda: player.pause(at_us), "resume": lambda: player.resume(at_us),
+        "step": lambda: player.step(0, int(at)), "double": lambda: player.set_speed(2.0, at_us),
+        "seek": lambda: player.seek(START_US + at_us, 0), "held": player.held,
+        "due": lambda: due_us if due_us is None else due_us / STEP_US,
+        "position": lambda: (player.position_us - START_US) / STEP_US,
+    }  # fmt: skip
+    return verbs[verb]()
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_player_follows_the_script(name: str) -> None:
+    options, script = SCRIPTS[name]
+    player = make_player(**options)
+    for number, (verb, at, expected) in enumerate(script):
+        found = perform(player, verb, at)
+        if verb in ("due", "position"):
+            assert found == expected, (number, verb)
+        elif verb == "held":
+            assert {*found} == {FRAMES[k] for k in expected}, (number, verb)
+        else:
+            assert [*(found or ())] == [FRAMES[k] for k in expected], (number, verb)
+    assert (player.state is PlayState.ENDED) == (script[-1][0] == "end")
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.09, 100.1, -1.0, math.nan])
@@ -66,125 +136,25 @@ def test_speed_out_of_range_is_refused(speed: float) -> None:
         make_player(speed=speed)
 
 
-def test_late_poll_returns_all_due_frames() -> None:
-    player = make_player()
-    assert player.poll(10 * STEP_US, MANY) == FRAMES[:11]
-    assert player.next_due_us() == 11 * STEP_US
+GAP_US = 60_000_000
 
 
-def test_pause_stops_the_clock() -> None:
-    player = make_player()
-    player.poll(0, MANY)
-    player.pause(STEP_US // 2)
-    assert player.next_due_us() is None
-    assert player.poll(10 * STEP_US, MANY) == []
-    player.resume(10 * STEP_US)
-    assert player.next_due_us() == 10 * STEP_US + STEP_US // 2
-
-
-def test_step_plays_a_number_of_frames_and_pauses() -> None:
-    player = make_player()
-    assert player.step(0) == FRAMES[:1]
-    assert player.step(0, 3) == FRAMES[1:4]
-    assert player.state is PlayState.PAUSED
-    player.resume(50)
-    assert player.next_due_us() == 50 + STEP_US
-    assert player.step(60, MANY) == FRAMES[4:]
-    assert player.step(60) == []
-
-
-def test_speed_changes_from_the_present_position() -> None:
-    player = make_player()
-    player.poll(0, MANY)
-    player.set_speed(2.0, STEP_US // 2)
-    assert player.next_due_us() == STEP_US // 2 + STEP_US // 4
-
-
-def test_seek_sends_state_messages_first() -> None:
-    player = make_player()
-    player.poll(0, MANY)
-    player.seek(START_US + 50 * STEP_US, 1000)
-    assert player.next_due_us() == 1000
-    frames = player.poll(1000, MANY)
-    assert frames == [FRAMES[48], FRAMES[49], FRAMES[50]]
-    assert player.position_us == START_US + 50 * STEP_US
-    assert player.next_due_us() == 1000 + STEP_US
-
-
-def test_seek_while_paused_sends_the_state_and_stays_paused() -> None:
-    player = make_player()
-    player.pause(0)
-    player.seek(START_US + 50 * STEP_US, 0)
-    assert player.next_due_us() == 0
-    assert player.poll(0, MANY) == [FRAMES[48], FRAMES[49]]
-    assert player.next_due_us() is None
-
-
-@pytest.mark.parametrize(("to_us", "number"), [(0, 10), (10**18, 20)])
-def test_seek_is_clamped_to_the_range(clip: Player, to_us: int, number: int) -> None:
-    clip.seek(to_us, 0)
-    assert clip.position_us == START_US + number * STEP_US
-
-
-@pytest.mark.parametrize(("position", "shown"), [(0, {0, 1}), (2, {0, 1}), (50, {48, 49})])
-def test_state_is_known_at_every_position(position: int, shown: set[int]) -> None:
-    """Before the first message of a kind it is that message."""
-    player = make_player()
-    player.pause(0)
-    player.seek(START_US + position * STEP_US, 0)
-    assert set(player.held()) == {FRAMES[i] for i in shown}
-
-
-def test_state_follows_the_played_frames() -> None:
-    player = make_player()
-    player.poll(50 * STEP_US, MANY)
-    before = set(player.held())
-    player.poll(60 * STEP_US, MANY)
-    assert set(player.held()) != before
-    assert set(player.held()) <= set(FRAMES[50:61])
-
-
-def test_range_begins_with_its_state_messages(clip: Player) -> None:
-    frames = [frame for _, frame in play_to_end(clip)]
-    assert sorted(frames[:2]) == sorted([FRAMES[7], FRAMES[9]])
-    assert frames[2:] == FRAMES[10:21]
-
-
-def test_range_is_clamped_to_the_recording() -> None:
-    player = make_player(begin_us=START_US - 10**15, end_us=START_US + 10**15)
-    assert (player.begin_us, player.end_us) == (START_US, START_US + SPAN_US)
-    assert play_to_end(player)[-1] == (SPAN_US, FRAMES[-1])
-
-
-def test_loop_restarts_at_once() -> None:
-    player = make_player(loop=True)
-    assert len(player.poll(SPAN_US, MANY)) == 100
-    assert player.state is PlayState.PLAYING
-    assert player.poll(SPAN_US + STEP_US, MANY)[:2] == FRAMES[:2]
-
-
-def test_resume_after_the_end_restarts() -> None:
-    player = make_player()
-    play_to_end(player)
-    assert player.state is PlayState.ENDED
-    player.resume(10**9)
-    assert player.poll(10**9, MANY) == FRAMES[:1]
-
-
-def test_gaps_are_kept_or_shortened_to_a_maximum() -> None:
-    gap_us = 60_000_000
-    kept = play_to_end(make_player(with_jump(RECORDS, 50, gap_us)))
-    assert kept[-1][0] == SPAN_US + gap_us
-    cut = play_to_end(make_player(with_jump(RECORDS, 50, gap_us), max_gap_us=1_000_000))
-    assert cut[-1][0] == SPAN_US - STEP_US + 1_000_000
-    assert [frame for _, frame in cut] == FRAMES
-
-
-@pytest.mark.parametrize("jump_us", [50 * 365 * 86_400_000_000, -3_600_000_000])
-def test_jump_of_the_recorded_clock_is_skipped(jump_us: int) -> None:
-    found = play_to_end(make_player(with_jump(RECORDS, 50, jump_us)))
+@pytest.mark.parametrize(
+    ("jump_us", "options", "end_us"),
+    [
+        (GAP_US, {}, SPAN_US + GAP_US),
+        (GAP_US, {"max_gap_us": 1_000_000}, SPAN_US - STEP_US + 1_000_000),
+        (50 * 365 * 86_400_000_000, {}, SPAN_US - STEP_US),
+        (-3_600_000_000, {}, SPAN_US - STEP_US),
+    ],
+    ids=["kept", "shortened", "jump of the clock", "clock set back"],
+)
+def test_gap_is_kept_or_shortened_and_a_jump_of_the_clock_skipped(
+    jump_us: int, options: dict[str, int], end_us: int
+) -> None:
+    found = play_to_end(make_player(with_jump(RECORDS, 50, jump_us), **options))
     assert [frame for _, frame in found] == FRAMES
-    assert found[-1][0] <= SPAN_US
+    assert found[-1][0] == end_us
 
 
 def test_several_recordings_interleave_by_time() -> None:

@@ -1,5 +1,6 @@
 """Every kind of source: any chunks give the same records, and damage costs only what it hits."""
 
+import struct
 from functools import cache
 from itertools import islice
 from typing import Any
@@ -13,12 +14,19 @@ from gateway.simulator.source_bytes import SOURCE_BYTES
 from gateway.sources.kinds import make_decoder
 from gateway.sources.settings import parse_source
 from gateway.wire.framing import Fault
+from tests.kit.payloads import ltm
 
-KINDS = st.sampled_from(sorted(SOURCE_BYTES))
+LTM = b"".join(
+    ltm(b"A", struct.pack("<hhh", n, -n, 10 * n)) + ltm(b"S", struct.pack("<HHBBB", n, 0, 0, 0, 9))
+    for n in range(30)
+)
+KINDS = st.sampled_from(["ltm", *sorted(SOURCE_BYTES)])
 
 
 @cache
 def flight(kind: str) -> bytes:
+    if kind == "ltm":
+        return LTM
     pieces = SOURCE_BYTES[kind](SimulatorSettings(), 1_790_000_000_000_000)
     return b"".join(piece.data for piece in islice(pieces, 12))
 

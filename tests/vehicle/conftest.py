@@ -35,13 +35,19 @@ def vehicle() -> Vehicle:
 
 
 @pytest.fixture
-def station(vehicle: Vehicle, clock: ManualClock) -> GroundStation:
-    """A trusted ground station of a vehicle that knows where it is."""
+def located(vehicle: Vehicle, clock: ManualClock) -> Vehicle:
+    """The vehicle when it knows where it is."""
     clock.now_us = 1_000_000
     vehicle.on_gps(FIX, clock.now_us)
     vehicle.on_baro(BARO, clock.now_us)
     vehicle.on_state(state_at(clock.now_us), sample_at(clock.now_us), clock.now_us)
-    return GroundStation(vehicle, clock)
+    return vehicle
+
+
+@pytest.fixture
+def station(located: Vehicle, clock: ManualClock) -> GroundStation:
+    """A trusted ground station of that vehicle."""
+    return GroundStation(located, clock)
 
 
 @pytest.fixture

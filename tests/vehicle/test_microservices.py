@@ -15,10 +15,8 @@ from pymavlink.dialects.v20 import development
 from gateway.records import RECORDED_ONLY
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.vehicle import Vehicle
-from gateway.wire import mavlink_messages
 from tests.conftest import ManualClock
 from tests.kit.ground_station import (
-    OWN_MESSAGES,
     GroundStation,
     command,
     command_int,
@@ -279,35 +277,6 @@ def test_modes_are_decoded_by_the_development_dialect(station: GroundStation) ->
     modes, mode = (development.MAVLink(None).decode(bytearray(frame)) for frame in frames)
     assert (modes.number_modes, modes.mode_index, modes.mode_name) == (1, 1, "Tracking")
     assert mode.custom_mode == 0
-
-
-@pytest.mark.parametrize(
-    ("kind", "fields"),
-    [
-        (
-            mavlink_messages.PROTOCOL_VERSION,
-            (
-                "uint16_t version/uint16_t min_version/uint16_t max_version/"
-                "uint8_t spec_version_hash/\x08uint8_t library_version_hash/\x08"
-            ),
-        ),
-        (
-            mavlink_messages.COMPONENT_METADATA,
-            "uint32_t time_boot_ms/uint32_t file_crc/char uri/\x64",
-        ),
-        (
-            mavlink_messages.CONTROL_STATUS,
-            "uint8_t flags/uint8_t gcs_main/uint8_t gcs_secondary/\x0a",
-        ),
-    ],
-    ids=lambda kind: getattr(kind, "msgname", ""),
-)
-def test_crc_extra_follows_from_the_definition(kind: Any, fields: str) -> None:
-    """CRC_EXTRA is the checksum of the message's own definition, in wire order."""
-    definition = f"{kind.msgname} {fields.replace('/', ' ')}"
-    crc = mavlink.x25crc(bytearray(definition, "latin1")).crc
-    assert kind.crc_extra == (crc & 0xFF) ^ (crc >> 8)
-    assert (kind.msgname, kind.crc_extra) == OWN_MESSAGES[kind.id]
 
 
 STREAMED = {

@@ -21,10 +21,6 @@ from tests.kit.memory import size_of
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "frames.json").read_text())
 
 
-def test_crc_check_value() -> None:
-    assert crc16(b"123456789") == 0x29B1
-
-
 def test_frame_equals_one_worked_out_by_hand() -> None:
     """Content 11 00 is stuffed as 02 11, then 03 and the CRC: worked out with pencil and paper."""
     crc = crc16(b"\x11\x00").to_bytes(2, "little")

@@ -83,11 +83,6 @@ COMMAND = {
 }
 
 
-def test_command_of_the_mavlink2rest_readme_is_read() -> None:
-    message = from_json({**COMMAND, "param1": 1})
-    assert (message.command, message.param1, message.target_system) == (400, 1.0, 1)
-
-
 @pytest.mark.parametrize(
     ("field", "value", "number"),
     [

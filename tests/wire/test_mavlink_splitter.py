@@ -232,11 +232,6 @@ def test_header_has_the_fields_of_the_frame(frame: bytes) -> None:
     assert found.signed == (frame is V2_SIGNED)
 
 
-def test_keys_differ_by_system_component_message_and_version() -> None:
-    others = [packed(HEARTBEAT, 8), packed(HEARTBEAT, 7, 2), V2_COMMAND, V1, V2]
-    assert len({frame_of(frame).key for frame in others}) == len(others)
-
-
 @pytest.mark.parametrize("length", range(10))
 def test_a_heartbeat_cut_short_is_no_station_and_no_error(length: int) -> None:
     """Cut zeros mean zero, and what follows the payload is no part of it."""

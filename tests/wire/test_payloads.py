@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from gateway.records import GpsFixType, ImuFlags, NodeId, RadioSignal, RadioState
+from gateway.records import GpsFixType, NodeId, RadioSignal, RadioState
 from gateway.wire import payloads
 from gateway.wire.framing import Fault, FaultKind
 from tests.kit.payloads import decode_payload
@@ -64,31 +64,6 @@ def test_receiver_status_equals_its_vector(vector: dict) -> None:
     assert isinstance(frame, payloads.ReceiverStatusFrame)
     assert as_json(frame) == vector["fields"]
     assert payloads.encode_receiver_status(frame).hex() == vector["content_hex"]
-
-
-def test_imu_payload_has_the_layout_of_the_protocol() -> None:
-    """Every offset of PROTOCOL.md, written out without the codec."""
-    packet = bytes.fromhex(
-        "11 15 3412 78563412"  # version and kind, vehicle 2 node 5, sequence, node time
-        "0100 0200 0300"
-        "ffff feff fdff"
-        "0001 0002 0003"
-        "1020"
-        "0500"
-        "26"  # 0b0_010_01_10
-    )
-    header, payload = decode_payload(packet)
-    assert header == payloads.Header(NodeId(2, 5), 0x1234, 0x12345678)
-    assert payload == payloads.ImuPayload(
-        accel=(1, 2, 3),
-        gyro=(-1, -2, -3),
-        mag=(256, 512, 768),
-        temperature=0x2010,
-        flags=ImuFlags.ACCEL_FILTERED | ImuFlags.MAG_NEW,
-        accel_range=2,
-        gyro_range=1,
-        mag_gain=2,
-    )
 
 
 SIGNAL_HEAD = "13 07 02 00010203"

@@ -38,7 +38,9 @@ def test_offset_and_drift_are_estimated(skew_ppm: float, start_us: int, seed: in
     rng = np.random.default_rng(seed)
     stamps, true_us, arrivals = packets(rng, seconds=60, skew_ppm=skew_ppm, start_us=start_us)
     tracker = ClockTracker()
-    error_us = observe(tracker, stamps, arrivals) - true_us
+    found_us = observe(tracker, stamps, arrivals)
+    assert (found_us <= arrivals).all(), "no sample comes from the future"
+    error_us = found_us - true_us
     settled = error_us[true_us - true_us[0] > 15e6]
     assert np.abs(settled).max() < 200.0
     assert tracker.skew_ppm == pytest.approx(skew_ppm, abs=10.0)
@@ -55,11 +57,6 @@ def test_soonest_packet_is_chosen_after_removing_the_drift(skew_ppm: float, seed
     error_us = observe(ClockTracker(), stamps, arrivals) - true_us
     settled = error_us[true_us - true_us[0] > 15e6]
     assert np.sqrt(np.mean(settled**2)) < 6.0
-
-
-def test_time_is_never_later_than_the_arrival(rng: np.random.Generator) -> None:
-    stamps, _, arrivals = packets(rng, seconds=5, skew_ppm=200.0)
-    assert (observe(ClockTracker(), stamps, arrivals) <= arrivals).all()
 
 
 @pytest.mark.parametrize("gap_s", [10, 600, 71 * 60, 3 * 3600])

@@ -29,6 +29,8 @@ from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import TableNote, block_of
 from gateway.records import NavFlags
 from gateway.vehicle_state.positions import TrackPoint
+from tests.kit.mavlink import message_of
+from tests.kit.messages import attitude, beat, chunks, home, text
 from tests.kit.recordings import SECOND_US, START_US, Sent, messages_of, records_sent
 from tests.recordings.flights import fly, make_flight, read
 
@@ -200,36 +202,26 @@ ONE, TWO, STATION, OLD_STATION = (1, 1), (7, 1), (255, 190), (42, 190)
 
 
 def position(lat: int) -> Any:
-    return mavlink.MAVLink_global_position_int_message(0, lat, 85_000_000, 430_000, 0, 0, 0, 0, 0)
+    return message_of("GLOBAL_POSITION_INT", lat=lat, lon=85_000_000, alt=430_000)
 
 
-def text(words: str, severity: int = 6, number: int = 0, chunk: int = 0) -> Any:
-    return mavlink.MAVLink_statustext_message(severity, words.encode(), number, chunk)
-
-
-def home(lat: int) -> Any:
-    return mavlink.MAVLink_home_position_message(
-        lat, 85_000_000, 400_000, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0
-    )
-
-
+HOME = home(47.0, 8.5, 400.0)
 SAID: list[tuple[tuple[int, int], Any]] = [
-    (ONE, text("Attitude valid")),
-    (OLD_STATION, mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)),
-    (ONE, mavlink.MAVLink_attitude_message(0, 0.1, -0.2, 1.5, 0, 0, 0)),
-    (ONE, mavlink.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 0)),
-    (ONE, home(470_000_000)),
+    (ONE, text("Attitude valid", 6)),
+    (OLD_STATION, beat(mavlink.MAV_TYPE_GCS, 8)),
+    (ONE, attitude(0.1, -0.2, 1.5)),
+    (ONE, message_of("GLOBAL_POSITION_INT")),
+    (ONE, HOME),
     (ONE, position(470_000_001)),
     (TWO, position(480_000_000)),
-    (ONE, home(470_000_000)),
-    (ONE, text("Note: over the gate")),
-    (ONE, text("Marked 47.500000, 8.600000")),
-    (ONE, text("for programmers", severity=7)),
-    (TWO, mavlink.MAVLink_attitude_quaternion_message(0, 1.0, 0, 0, 0, 0, 0, 0)),
+    (ONE, HOME),
+    (ONE, text("Note: over the gate", 6)),
+    (ONE, text("Marked 47.500000, 8.600000", 6)),
+    (ONE, text("for programmers", 7)),
+    (TWO, message_of("ATTITUDE_QUATERNION", q1=1.0)),
     (TWO, position(480_000_001)),
-    (ONE, text("A" * 50, number=3, chunk=0)),
-    (ONE, text("B", number=3, chunk=1)),
-    (STATION, text("hello")),
+    *((ONE, chunk) for chunk in chunks("A" * 50 + "B", 6)),
+    (STATION, text("hello", 6)),
     (STATION, position(10)),
     (OLD_STATION, position(20)),
 ]

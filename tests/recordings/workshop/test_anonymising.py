@@ -494,20 +494,3 @@ def test_command_moves_to_the_place_and_prints_the_changes(tmp_path: Path) -> No
     first = next(r for r in read_tlog(out) if message_id_of(r.frame) == 33)
     assert fields_of(first.frame)["lat"] == -339_000_000
     assert datetime.fromtimestamp(first.time_us / 1e6, UTC).date() == date(2001, 2, 3)
-
-
-@pytest.mark.io
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        (("--place", "1,2"), "--anonymise"),
-        (("--anonymise", "--place", "89,2"), "80"),
-        (("--anonymise", "--place", "x"), "LAT,LON"),
-        (("--anonymise", "--day", "2001-13-01"), "2020-01-31"),
-    ],
-)
-def test_invalid_options_of_anonymising_are_refused(
-    tmp_path: Path, options: tuple[str, ...], text: str
-) -> None:
-    path = write_tlog(tmp_path / "a.tlog", records_of([Sender().heartbeat()]))
-    assert text in run("convert", path, "-o", tmp_path / "b.tlog", *options, code=2)

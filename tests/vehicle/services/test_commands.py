@@ -16,7 +16,7 @@ from gateway.vehicle.service import RecordingRequest
 from gateway.vehicle.services.commands import MAX_WAITING, RECORDER_TIMEOUT_US
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
-from tests.kit.conversation import Step, converse
+from tests.kit.conversation import Step, converse, perform
 from tests.kit.ground_station import (
     GroundStation,
     command,
@@ -124,7 +124,7 @@ def acks(messages: list[Any]) -> list[tuple[int, int]]:
 
 
 def recorder(trouble: str = "", *, recording: bool = False) -> Any:
-    return lambda vehicle, now_us: vehicle.on_recorder(trouble, now_us, recording=recording)
+    return lambda me: perform("on_recorder", trouble, me.clock(), recording=recording)(me)
 
 
 def ended(result: int, *reported: str) -> dict[str, Any]:
