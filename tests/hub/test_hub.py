@@ -30,14 +30,6 @@ async def world(rig: Any) -> Any:
     return rig
 
 
-async def test_telemetry_of_an_autopilot_goes_to_all_byte_for_byte(world: Any) -> None:
-    signed = world.sender(42, 1, signed=True)
-    for frame in (world.autopilot.sender.attitude(), signed.attitude()):
-        world.autopilot.send(frame)
-        assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
-        assert world.foreign[-1] == frame
-
-
 async def test_text_of_a_router_is_sent_as_a_component_of_each_vehicle(world: Any) -> None:
     foreign = len(world.foreign)
     for number in range(2):
@@ -47,50 +39,6 @@ async def test_text_of_a_router_is_sent_as_a_component_of_each_vehicle(world: An
             assert (frame.origin[0], frame.message_id, frame.sequence) == (42, 253, number)
             assert b"Note: here" in frame.data
     assert len(world.foreign) == foreign + 2
-
-
-async def test_request_goes_to_the_system_that_it_addresses(world: Any) -> None:
-    count = len(world.incoming)
-    request = world.first.sender.command(42, 1)
-    world.first.send(request)
-    assert await world.autopilot.receive() == request
-    answer = world.autopilot.sender.command(255, 190)
-    world.autopilot.send(answer)
-    assert await world.first.receive() == answer
-    assert world.second.is_empty()
-    assert len(world.incoming) == count
-
-
-async def test_request_to_our_vehicle_or_to_an_unknown_system_is_not_forwarded(world: Any) -> None:
-    request = world.first.sender.command(1, 1)
-    world.first.send(request, world.first.sender.command(99, 1))
-    await world.until(lambda: world.world.counters().unroutable == 1)
-    assert world.incoming[-1].frame == request
-    assert world.autopilot.is_empty()
-
-
-async def test_broadcast_of_a_station_reaches_vehicles_only(world: Any) -> None:
-    beat = world.first.sender.heartbeat()
-    world.first.send(beat)
-    assert await world.autopilot.receive() == beat
-    assert world.second.is_empty()
-
-
-async def test_copies_and_echoes_are_dropped(world: Any) -> None:
-    hub, pilot = world.world, world.autopilot.sender
-    echo, frame = pilot.attitude(), pilot.attitude()
-    world.second.send(echo)
-    assert [await world.first.receive(), await world.autopilot.receive()] == [echo, echo]
-    world.autopilot.send(frame)
-    assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
-    world.second.send(frame)
-    await world.until(lambda: hub.counters().duplicates == 1)
-    assert world.first.is_empty()
-    ours = world.vehicle.attitude()
-    world.first.send(ours)
-    await world.until(lambda: hub.counters().looped == 1)
-    assert world.second.is_empty()
-    assert world.incoming[-1].frame != ours
 
 
 async def test_first_frame_of_a_restarted_program_is_accepted(world: Any) -> None:

@@ -40,31 +40,6 @@ async def send_untrusted(world: Any, *frames: bytes) -> None:
     await world.until(lambda: received() == before + len(frames))
 
 
-async def test_untrusted_requests_reach_our_vehicles_only(world: Any) -> None:
-    foreign, unroutable = len(world.foreign), world.world.counters().unroutable
-    monitor = world.station()
-    world.world.add(f"udp:127.0.0.1:{monitor.port}?monitor=yes")
-    await world.until_open(world.world)
-    request = world.untrusted.sender.command(1, 1)
-    await send_untrusted(world, request, world.untrusted.sender.command(255, 190))
-    assert [(each.frame, each.trusted) for each in world.incoming[-1:]] == [(request, False)]
-    assert world.world.counters().unroutable == unroutable + 1
-    assert (world.station_.is_empty(), len(world.foreign)) == (True, foreign)
-    assert monitor.received() == [request]
-
-
-async def test_command_goes_to_the_trusted_path_despite_a_forged_component(
-    world: Any,
-) -> None:
-    claimed = world.sender(42, 77)
-    await send_untrusted(world, claimed.heartbeat(), claimed.attitude())
-    request = world.station_.sender.command(42, 77)
-    world.station_.send(request)
-    assert await world.autopilot.receive() == request
-    await world.quiet()
-    assert request not in world.untrusted.received()
-
-
 async def test_forged_stations_displace_no_other_client(world: Any) -> None:
     for number in range(357):
         forged = world.sender(1 + number % 200, 1 + number // 200)

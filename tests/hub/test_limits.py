@@ -20,99 +20,61 @@ from gateway.hub.transports.listener import client_to_remove
 from gateway.records import Incoming
 from gateway.units import US_PER_S
 
-
-def asked(client_id: int, number: int = 0, *, trusted: bool = True) -> Incoming:
-    return Incoming(client_id, bytes((number,)), trusted)
-
-
-def test_clients_are_served_in_turns_and_each_in_its_order() -> None:
-    queue = RequestQueue()
-    for number in range(3):
-        queue.offer(asked(1, number), 0)
-    queue.offer(asked(2), 0)
-    queue.offer(asked(3, trusted=False), 0)
-    taken = [queue.take(0) for _ in range(6)]
-    assert [(i.client_id, i.frame[0]) for i in taken if i] == [
-        (1, 0), (2, 0), (3, 0), (1, 1), (1, 2)
-    ]  # fmt: skip
-    assert taken[-1] is None
-    assert queue.wait_us(0) is None
+TRANSCRIPTS = {
+    "each client in its turn and order": "+1a +1b +1c +2a +3a? =1a =2a =3a? =1b =1c =-",
+    "client beyond its quota delays no other": "+1a +2a !1 =2a =-",
+    "new untrusted client does not refill the bucket of all":
+        "+1a? =1a? !1? x1 +2a? +3a? +4a =4a =- >1 =2a?",
+    "client no longer trusted uses the shared bucket": "+9a? !9? +1a =1a +1b? =-",
+    "removed client leaves neither requests nor a quota": "+1a !1 x1 =- +1b =1b",
+    "flooding client delays only itself": "+1a " * MAX_WAITING + "-1a +2a =1a =2a",
+}  # fmt: skip
+"""Requests of clients, untrusted ones with a question mark: offered (+) or not accepted (-), taken
+(=), or none; a quota is used up (!), a client removed (x), seconds pass (>)."""
 
 
-def test_flooding_client_delays_only_itself() -> None:
-    queue = RequestQueue()
-    assert [queue.offer(asked(1), 0) for _ in range(MAX_WAITING + 1)][-2:] == [True, False]
-    assert queue.offer(asked(2), 0)
-    assert queue.take(0) == asked(1)
-    assert queue.take(0) == asked(2)
+@pytest.mark.parametrize("name", TRANSCRIPTS)
+def test_requests_are_served_in_turns_within_quotas(name: str) -> None:
+    queue, now_us = RequestQueue(), 0
+    for number, word in enumerate(TRANSCRIPTS[name].split()):
+        client_id, is_trusted = int("0" + word[1:2].strip("-")), not word.endswith("?")
+        asked = Incoming(client_id, word[2:3].encode(), is_trusted)
+        match word[0]:
+            case "+" | "-":
+                assert queue.offer(asked, now_us) == (word[0] == "+"), number
+            case "=":
+                assert queue.take(now_us) == (None if word == "=-" else asked), number
+            case "!":
+                queue.charge(client_id, 2 * CLIENT_BURST if is_trusted else UNTRUSTED_BURST)
+            case "x":
+                queue.remove(client_id)
+                assert queue.wait_us(now_us) != 0, "none of it waits"
+            case _:
+                now_us += US_PER_S
 
 
 def test_next_request_waits_until_the_bucket_has_refilled() -> None:
-    queue = RequestQueue()
-    queue.offer(asked(1), 0)
-    queue.offer(asked(1), 0)
+    queue, asked = RequestQueue(), Incoming(1, b"", True)
+    assert queue.wait_us(0) is None
+    queue.offer(asked, 0)
+    queue.offer(asked, 0)
     queue.take(0)
     queue.charge(1, CLIENT_BURST)
-    assert queue.take(0) is None
     wait_us = queue.wait_us(0)
     assert wait_us
     assert abs(wait_us - REQUEST_COST * US_PER_S / CLIENT_RATE) < 100
-    assert queue.take(wait_us) == asked(1)
-
-
-def test_client_beyond_its_quota_delays_no_other() -> None:
-    queue = RequestQueue()
-    for client_id in (1, 2):
-        queue.offer(asked(client_id), 0)
-    queue.charge(1, 2 * CLIENT_BURST)
-    assert queue.take(0) == asked(2)
-    assert queue.take(0) is None
-
-
-def test_untrusted_clients_share_one_bucket_that_a_new_client_does_not_refill() -> None:
-    queue = RequestQueue()
-    queue.offer(asked(1, trusted=False), 0)
-    queue.take(0)
-    queue.charge(1, UNTRUSTED_BURST)
-    queue.remove(1)
-    for client_id in (2, 3):
-        queue.offer(asked(client_id, trusted=False), 0)
-    queue.offer(asked(4), 0)
-    assert queue.take(0) == asked(4), "a trusted client is served all the same"
-    assert queue.take(0) is None
-    assert queue.take(US_PER_S) == asked(2, trusted=False)
+    assert (queue.take(0), queue.take(wait_us)) == (None, asked)
 
 
 def test_untrusted_clients_cause_a_bounded_number_of_bytes_in_a_minute() -> None:
-    queue = RequestQueue()
-    answered = 0
+    queue, answered = RequestQueue(), 0
     for now_us in range(0, 60 * US_PER_S, 10_000):
         for client_id in range(32):
-            queue.offer(asked(client_id, trusted=False), now_us)
+            queue.offer(Incoming(client_id, b"", trusted=False), now_us)
         if taken := queue.take(now_us):
             queue.charge(taken.client_id, 300)
             answered += 1
     assert answered <= (UNTRUSTED_BURST + 60 * UNTRUSTED_RATE) / (REQUEST_COST + 300) + 1
-
-
-def test_client_no_longer_trusted_uses_the_shared_bucket() -> None:
-    queue = RequestQueue()
-    queue.offer(asked(9, trusted=False), 0)
-    queue.charge(9, 2 * UNTRUSTED_BURST)
-    queue.offer(asked(1), 0)
-    assert queue.take(0) == asked(1)
-    queue.offer(asked(1, trusted=False), 0)
-    assert queue.take(0) is None
-
-
-def test_removed_client_leaves_neither_requests_nor_a_quota() -> None:
-    queue = RequestQueue()
-    queue.offer(asked(1), 0)
-    queue.charge(1, 2 * CLIENT_BURST)
-    queue.remove(1)
-    assert (queue.take(0), queue.wait_us(0)) == (None, None)
-    queue.offer(asked(1), 0)
-    assert queue.take(0) == asked(1)
 
 
 S = US_PER_S

@@ -7,7 +7,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.hub.packer import Packer
-from gateway.hub.send_queue import BULK_BYTES, URGENT_RUN, SendQueue
+from gateway.hub.send_queue import BULK_BYTES, SendQueue
 from gateway.hub.transports.serial_line import Pacer
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import frame_of
@@ -28,44 +28,31 @@ def drain(queue: SendQueue) -> list[bytes]:
     return frames
 
 
+ORDERS = {
+    "urgent frames leave first without starving bulk":
+        ("pppaaaaaaaaa", 1000, "a0 a1 a2 a3 p0 a4 a5 a6 a7 p1 a8 p2"),
+    "bulk and usual frames take turns": ("ipipip", 1000, "p0 i0 p1 i1 p2 i2"),
+    "answer overtakes attitudes": ("aipch", 1000, "c0 h0 a0 p0 i0"),
+    "full queue drops oldest telemetry first and answers last": ("caiiac", 30, "c0 c1 a1"),
+    **{f"newest frame is accepted: {kind}": (f"aic{kind}", 30, f"{kind}0") for kind in "AIC"},
+}  # fmt: skip
+"""Kinds of pushed frames of 10 bytes (large: 30), the bound, and the order in which they leave."""
+KINDS = {"a": ATTITUDE, "i": RAW_IMU, "p": PARAM_VALUE, "c": COMMAND_ACK, "h": HEARTBEAT}
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_frames_leave_by_their_importance(name: str) -> None:
+    pushed, max_bytes, left = ORDERS[name]
+    queue, dropped = queue_of(max_bytes), 0
+    for at, kind in enumerate(pushed):
+        data = f"{kind}{pushed[:at].count(kind)}".ljust(10 if kind.islower() else 30)
+        dropped += queue.push(raw_frame(KINDS[kind.lower()], data.encode()), 0)
+    found = drain(queue)
+    assert b"".join(found).decode().split() == left.split()
+    assert (dropped, queue.size) == (len(pushed) - len(found), 0)
+
+
 class TestSendQueue:
-    def test_urgent_frames_leave_first_without_starving_bulk(self) -> None:
-        queue = queue_of(10_000)
-        for n in range(8):
-            queue.push(raw_frame(PARAM_VALUE, b"b%d" % n), 0)
-        for n in range(20):
-            queue.push(raw_frame(ATTITUDE, b"a%02d" % n), 0)
-        order = drain(queue)
-        assert order[:URGENT_RUN] == [b"a00", b"a01", b"a02", b"a03"]
-        assert order[URGENT_RUN] == b"b0"
-        assert [f for f in order if f[:1] == b"a"] == [b"a%02d" % n for n in range(20)]
-        assert [f for f in order if f[:1] == b"b"] == [b"b%d" % n for n in range(8)]
-        assert queue.size == 0
-
-    def test_bulk_and_usual_frames_take_turns(self) -> None:
-        queue = queue_of(10_000)
-        for n in range(3):
-            queue.push(raw_frame(RAW_IMU, b"u%d" % n), 0)
-            queue.push(raw_frame(PARAM_VALUE, b"b%d" % n), 0)
-        assert drain(queue) == [b"b0", b"u0", b"b1", b"u1", b"b2", b"u2"]
-
-    def test_full_queue_drops_oldest_telemetry_first_and_answers_last(self) -> None:
-        queue = queue_of(30)
-        queue.push(raw_frame(COMMAND_ACK, b"c" * 10), 0)
-        queue.push(raw_frame(ATTITUDE, b"a" * 10), 0)
-        queue.push(raw_frame(RAW_IMU, b"1" * 10), 0)
-        assert queue.push(raw_frame(RAW_IMU, b"2" * 10), 0) == 1
-        assert queue.push(raw_frame(ATTITUDE, b"A" * 10), 0) == 1
-        assert queue.push(raw_frame(COMMAND_ACK, b"C" * 10), 0) == 1
-        assert drain(queue) == [b"c" * 10, b"C" * 10, b"A" * 10]
-
-    def test_answer_overtakes_attitudes(self) -> None:
-        queue = queue_of(1000)
-        for message_id in (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK, HEARTBEAT):
-            queue.push(raw_frame(message_id, bytes([message_id])), 0)
-        order = [frame[0] for frame in drain(queue)]
-        assert order == [COMMAND_ACK, HEARTBEAT, ATTITUDE, PARAM_VALUE, RAW_IMU]
-
     def test_all_parameters_fit_next_to_the_telemetry_of_the_slowest_line(self) -> None:
         queue = queue_of(100)
         for n in range(300):
@@ -92,14 +79,6 @@ class TestSendQueue:
             *(bytes([COMMAND_ACK, now_us]) for now_us in (1, 2, 3)),
         ]
         assert queue.size == 0
-
-    @pytest.mark.parametrize("message_id", [ATTITUDE, RAW_IMU, COMMAND_ACK])
-    def test_newest_frame_is_always_accepted(self, message_id: int) -> None:
-        queue = queue_of(30)
-        for n in range(3):
-            queue.push(raw_frame((ATTITUDE, RAW_IMU, COMMAND_ACK)[n], bytes((n,)) * 10), 0)
-        assert queue.push(raw_frame(message_id, b"n" * 30), 0) == 3
-        assert drain(queue) == [b"n" * 30]
 
     @pytest.mark.parametrize("seed", range(5))
     def test_every_frame_leaves_or_is_counted_and_the_bound_holds(self, seed: int) -> None:

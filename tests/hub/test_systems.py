@@ -1,6 +1,7 @@
 """Options of endpoints that select systems and renumber them, in both directions."""
 
 import socket
+from dataclasses import asdict
 from typing import Any
 
 import pytest
@@ -194,6 +195,8 @@ def test_one_vehicle_is_found_by_the_heartbeat_of_its_autopilot() -> None:
 
 A, B, C = "first", "second", "seat"
 """Three endpoints; the options of each are the first row of a conversation."""
+SEAT = (C, GCS, 255, STATION)
+"""A station at the third of them."""
 ACK = mavlink.MAVLink_command_ack_message(400, 0)
 ACK_TO_254 = mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 254, 0)
 POSE = [
@@ -231,9 +234,43 @@ CONVERSATIONS: dict[str, list[Any]] = {
         (C, CORRECTIONS, 255, STATION), (C, GCS, 255, STATION), {}, (C, CORRECTIONS, 255, STATION),
         {A: [(255, 233)], B: []},
     ],
+    "telemetry of a vehicle goes to all others": [
+        ("", "", ""), (A, heartbeat(), 1, 1), {}, (A, attitude(), 1, 1),
+        {A: [], B: [(1, 30)], C: [(1, 30)], "ours": 0},
+    ],
+    "request goes to the system that it addresses, and its answer back": [
+        ("", "", ""), (A, heartbeat(), 1, 1), (B, GCS, 254, STATION), SEAT, {},
+        (C, command(1), 255, STATION), {A: [(255, 76)], B: [], "ours": 0},
+        (A, command(255, STATION), 1, 1), {B: [], C: [(1, 76)]},
+    ],
+    "request to our vehicle or to an unknown system is not forwarded": [
+        ("", "", ""), (None, heartbeat(), 3, 1), (A, heartbeat(), 1, 1), SEAT, {},
+        (C, command(3), 255, STATION), {A: [], "ours": 1, "unroutable": 0},
+        (C, command(99), 255, STATION), {A: [], "ours": 0, "unroutable": 1},
+    ],
+    "broadcast of a station reaches vehicles only": [
+        ("", "", ""), (A, heartbeat(), 1, 1), (B, GCS, 254, STATION), {}, SEAT,
+        {A: [(255, 0)], B: [], "ours": 1},
+    ],
+    "copies are dropped, and our own frames that return": [
+        ("", "", ""), (A, heartbeat(), 1, 1), {}, (B, attitude(), 1, 1),
+        {A: [(1, 30)], C: [(1, 30)], "duplicates": 0}, (A, attitude(6), 1, 1), {C: [(1, 30)]},
+        (B, attitude(6), 1, 1), {A: [], C: [], "duplicates": 1}, (None, heartbeat(), 3, 1),
+        (None, attitude(), 3, 1), {}, (C, attitude(), 3, 1),
+        {A: [], B: [], "looped": 1, "ours": 0},
+    ],
+    "untrusted requests reach our vehicles, and a monitor, only": [
+        ("trusted=no", "monitor=yes", ""), (None, heartbeat(), 3, 1), SEAT, {},
+        (A, command(3), 200, STATION), {B: [(200, 76)], C: [], "ours": 1, "unroutable": 0},
+        (A, command(255, STATION), 200, STATION), {B: [], C: [], "ours": 0, "unroutable": 1},
+    ],
+    "command takes the trusted path despite a forged component": [
+        ("trusted=no", "", ""), (B, heartbeat(), 1, 1), (A, heartbeat(), 1, 77),
+        (A, attitude(), 1, 77), {}, (C, command(1, 77), 255, STATION), {A: [], B: [(255, 76)]},
+    ],
 }  # fmt: skip
 """Frames with their senders, our own without a link, and what has been received since the last
-check: system and message."""
+check: system and message, how many by our vehicles, or the increase of a counter."""
 
 
 @pytest.mark.io
@@ -269,9 +306,13 @@ class TestHub:
     async def test_conversation_passes_as_the_options_allow(self, rig: Any, rows: Any) -> None:
         hub, *stations = await self.open(rig, *rows[0][:2], station=rows[0][2])
         named = dict(zip((A, B, C), stations, strict=True))
+        before: dict[str, int] = {}
         for row in rows[1:]:
             if isinstance(row, dict):
-                got = {name: self.origins(each) for name, each in named.items()}
+                got: dict[str, Any] = {name: self.origins(each) for name, each in named.items()}
+                counts = {"ours": rig.received} | asdict(hub.counters())
+                got |= {name: count - before.get(name, 0) for name, count in counts.items()}
+                before = counts
                 assert {name: got[name] for name in row} == row
             elif row[0] is None:
                 rig.publish(hub, packed(*row[1:]))
