@@ -16,6 +16,7 @@ import gateway.player
 from gateway.cli.recorded.play import steer
 from gateway.config import GatewaySettings
 from gateway.hub.hub import SENDS_AT_ONCE
+from gateway.live import player_edge
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import lay_out, open_flights
@@ -366,8 +367,10 @@ def test_end_does_not_wait_for_a_name(
 
 @pytest.mark.parametrize("plan", [{"paused": True}, {}], ids=["before the start", "at the end"])
 async def test_idle_player_repeats_the_state_without_gaps_in_the_numbers(
-    make: Make, station: PlayedTo, plan: dict[str, Any]
+    make: Make, station: PlayedTo, plan: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(player_edge, "HOLD_US", 10_000)
+    monkeypatch.setattr(player_edge, "LONGEST_WAIT_S", 0.005)
     await make(station.url, **plan).start()
     await station.until(3 if plan else 5)
     read = [frame_of(frame) for frame in station.frames]

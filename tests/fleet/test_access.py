@@ -6,8 +6,10 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import pytest
@@ -152,10 +154,10 @@ def test_client_without_certificate_of_the_authority_is_refused(
 
 def test_site_reads_and_writes_its_own_keys_only(join: Callable[[str], Any]) -> None:
     first, second = join("field-1"), join("field-2")
-    got: list[tuple[str, bytes]] = []
+    got, arrived = list[tuple[str, bytes]](), SimpleQueue[tuple[str, bytes]]()
     for key in ("mavlink/field-1/1/out", "mavlink/field-2/1/out"):
         second.declare_subscriber(
-            key, lambda sample: got.append((str(sample.key_expr), sample.payload.to_bytes()))
+            key, lambda sample: arrived.put((str(sample.key_expr), sample.payload.to_bytes()))
         )
     end_s = time.monotonic() + START_LIMIT_S
     while len(got) < 20:
@@ -163,7 +165,9 @@ def test_site_reads_and_writes_its_own_keys_only(join: Callable[[str], Any]) -> 
         first.put("mavlink/field-1/1/out", b"telemetry of field-1")
         first.put("mavlink/field-2/1/out", b"forged")
         second.put("mavlink/field-2/1/out", b"own")
-        time.sleep(0.02)
+        with suppress(Empty):
+            # Nothing arrives before both sessions know of the subscription.
+            got.append(arrived.get(timeout=0.02))
     assert set(got) == {("mavlink/field-2/1/out", b"own")}
 
 

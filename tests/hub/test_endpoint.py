@@ -1,8 +1,5 @@
 """Endpoint URLs, the errors of malformed ones, and the pages that may connect."""
 
-import contextlib
-import re
-
 import msgspec
 import pytest
 from hypothesis import given
@@ -220,12 +217,10 @@ URLS = st.one_of(
 
 @given(URLS)
 def test_any_text_is_a_usable_endpoint_or_is_refused_by_name(url: str) -> None:
-    endpoint = None
-    with contextlib.suppress(ValueError):
+    try:
         endpoint = parse_endpoint(url)
-    if endpoint is None:
-        with pytest.raises(ValueError, match=re.escape(repr(url))):
-            parse_endpoint(url)
+    except ValueError as error:
+        assert repr(url) in str(error)  # noqa: PT017
         return
     assert endpoint.name.isprintable()
     assert endpoint.host

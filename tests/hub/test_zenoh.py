@@ -108,6 +108,7 @@ async def site(router: Router) -> AsyncIterator[Site]:
     site = Site(router)
     yield site
     site.close()
+    router.restore()
 
 
 @pytest.fixture
@@ -472,4 +473,5 @@ def test_process_ends_soon_after_its_session_is_closed(
             site.communicate("fill\n" if stalls else "end\n", timeout=START_LIMIT_S)
         finally:
             site.kill()
+            router.restore()
         assert site.returncode == 7

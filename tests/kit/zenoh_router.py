@@ -49,8 +49,14 @@ class Router:
         assert self.process is not None
         self.process.send_signal(number)
 
+    def restore(self) -> None:
+        """Let it run again, whatever a test has done with it."""
+        if self.process is None:
+            self.start()
+        self.signal(signal.SIGCONT)
 
-@pytest.fixture
+
+@pytest.fixture(scope="module")
 def router() -> Iterator[Router]:
     router = Router()
     yield router
