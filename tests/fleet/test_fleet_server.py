@@ -167,6 +167,7 @@ async def test_assigned_id_is_used_shown_and_saved(world: World, settings: Fleet
     assert json.loads(Path(settings.ids_file).read_text()) == {"field-a/1": 77}
 
 
+@pytest.mark.usefixtures("_polls_often")
 @pytest.mark.parametrize("ids", [{"field-a/1": 5}])
 async def test_id_that_cannot_be_saved_is_an_error(world: World, settings: FleetSettings) -> None:
     with pytest.raises(ControlError, match=r"unknown site 'field-z'; known: .*field-a"):

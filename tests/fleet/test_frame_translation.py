@@ -69,16 +69,12 @@ def command(target: int) -> Any:
     return mavlink.MAVLink_command_long_message(target, 1, 400, 0, 1, 0, 0, 0, 0, 0, 7)
 
 
-@pytest.mark.parametrize("v1", [False, True])
-def test_sender_of_a_frame_from_the_site_is_translated(v1: bool) -> None:
+@pytest.mark.parametrize("v1", [False, True], ids=["MAVLink 2", "MAVLink 1"])
+def test_sender_from_the_site_and_target_to_it_are_translated(v1: bool) -> None:
     there = translation()
     got = shown(there, packed(attitude(), 1, v1=v1))
     assert (got.get_srcSystem(), got.roll, got.yawspeed) == (2, 0.5, 0.25)
-
-
-@pytest.mark.parametrize("v1", [False, True])
-def test_target_of_a_frame_to_the_site_is_translated(v1: bool) -> None:
-    got = sent(translation(), packed(command(2), 255, v1=v1))
+    got = sent(there, packed(command(2), 255, v1=v1))
     assert (got.target_system, got.get_srcSystem()) == (1, 255)
     assert (got.command, got.param7) == (400, 7)
 

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import random
+import re
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -17,17 +18,45 @@ from gateway.fleet.id_map import FIRST_ID, LAST_ID, MAX_WAITING, Handover, IdMap
 pytestmark = pytest.mark.io
 
 
-def test_first_vehicle_keeps_its_id_and_second_gets_the_lowest_free_one() -> None:
-    ids = IdMap()
-    assert ids.id_of("a", 1) == 1
-    assert ids.id_of("b", 1) == 2
-    assert ids.id_of("b", 7) == 7
-    assert ids.id_of("c", 1) == 3
-    assert [ids.id_of(site, 1) for site in "abc"] == [1, 2, 3]
-    assert ids.vehicle_of(2) == ("b", 1)
-    assert ids.vehicle_of(9) is None
-    assert ids.id_of("c", 255) == 4, "no id of a ground station"
+TRANSCRIPTS = {
+    "first vehicle keeps its id, the second gets the lowest free one":
+        "a/1=1 b/1=2 b/7=7 c/1=3 a/1=1 b/1=2 c/1=3 2:b/1 9:-",
+    "no vehicle gets the id of a ground station": "a/1=1 c/255=2",
+    "id assigned by the operator is swapped":
+        "a/1=1 b/1=2 c/1=3 d/1=4 b/1!0 d/1!1 a/1=4 c/1=3 d/1=1 e/1!3 c/1=2 e/1=3 f/1!9 f/1=9",
+    "site gets no more ids than its limit, save by the operator":
+        "f/1=1 f/2=2 f/3=3 f/4=- f/5=- g/1=4 f/4!9 f/4=9",
+    "sites of one client share the limit of one site":
+        "a@x b@x c@x a/1=1 a/2=2 b/1=3 b/2=- c/1=- f/1=4 c@y c/1=5 b/2=-",
+}  # fmt: skip
+"""Ids of vehicles: given (=), assigned by hand or left out (!), looked up (:); the client of a site
+(@). A site has at most three."""
+
+
+@pytest.mark.parametrize("name", TRANSCRIPTS)
+def test_ids_are_given_and_assigned(name: str) -> None:
+    ids = IdMap(per_site=3)
+    for word in TRANSCRIPTS[name].split():
+        left, mark, right = re.split("([=!:@])", word)
+        site, system = left[0], int(left[2:] or 0)
+        if mark == "=":
+            assert ids.id_of(site, system) == (None if right == "-" else int(right)), word
+        elif mark == ":":
+            found = ids.vehicle_of(int(left))
+            assert found == (None if right == "-" else (right[0], int(right[2:]))), word
+        elif mark == "@":
+            ids.set_client(site, right)
+        elif right == "0":
+            ids.leave_out(site, system)
+        else:
+            ids.set_by_hand(site, system, int(right))
     assert IdMap(dict(ids.items())).items() == ids.items()
+
+
+def test_id_out_of_range_is_refused() -> None:
+    for wrong in (0, 250):
+        with pytest.raises(ValueError, match="1 to 249"):
+            IdMap().set_by_hand("a", 1, wrong)
 
 
 def filled(sites: int, systems: int = LAST_ID) -> IdMap:
@@ -68,37 +97,21 @@ def test_no_site_takes_all_ids(sites: int) -> None:
     assert ids.id_of("many-0", 249) is None
 
 
-def test_site_gets_no_more_ids_than_its_limit() -> None:
+def test_room_is_made_within_the_limit_of_a_client() -> None:
     ids = IdMap(per_site=3)
-    assert [ids.id_of("field", system) for system in range(1, 6)] == [1, 2, 3, None, None]
-    assert ids.id_of("other", 1) == 4
-    received_us = dict.fromkeys([vehicle for vehicle, _ in ids.items()], 0)
-    for site in range(LAST_ID):
-        ids.id_of(f"site-{site}", 1)
-    done = ids.make_room(received_us, 1000)
-    assert done is None or done.holder[0] != "field" or done.former[0] == "field"
-    ids.set_by_hand("field", 4, 9)
-    assert ids.known_id("field", 4) == 9, "the operator may exceed the limit"
-
-
-def test_sites_of_one_client_share_the_limit_of_one_site() -> None:
-    ids = IdMap(per_site=3)
-    for number in range(5):
-        ids.set_client(f"forged-{number}", "forger")
-    given = [ids.id_of(f"forged-{n}", system) for n in range(5) for system in (1, 2)]
-    assert [each for each in given if each is not None] == [1, 2, 3]
-    assert ids.id_of("field", 1) == 4
-    ids.set_client("forged-4", "its own session")
-    assert ids.id_of("forged-4", 1) is not None
-    assert ids.id_of("forged-2", 1) is None
+    for site in "ab":
+        ids.set_client(f"forged-{site}", "forger")
+    given = [ids.id_of("forged-a", 1), ids.id_of("forged-a", 2), ids.id_of("forged-a", 3)]
+    assert (given, ids.id_of("forged-b", 1)) == ([1, 2, 3], None)
+    ids.id_of("field", 1)
     for system in range(1, 6):
         ids.set_by_hand("large", system, 10 + system)
     received_us = {vehicle: 1000 for vehicle, _ in ids.items()}
     for idle in (("field", 1), ("large", 1)):
         assert ids.make_room(received_us | {idle: 0}, 1000) is None
-    done = ids.make_room(received_us | {("forged-0", 1): 0}, 1000)
+    done = ids.make_room(received_us | {("forged-a", 1): 0}, 1000)
     assert done is not None
-    assert (done.former, done.holder) == (("forged-0", 1), ("forged-2", 1))
+    assert (done.former, done.holder) == (("forged-a", 1), ("forged-b", 1))
 
 
 def test_received_vehicle_keeps_its_id() -> None:
@@ -136,22 +149,6 @@ def test_number_of_waiting_vehicles_is_bounded() -> None:
     for number in range(MAX_WAITING):
         assert ids.id_of(f"s{number}", 1) is None
     assert len(ids.unmapped) == MAX_WAITING
-
-
-def test_id_assigned_by_the_operator_is_swapped() -> None:
-    ids = IdMap()
-    for site in "abcd":
-        ids.id_of(site, 1)
-    ids.leave_out("b", 1)
-    ids.set_by_hand("d", 1, 1)
-    assert [ids.known_id(site, 1) for site in "acd"] == [4, 3, 1]
-    ids.set_by_hand("e", 1, 3)
-    assert [ids.known_id(site, 1) for site in "ce"] == [2, 3]
-    ids.set_by_hand("f", 1, 9)
-    assert ids.id_of("f", 1) == 9
-    for wrong in (0, 250):
-        with pytest.raises(ValueError, match="1 to 249"):
-            ids.set_by_hand("a", 1, wrong)
 
 
 @pytest.mark.parametrize("seed", range(20))

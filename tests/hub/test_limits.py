@@ -26,6 +26,7 @@ TRANSCRIPTS = {
     "new untrusted client does not refill the bucket of all":
         "+1a? =1a? !1? x1 +2a? +3a? +4a =4a =- >1 =2a?",
     "client no longer trusted uses the shared bucket": "+9a? !9? +1a =1a +1b? =-",
+    "client that loses trust loses its waiting requests": "+9a? !9? +1a +1b? =-",
     "removed client leaves neither requests nor a quota": "+1a !1 x1 =- +1b =1b",
     "flooding client delays only itself": "+1a " * MAX_WAITING + "-1a +2a =1a =2a",
 }  # fmt: skip

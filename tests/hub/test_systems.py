@@ -234,6 +234,9 @@ CONVERSATIONS: dict[str, list[Any]] = {
         (C, CORRECTIONS, 255, STATION), (C, GCS, 255, STATION), {}, (C, CORRECTIONS, 255, STATION),
         {A: [(255, 233)], B: []},
     ],
+    "frames of an excluded system are counted": [
+        ("systems=1", "", ""), (A, attitude(), 2, 1), {B: [], C: [], "unroutable": 1},
+    ],
     "telemetry of a vehicle goes to all others": [
         ("", "", ""), (A, heartbeat(), 1, 1), {}, (A, attitude(), 1, 1),
         {A: [], B: [(1, 30)], C: [(1, 30)], "ours": 0},

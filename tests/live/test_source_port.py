@@ -105,18 +105,6 @@ async def test_serial_device_is_opened_again_after_it_was_unplugged(tmp_path: Pa
             await until(lambda: not opened.source.connected)
 
 
-async def test_server_is_connected_again_after_it_has_closed() -> None:
-    async def serve(_reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        writer.write(b"x")
-        await writer.drain()
-        writer.close()
-
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    port = server.sockets[0].getsockname()[1]
-    async with server, Opened(f"lines:tcp:127.0.0.1:{port}") as opened:
-        await until(lambda: opened.data.startswith(b"xx"))
-
-
 async def test_newest_client_of_a_listening_source_is_used(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
