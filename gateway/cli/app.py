@@ -15,13 +15,13 @@ from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import IO, Annotated, Any, Final, cast
+from typing import IO, Any, Final, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from gateway import __version__
-from gateway.cli.support.options import CONFIG, SOCKET, USER_CONFIG, extend
+from gateway.cli.support.options import CONFIG, SOCKET, USER_CONFIG, extend, option
 from gateway.cli.support.terminal import in_words, refusing
 from gateway.live.log_limit import LogLimit
 from gateway.printable import PrintableFormatter, printable, reason_of
@@ -219,26 +219,16 @@ def _commit() -> str:
 def _options(
     context: typer.Context,
     *,
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            "--config",
-            "-c",
-            help=f"Settings file; by default gateway.toml in {USER_CONFIG.parent}.",
-        ),
-    ] = None,
-    socket: Annotated[
-        Path | None,
-        typer.Option(
-            "--socket",
-            envvar="MAVGATE_SOCKET",
-            help="Control socket of the gateway to use, if several run.",
-        ),
-    ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log details too.")] = False,
-    _version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show version.")
-    ] = False,
+    config: Path | None = option(
+        "--config -c", f"Settings file; by default gateway.toml in {USER_CONFIG.parent}."
+    ),
+    socket: Path | None = option(
+        "--socket", "Control socket of the gateway to use, if several run.", envvar="MAVGATE_SOCKET"
+    ),
+    verbose: bool = option("--verbose -v", "Log details too.", False),
+    _version: bool = option(
+        "--version", "Show version.", False, callback=_show_version, is_eager=True
+    ),
 ) -> None:
     for chosen, value in ((CONFIG, config), (SOCKET, socket)):
         context.call_on_close(partial(chosen.reset, chosen.set(value)))

@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from enum import StrEnum
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 import typer
@@ -20,9 +20,11 @@ from rich.progress import BarColumn, Progress, TextColumn
 from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import (
     CONFIG,
+    argument,
     ask,
     folder_of,
     is_running,
+    option,
     read_options,
     read_settings,
 )
@@ -105,24 +107,16 @@ Poses = Callable[[Step], list[NodeSamples]]
 
 @app.command()
 def calibrate(
-    steps: Annotated[
-        list[Step] | None, typer.Argument(help=f"Steps; by default {' '.join(STEPS)}.")
-    ] = None,
+    steps: list[Step] | None = argument(f"Steps; by default {' '.join(STEPS)}."),
     *,
-    vehicle: Annotated[int, typer.Option("--vehicle", min=1, max=31, help="Its id.")] = 1,
-    log: Annotated[
-        Path | None,
-        typer.Option("--log", help="Calibrate from a recording, by name or file, instead."),
-    ] = None,
-    port: opt.Port = None,
-    field_ut: Annotated[
-        float | None,
-        typer.Option("--field-strength", min=10.0, max=100.0, help="Of the field here, uT."),
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show the result, but do not save it.")
-    ] = False,
-    simulated: opt.Simulated = False,
+    vehicle: int = option("--vehicle", "Its id.", 1, min=1, max=31),
+    log: Path | None = option("--log", "Calibrate from a recording, by name or file, instead."),
+    port: str | None = opt.PORT,
+    field_ut: float | None = option(
+        "--field-strength", "Of the field here, uT.", min=10.0, max=100.0
+    ),
+    dry_run: bool = option("--dry-run", "Show the result, but do not save it.", False),
+    simulated: bool = opt.SIMULATED,
 ) -> None:
     """Calibrate an aircraft's sensors and save the result with its residuals.
 

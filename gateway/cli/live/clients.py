@@ -3,13 +3,13 @@
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from gateway.cli.support.options import SOCKET, ask, settings_file
+from gateway.cli.support.options import SOCKET, argument, ask, option, settings_file
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
     JsonOption,
@@ -43,12 +43,9 @@ MOST_SYSTEMS: Final = 8
 @app.command()
 def status(
     *,
-    requests: Annotated[
-        bool,
-        typer.Option(
-            "--requests", help="Show the requests of clients that were refused or had no answer."
-        ),
-    ] = False,
+    requests: bool = option(
+        "--requests", "Show the requests of clients that were refused or had no answer.", False
+    ),
     json: JsonOption = False,
 ) -> None:
     """Show the status of the gateway: receiver, nodes, vehicles, clients.
@@ -86,11 +83,9 @@ def list_clients(*, json: JsonOption = False) -> None:
 
 @group.command()
 def add(
-    url: Annotated[str, typer.Argument(help="As in the settings: udp:192.168.1.7:14550?name=…")],
+    url: str = argument("As in the settings: udp:192.168.1.7:14550?name=…", ...),
     *,
-    save: Annotated[
-        bool, typer.Option("--save", help="Save it in the settings file too, for the next start.")
-    ] = False,
+    save: bool = option("--save", "Save it in the settings file too, for the next start.", False),
 ) -> None:
     """Add a client or a source, until the gateway ends or permanently."""
     ask("clients.add", url=url)
@@ -115,7 +110,7 @@ def _save(file: Path, url: str) -> None:
 
 
 @group.command()
-def remove(name: Annotated[str, typer.Argument(help="Name or URL of the client.")]) -> None:
+def remove(name: str = argument("Name or URL of the client.", ...)) -> None:
     """Remove a client, a source or a listening port."""
     ask("clients.remove", name=name)
     print(f"removed {name}")
@@ -123,13 +118,11 @@ def remove(name: Annotated[str, typer.Argument(help="Name or URL of the client."
 
 @group.command(context_settings=NEGATIVE_NUMBERS)
 def mark(
-    lat_deg: Annotated[float | None, typer.Argument(help="Latitude; south is negative.")] = None,
-    lon_deg: Annotated[float | None, typer.Argument(help="Longitude; west is negative.")] = None,
-    alt_amsl_m: Annotated[float | None, typer.Argument(help="Height AMSL in m.")] = None,
+    lat_deg: float | None = argument("Latitude; south is negative."),
+    lon_deg: float | None = argument("Longitude; west is negative."),
+    alt_amsl_m: float | None = argument("Height AMSL in m."),
     *,
-    vehicle: Annotated[
-        int | None, typer.Option("--vehicle", help="For this vehicle only; by default all.")
-    ] = None,
+    vehicle: int | None = option("--vehicle", "For this vehicle only; by default all."),
 ) -> None:
     """Mark a location: clients show distance and bearing to it. Without one, clear the mark."""
     for name, value in (("LAT_DEG", lat_deg), ("LON_DEG", lon_deg), ("ALT_AMSL_M", alt_amsl_m)):

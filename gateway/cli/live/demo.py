@@ -13,7 +13,7 @@ from contextlib import suppress
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Annotated, Final, Literal, cast
+from typing import Final, Literal, cast
 
 import msgspec
 import typer
@@ -27,6 +27,7 @@ from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import (
     CONFIG,
     folder_of,
+    option,
     read_options,
     read_settings,
     settings_file,
@@ -59,25 +60,20 @@ TrackerName = Literal["crsf", "lines", "phone"]
 @app.command()
 def demo(
     *,
-    endpoint: opt.Endpoint = None,
-    plain: opt.Plain = False,
-    record: Annotated[bool, typer.Option("--record", help="Record it from the start.")] = False,
-    flight: Annotated[
-        Path | None,
-        typer.Option("--flight", "-f", help="Fly a recording instead: by its name, or any file."),
-    ] = None,
-    firmware: Annotated[
-        Radio | None,
-        typer.Option(
-            "--firmware", help="Run the boards' own programs on simulated chips, with this radio."
-        ),
-    ] = None,
-    tracker: Annotated[
-        TrackerName | None,
-        typer.Option("--tracker", help="Fly it through the bytes of another kind of tracker."),
-    ] = None,
-    panel: Annotated[bool, typer.Option("--panel/--no-panel", help="Start the panel too.")] = True,
-    duplicate_ids: opt.DuplicateIds = False,
+    endpoint: list[str] | None = opt.ENDPOINT,
+    plain: bool = opt.PLAIN,
+    record: bool = option("--record", "Record it from the start.", False),
+    flight: Path | None = option(
+        "--flight -f", "Fly a recording instead: by its name, or any file."
+    ),
+    firmware: Radio | None = option(
+        "--firmware", "Run the boards' own programs on simulated chips, with this radio."
+    ),
+    tracker: TrackerName | None = option(
+        "--tracker", "Fly it through the bytes of another kind of tracker."
+    ),
+    panel: bool = option("--panel/--no-panel", "Start the panel too.", True),
+    duplicate_ids: bool = opt.DUPLICATE_IDS,
 ) -> None:
     """Fly the simulated tracker repeatedly until interrupted.
 

@@ -13,11 +13,18 @@ from datetime import UTC, datetime
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import typer
 
-from gateway.cli.support.options import CONFIG, folder_of, read_settings, settings_file
+from gateway.cli.support.options import (
+    CONFIG,
+    argument,
+    folder_of,
+    option,
+    read_settings,
+    settings_file,
+)
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.compiled.entry_point import LibraryError, load_entry_points
 from gateway.config import (
@@ -308,22 +315,16 @@ CHECKS: Final[tuple[Check, ...]] = (
 
 @app.command()
 def doctor(
-    file: Annotated[
-        Path | None,
-        typer.Argument(help="Settings file to check alone; without it, this machine is checked."),
-    ] = None,
+    file: Path | None = argument(
+        "Settings file to check alone; without it, this machine is checked."
+    ),
     *,
-    template: Annotated[
-        Literal["usual", "all"] | None,
-        typer.Option(
-            "--template",
-            help="Print a settings file instead, with the defaults of the settings that are "
-            "changed most, or of all.",
-        ),
-    ] = None,
-    write: Annotated[
-        bool, typer.Option("--write", help="Write that file as the settings, if there are none.")
-    ] = False,
+    template: Literal["usual", "all"] | None = option(
+        "--template",
+        "Print a settings file instead, with the defaults of the settings that are "
+        "changed most, or of all.",
+    ),
+    write: bool = option("--write", "Write that file as the settings, if there are none.", False),
 ) -> None:
     """Check settings and machine and suggest fixes: rights, ports, latency, kernels, time, disk.
 

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal, NoReturn
+from typing import TYPE_CHECKING, Final, Literal, NoReturn
 
 import typer
 from msgspec.structs import replace
@@ -22,7 +22,7 @@ from gateway.cli.live.calibrate import (
     simulated_receiver,
 )
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.options import read_settings, settings_file
+from gateway.cli.support.options import argument, option, read_settings, settings_file
 from gateway.cli.support.phone import guide_phone
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
@@ -58,17 +58,13 @@ app = typer.Typer()
 
 @app.command()
 def setup(
-    what: Annotated[
-        Literal["boards", "phone"],
-        typer.Argument(help="Our boards, or a phone that posts the readings of its sensors."),
-    ] = "boards",
+    what: Literal["boards", "phone"] = argument(
+        "Our boards, or a phone that posts the readings of its sensors.", "boards"
+    ),
     *,
-    vehicle: Annotated[
-        int | None,
-        typer.Option("--vehicle", min=1, max=31, help="Its id, if several send."),
-    ] = None,
-    port: opt.Port = None,
-    simulated: opt.Simulated = False,
+    vehicle: int | None = option("--vehicle", "Its id, if several send.", min=1, max=31),
+    port: str | None = opt.PORT,
+    simulated: bool = opt.SIMULATED,
 ) -> None:
     """Guide through the first start: receiver, sensors, radio, GPS, calibration.
 

@@ -1,13 +1,13 @@
 """`mavgate flash`: programs and settings of boards."""
 
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 import msgspec
 import typer
 from intelhex import IntelHex
 
-from gateway.cli.support.options import output_file
+from gateway.cli.support.options import argument, option, output_file
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.flashing import airtime, boards
 from gateway.flashing.boards import (
@@ -65,77 +65,55 @@ def _panel(name: str) -> str:
 
 
 def _option(name: str) -> Any:
-    field, flags = FIELDS[name], [OPTIONS[name]]
-    if name == "imu_raw":
-        flags = ["--raw/--filtered"]
+    field = FIELDS[name]
+    names = "--raw/--filtered" if name == "imu_raw" else OPTIONS[name]
     unbounded = ("imu_raw", "radio_address", "lora_foreign")
     allowed = "" if name in unbounded else f" {_allowed(field)}."
     text = f"{field.meaning}{allowed}"
-    return typer.Option(*flags, help=text, show_default=False, rich_help_panel=_panel(name))
+    return option(names, text, show_default=False, rich_help_panel=_panel(name))
 
 
 @app.command()
 def flash(
-    board: Annotated[
-        Literal["imu", "gps", "receiver"] | None,
-        typer.Argument(help="Program to write; without it, list the boards."),
-    ] = None,
+    board: Literal["imu", "gps", "receiver"] | None = argument(
+        "Program to write; without it, list the boards."
+    ),
     *,
-    port: Annotated[
-        str, typer.Option("--port", "-p", help="As serial.port: device, usb:VID:PID or auto.")
-    ] = "auto",
-    show: Annotated[
-        bool, typer.Option("--show", help="Read the program, version and settings of a board.")
-    ] = False,
-    keep: Annotated[
-        bool, typer.Option("--keep", help="Keep present settings that are not given.")
-    ] = False,
-    clock: Annotated[int, typer.Option("--clock", help="Crystal: 16 or 8 MHz.")] = 16,
-    output: Annotated[
-        Path | None,
-        output_file("Write the image to this file, not to a board.", (".hex",)),
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
-    radio: Annotated[
-        Radio, typer.Option("--radio", help="The radio of all boards: nRF24L01+ or LoRa.")
-    ] = "nrf24",
-    power: Annotated[
-        int | None,
-        typer.Option("--power", help="Transmit power: -18, -12, -6, 0 dBm; with LoRa 2 to 20."),
-    ] = None,
-    vehicle: Annotated[int | None, _option("vehicle_id")] = None,
-    node: Annotated[int | None, _option("node_id")] = None,
-    pipe: Annotated[int | None, _option("radio_pipe")] = None,
-    send_rate: Annotated[int | None, _option("imu_send_hz")] = None,
-    raw: Annotated[bool | None, _option("imu_raw")] = None,
-    accel_range: Annotated[int | None, _option("accel_range_g")] = None,
-    gyro_range: Annotated[int | None, _option("gyro_range_dps")] = None,
-    gps_rate: Annotated[int | None, _option("gps_rate_hz")] = None,
-    gps_model: Annotated[int | None, _option("gps_dynamic_model")] = None,
-    channel: Annotated[int | None, _option("radio_channel")] = None,
-    air_rate: Annotated[int | None, _option("radio_kbps")] = None,
-    address: Annotated[str | None, _option("radio_address")] = None,
-    frequency: Annotated[
-        float | None,
-        typer.Option(
-            "--frequency",
-            help="Centre of the channel, MHz; the same on all boards.",
-            rich_help_panel="LoRa",
-        ),
-    ] = None,
-    bandwidth: Annotated[int | None, _option("lora_bandwidth_khz")] = None,
-    spreading: Annotated[int | None, _option("lora_spreading")] = None,
-    coding: Annotated[int | None, _option("lora_coding")] = None,
-    sync_word: Annotated[int | None, _option("lora_sync_word")] = None,
-    foreign: Annotated[bool | None, _option("lora_foreign")] = None,
-    duty: Annotated[
-        float | None,
-        typer.Option(
-            "--duty",
-            help="Maximum time on air, percent; by default 45, with a warning.",
-            rich_help_panel="LoRa",
-        ),
-    ] = None,
+    port: str = option("--port -p", "As serial.port: device, usb:VID:PID or auto.", "auto"),
+    show: bool = option("--show", "Read the program, version and settings of a board.", False),
+    keep: bool = option("--keep", "Keep present settings that are not given.", False),
+    clock: int = option("--clock", "Crystal: 16 or 8 MHz.", 16),
+    output: Path | None = output_file("Write the image to this file, not to a board.", (".hex",)),
+    force: bool = option("--force", "Replace an existing file.", False),
+    radio: Radio = option("--radio", "The radio of all boards: nRF24L01+ or LoRa.", "nrf24"),
+    power: int | None = option(
+        "--power", "Transmit power: -18, -12, -6, 0 dBm; with LoRa 2 to 20."
+    ),
+    vehicle: int | None = _option("vehicle_id"),
+    node: int | None = _option("node_id"),
+    pipe: int | None = _option("radio_pipe"),
+    send_rate: int | None = _option("imu_send_hz"),
+    raw: bool | None = _option("imu_raw"),
+    accel_range: int | None = _option("accel_range_g"),
+    gyro_range: int | None = _option("gyro_range_dps"),
+    gps_rate: int | None = _option("gps_rate_hz"),
+    gps_model: int | None = _option("gps_dynamic_model"),
+    channel: int | None = _option("radio_channel"),
+    air_rate: int | None = _option("radio_kbps"),
+    address: str | None = _option("radio_address"),
+    frequency: float | None = option(
+        "--frequency", "Centre of the channel, MHz; the same on all boards.", rich_help_panel="LoRa"
+    ),
+    bandwidth: int | None = _option("lora_bandwidth_khz"),
+    spreading: int | None = _option("lora_spreading"),
+    coding: int | None = _option("lora_coding"),
+    sync_word: int | None = _option("lora_sync_word"),
+    foreign: bool | None = _option("lora_foreign"),
+    duty: float | None = option(
+        "--duty",
+        "Maximum time on air, percent; by default 45, with a warning.",
+        rich_help_panel="LoRa",
+    ),
 ) -> None:
     """Write a ready-made program with its settings to a board, or read them back.
 

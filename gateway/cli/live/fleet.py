@@ -5,7 +5,7 @@ import logging
 from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import msgspec
 import typer
@@ -13,7 +13,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColu
 
 from gateway.cli.live.run import with_endpoints
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.options import ask, read_settings, socket_of
+from gateway.cli.support.options import argument, ask, option, read_settings, socket_of
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, refuse, table_of
 from gateway.extras import require
 from gateway.fleet.recording_fetch import FetchError, RecordingFetch
@@ -48,17 +48,10 @@ group.add_typer(recordings_group, name="recordings")
 def fleet(
     context: typer.Context,
     *,
-    listen: Annotated[
-        str | None,
-        typer.Option("--listen", help="Run the router here, e.g. tls/0.0.0.0:7447."),
-    ] = None,
-    connect: Annotated[
-        str | None, typer.Option("--connect", help="Router to connect to: tls/HOST:7447.")
-    ] = None,
-    site: Annotated[
-        list[str] | None, typer.Option("--site", help="Sites to show, such as 'field-*'.")
-    ] = None,
-    endpoint: opt.Endpoint = None,
+    listen: str | None = option("--listen", "Run the router here, e.g. tls/0.0.0.0:7447."),
+    connect: str | None = option("--connect", "Router to connect to: tls/HOST:7447."),
+    site: list[str] | None = option("--site", "Sites to show, such as 'field-*'."),
+    endpoint: list[str] | None = opt.ENDPOINT,
 ) -> None:
     """Show the vehicles of many sites here, through a Zenoh router."""
     if context.invoked_subcommand is not None:
@@ -106,8 +99,8 @@ def status(*, json: JsonOption = False) -> None:
 
 @group.command("id")
 def set_id(
-    vehicle: Annotated[str, typer.Argument(help="SITE/SYSTEM, as in field-1/1.")],
-    own_id: Annotated[int, typer.Argument(help="Its system id here; 0 excludes it.")],
+    vehicle: str = argument("SITE/SYSTEM, as in field-1/1.", ...),
+    own_id: int = argument("Its system id here; 0 excludes it.", ...),
 ) -> None:
     """Assign a system id to a vehicle of a site, or exclude it; the choice is saved."""
     name, _, system = vehicle.rpartition("/")
@@ -157,7 +150,7 @@ async def _serve(settings: Any, hub_settings: Any) -> None:
 def recordings(
     context: typer.Context,
     *,
-    site: Annotated[str, typer.Option("--site", help="Only these sites, such as 'field-*'.")] = "",
+    site: str = option("--site", "Only these sites, such as 'field-*'.", ""),
     json: JsonOption = False,
 ) -> None:
     """List the recordings of the sites, the newest last."""
@@ -183,14 +176,11 @@ def _when(recording: Mapping[str, Any]) -> str:
 
 @recordings_group.command()
 def get(
-    site: Annotated[str, typer.Argument(help="The site.")],
-    name: Annotated[str, typer.Argument(help="Name of a recording, or last.")],
+    site: str = argument("The site.", ...),
+    name: str = argument("Name of a recording, or last.", ...),
     *,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Folder; by default one named after the site."),
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace files that differ.")] = False,
+    output: Path | None = option("--output -o", "Folder; by default one named after the site."),
+    force: bool = option("--force", "Replace files that differ.", False),
 ) -> None:
     """Fetch a recording of a site; an interrupted fetch is continued."""
     if not SITE_NAME.fullmatch(site):

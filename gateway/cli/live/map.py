@@ -2,12 +2,11 @@
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
 
 import typer
 from rich.progress import Progress
 
-from gateway.cli.support.options import folder_of, read_options, read_settings
+from gateway.cli.support.options import argument, folder_of, option, read_options, read_settings
 from gateway.cli.support.recordings import files_of, name_of
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of, refuse
 from gateway.extras import require
@@ -17,20 +16,16 @@ app = typer.Typer()
 
 @app.command("map", context_settings=NEGATIVE_NUMBERS)
 def get_map(
-    around: Annotated[str, typer.Argument(help="A recording, or LATITUDE,LONGITUDE in degrees.")],
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="A PMTiles file of raster tiles: an https:// address whose owner permits "
-            "extracts, or a path.",
-        ),
-    ],
+    around: str = argument("A recording, or LATITUDE,LONGITUDE in degrees.", ...),
+    source: str = argument(
+        "A PMTiles file of raster tiles: an https:// address whose owner permits "
+        "extracts, or a path.",
+        ...,
+    ),
     *,
-    radius: Annotated[str, typer.Option("--radius", help="Margin: 5km, 800m, 3mi.")] = "5km",
-    zoom: Annotated[int, typer.Option("--zoom", min=1, max=22, help="Greatest zoom.")] = 16,
-    name: Annotated[
-        str | None, typer.Option("--name", help="Name of the map style; by default the area's.")
-    ] = None,
+    radius: str = option("--radius", "Margin: 5km, 800m, 3mi.", "5km"),
+    zoom: int = option("--zoom", "Greatest zoom.", 16, min=1, max=22),
+    name: str | None = option("--name", "Name of the map style; by default the area's."),
 ) -> None:
     """Fetch an area of a map for the panel, for use without a network.
 

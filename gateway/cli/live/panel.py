@@ -8,12 +8,12 @@ import sys
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
 import typer
 from msgspec.structs import replace
 
-from gateway.cli.support.options import CONFIG, SOCKET, folder_of, read_settings
+from gateway.cli.support.options import CONFIG, SOCKET, folder_of, option, read_settings
 from gateway.cli.support.terminal import refuse
 from gateway.extras import how_to_add, missing, require
 from gateway.hub.endpoint import parse_endpoint
@@ -41,20 +41,14 @@ END_S: Final = 3.0
 @app.command()
 def panel(
     *,
-    connect: Annotated[
-        str | None,
-        typer.Option(
-            "--connect",
-            help="A vehicle's MAVLink, such as tcp:HOST:5760 or udp-listen:0.0.0.0:14550.",
-        ),
-    ] = None,
-    tcp_port: Annotated[
-        int | None, typer.Option("--tcp-port", help="Instead of the settings'.", min=0, max=65535)
-    ] = None,
-    hash_password: Annotated[
-        bool, typer.Option("--hash-password", help="Prompt for a password and print its hash.")
-    ] = False,
-    attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
+    connect: str | None = option(
+        "--connect", "A vehicle's MAVLink, such as tcp:HOST:5760 or udp-listen:0.0.0.0:14550."
+    ),
+    tcp_port: int | None = option("--tcp-port", "Instead of the settings'.", min=0, max=65535),
+    hash_password: bool = option(
+        "--hash-password", "Prompt for a password and print its hash.", False
+    ),
+    attached: bool = option("--attached", "", False, hidden=True),
 ) -> None:
     """Show the aircraft in a browser: instruments, map, link, recordings, calibration, tuning.
 

@@ -2,11 +2,11 @@
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-from gateway.cli.support.options import ask, folder_of, is_running, read_settings
+from gateway.cli.support.options import argument, ask, folder_of, is_running, option, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, duration_text, print_json
 from gateway.live.session import SessionState
 from gateway.recordings.index import (
@@ -49,11 +49,10 @@ def status(*, json: JsonOption = False) -> None:
 
 @group.command()
 def rename(
-    name: Annotated[str, typer.Argument(help="New name: letters, digits, spaces, dots, hyphens.")],
-    recording: Annotated[
-        str | None,
-        typer.Argument(help="Recording; by default the current or last one.", show_default=False),
-    ] = None,
+    name: str = argument("New name: letters, digits, spaces, dots, hyphens.", ...),
+    recording: str | None = argument(
+        "Recording; by default the current or last one.", show_default=False
+    ),
 ) -> None:
     """Rename a recording; nothing is ever overwritten."""
     if recording is None and is_running():
@@ -66,9 +65,9 @@ def rename(
 
 @group.command()
 def delete(
-    name: Annotated[str, typer.Argument(help="Name of a recording, or last.")],
+    name: str = argument("Name of a recording, or last.", ...),
     *,
-    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmation.")] = False,
+    yes: bool = option("--yes -y", "Do not ask for confirmation.", False),
 ) -> None:
     """Delete a recording, after asking."""
     running = is_running()
@@ -87,7 +86,7 @@ def delete(
 
 
 @group.command()
-def note(text: Annotated[str, typer.Argument(help="Text of the remark.")]) -> None:
+def note(text: str = argument("Text of the remark.", ...)) -> None:
     """Add a remark to the recording at this moment, and send it to the ground stations."""
     _show(ask("record.note", text=text))
 

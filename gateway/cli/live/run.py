@@ -7,14 +7,14 @@ import signal
 import sys
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 import typer
 
 from gateway.cli.live.panel import PanelProcess, launched_panel
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.options import CONFIG, read_settings, settings_file
+from gateway.cli.support.options import CONFIG, option, read_settings, settings_file
 from gateway.cli.support.terminal import refuse
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import ConfigError, GatewaySettings, load_aircraft
@@ -42,20 +42,14 @@ SWITCH_S: Final = 0.0001
 @app.command("run")
 def run_gateway(
     *,
-    port: opt.Port = None,
-    source: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--source",
-            "-s",
-            help="A tracker, radio or phone, such as crsf:/dev/ttyACM0, instead of the settings'.",
-        ),
-    ] = None,
-    endpoint: opt.Endpoint = None,
-    plain: opt.Plain = False,
-    panel: Annotated[
-        bool, typer.Option("--panel", help="Start the panel too, whatever the settings.")
-    ] = False,
+    port: str | None = opt.PORT,
+    source: list[str] | None = option(
+        "--source -s",
+        "A tracker, radio or phone, such as crsf:/dev/ttyACM0, instead of the settings'.",
+    ),
+    endpoint: list[str] | None = opt.ENDPOINT,
+    plain: bool = opt.PLAIN,
+    panel: bool = option("--panel", "Start the panel too, whatever the settings.", False),
 ) -> None:
     """Run the gateway: for receiver, trackers or a router, until interrupted.
 

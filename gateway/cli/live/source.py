@@ -1,10 +1,10 @@
 """`mavgate source`: describe the data that a tracker sends."""
 
 import asyncio
-from typing import Annotated
 
 import typer
 
+from gateway.cli.support.options import argument, option
 from gateway.cli.support.terminal import refuse
 from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
@@ -24,10 +24,8 @@ SHOWN = 5
 
 @app.command("source")
 def try_source(
-    url: Annotated[str, typer.Argument(help="Such as lines:/dev/ttyUSB0 or crsf:/dev/ttyACM0.")],
-    seconds: Annotated[
-        float, typer.Option("--seconds", min=0.1, max=3600, help="Duration of the test, s.")
-    ] = 10.0,
+    url: str = argument("Such as lines:/dev/ttyUSB0 or crsf:/dev/ttyACM0.", ...),
+    seconds: float = option("--seconds", "Duration of the test, s.", 10.0, min=0.1, max=3600),
 ) -> None:
     """Test a tracker: show its data, its rates, and data missing for attitude and position.
 

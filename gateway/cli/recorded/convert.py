@@ -4,13 +4,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import typer
 
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.options import CONFIG, output_file, read_options, read_settings
+from gateway.cli.support.options import CONFIG, option, output_file, read_options, read_settings
 from gateway.cli.support.recordings import (
     print_remarks,
     progress_of,
@@ -23,6 +24,7 @@ from gateway.estimation.select import ESTIMATORS
 from gateway.output import write_new
 from gateway.recordings.files import FlightError
 from gateway.recordings.recording import open_recordings
+from gateway.recordings.table import Position, SettingsChoice
 from gateway.recordings.workshop.anonymising import (
     FIRST_DAY,
     LAST_DAY,
@@ -52,87 +54,68 @@ PANEL: Final = "Tlog to tlog"
 """Heading of these options in the help."""
 
 
-def _option(name: str, text: str, **how: Any) -> Any:
-    """Return an option for writing tlogs from tlogs."""
-    return typer.Option(name, help=text, rich_help_panel=PANEL, **how)
+_option: Final = partial(option, rich_help_panel=PANEL)
+"""Return an option for writing tlogs from tlogs."""
 
 
 @app.command()
 def convert(
-    files: opt.Files,
+    files: list[Path] = opt.FILES,
     *,
-    output: Annotated[Path, output_file("Output; its ending selects the format.", WRITERS)],
-    begin: opt.From = None,
-    end: opt.To = None,
-    columns: opt.Columns = None,
-    sensor: opt.Sensor = None,
-    system: Annotated[
-        list[int] | None,
-        typer.Option(
-            "--system", min=1, max=255, help="Vehicle of a tlog to use; for a tlog also several."
-        ),
-    ] = None,
-    component: Annotated[
-        list[int] | None,
-        _option("--component", "Keep frames of this component; may be repeated.", min=0, max=255),
-    ] = None,
-    message: Annotated[
-        list[str] | None,
-        _option(
-            "--message",
-            "Keep messages of this name, id or pattern (CAMERA_*); may be repeated. For Parquet "
-            "and CSV: this message instead of the table.",
-        ),
-    ] = None,
-    without: Annotated[
-        list[str] | None,
-        _option("--without", "Leave out messages of this name, id or pattern; may be repeated."),
-    ] = None,
-    armed: Annotated[
-        bool, _option("--armed", "Keep the time while a vehicle is armed, or one of --system.")
-    ] = False,
-    modes: Annotated[
-        list[str] | None,
-        _option("--from-mode", "Keep the time while a vehicle is in this mode; may be repeated."),
-    ] = None,
-    margin_s: Annotated[
-        float,
-        _option(
-            "--margin",
-            "Margin before and after --armed and --from-mode, s.",
-            min=0.0,
-            max=MAX_MARGIN_S,
-        ),
-    ] = 0.0,
-    merge: Annotated[
-        bool | None,
-        _option(
-            "--merge/--join",
-            "Leave out copies of frames that are in several files, and align their clocks; or "
-            "keep all. By default files are merged if they overlap.",
-        ),
-    ] = None,
-    rename: Annotated[
-        list[str] | None,
-        _option("--as", "OLD:NEW gives a system another id, also where it is addressed."),
-    ] = None,
-    merge_systems: Annotated[
-        bool, _option("--merge-systems", "With --as, give several systems the same id.")
-    ] = False,
-    anonymise: Annotated[
-        bool,
-        _option("--anonymise", "Move coordinates and dates, replace texts and identifiers."),
-    ] = False,
-    place: Annotated[
-        str | None, _option("--place", "LAT,LON to which --anonymise moves the first position.")
-    ] = None,
-    day: Annotated[
-        str | None, _option("--day", "Day to which --anonymise moves the recording: 2020-01-31.")
-    ] = None,
-    keep_unknown: Annotated[
-        bool, _option("--keep-unknown", "With --anonymise, keep messages that are not known here.")
-    ] = False,
-    force: opt.Force = False,
+    output: Path = output_file("Output; its ending selects the format.", WRITERS, default=...),
+    begin: str | None = opt.FROM,
+    end: str | None = opt.TO,
+    columns: Path | None = opt.COLUMNS,
+    sensor: list[str] | None = opt.SENSOR,
+    system: list[int] | None = option(
+        "--system", "Vehicle of a tlog to use; for a tlog also several.", min=1, max=255
+    ),
+    component: list[int] | None = _option(
+        "--component", "Keep frames of this component; may be repeated.", min=0, max=255
+    ),
+    message: list[str] | None = _option(
+        "--message",
+        "Keep messages of this name, id or pattern (CAMERA_*); may be repeated. For Parquet "
+        "and CSV: this message instead of the table.",
+    ),
+    without: list[str] | None = _option(
+        "--without", "Leave out messages of this name, id or pattern; may be repeated."
+    ),
+    armed: bool = _option(
+        "--armed", "Keep the time while a vehicle is armed, or one of --system.", False
+    ),
+    modes: list[str] | None = _option(
+        "--from-mode", "Keep the time while a vehicle is in this mode; may be repeated."
+    ),
+    margin_s: float = _option(
+        "--margin",
+        "Margin before and after --armed and --from-mode, s.",
+        0.0,
+        min=0.0,
+        max=MAX_MARGIN_S,
+    ),
+    merge: bool | None = _option(
+        "--merge/--join",
+        "Leave out copies of frames that are in several files, and align their clocks; or "
+        "keep all. By default files are merged if they overlap.",
+    ),
+    rename: list[str] | None = _option(
+        "--as", "OLD:NEW gives a system another id, also where it is addressed."
+    ),
+    merge_systems: bool = _option(
+        "--merge-systems", "With --as, give several systems the same id.", False
+    ),
+    anonymise: bool = _option(
+        "--anonymise", "Move coordinates and dates, replace texts and identifiers.", False
+    ),
+    place: str | None = _option(
+        "--place", "LAT,LON to which --anonymise moves the first position."
+    ),
+    day: str | None = _option("--day", "Day to which --anonymise moves the recording: 2020-01-31."),
+    keep_unknown: bool = _option(
+        "--keep-unknown", "With --anonymise, keep messages that are not known here.", False
+    ),
+    force: bool = opt.FORCE,
 ) -> None:
     """Convert, trim, join, merge and edit recordings.
 
@@ -273,27 +256,25 @@ def _known_estimator(name: str | None) -> str | None:
 
 @app.command("fuse")
 def fuse_log(
-    files: opt.Files,
+    files: list[Path] = opt.FILES,
     *,
-    output: Annotated[Path, output_file("Output; its ending selects the format.", WRITERS)],
-    estimator: Annotated[
-        str | None,
-        typer.Option("--estimator", help="Instead of the settings'.", callback=_known_estimator),
-    ] = None,
-    gps_latency_s: Annotated[
-        float | None,
-        typer.Option("--gps-latency", min=0.0, max=2.0, help="Instead of the settings', s."),
-    ] = None,
-    fuse_with: opt.FuseWith = "recorded",
-    position: opt.Placing = "causal",
-    smooth: opt.Smooth = False,
-    both: opt.BothEstimates = False,
-    begin: opt.From = None,
-    end: opt.To = None,
-    columns: opt.Columns = None,
-    sensor: opt.Sensor = None,
-    system: opt.System = None,
-    force: opt.Force = False,
+    output: Path = output_file("Output; its ending selects the format.", WRITERS, default=...),
+    estimator: str | None = option(
+        "--estimator", "Instead of the settings'.", callback=_known_estimator
+    ),
+    gps_latency_s: float | None = option(
+        "--gps-latency", "Instead of the settings', s.", min=0.0, max=2.0
+    ),
+    fuse_with: SettingsChoice = opt.FUSE_WITH,
+    position: Position = opt.PLACING,
+    smooth: bool = opt.SMOOTH,
+    both: bool = opt.BOTH_ESTIMATES,
+    begin: str | None = opt.FROM,
+    end: str | None = opt.TO,
+    columns: Path | None = opt.COLUMNS,
+    sensor: list[str] | None = opt.SENSOR,
+    system: int | None = opt.SYSTEM,
+    force: bool = opt.FORCE,
 ) -> None:
     """Re-run the estimator on recordings, and write them with the new states in any format.
 

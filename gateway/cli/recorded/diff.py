@@ -3,14 +3,13 @@
 import re
 from base64 import b64decode
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from gateway.aircraft import Aircraft
 from gateway.answers.log_answers import LogAnswers
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.options import ask, output_file, read_options, read_settings
+from gateway.cli.support.options import argument, ask, output_file, read_options, read_settings
 from gateway.cli.support.recordings import print_remarks, progress_of, recorded_files
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.output import check_output, write_new
@@ -39,19 +38,17 @@ PARAM_ENDINGS = (".param", ".params", ".parm")
 
 @app.command()
 def diff(
-    first: Annotated[
-        Path,
-        typer.Argument(
-            help="Recording, log of an autopilot, .param file, or live:1 for an aircraft of the "
-            "running gateway."
-        ),
-    ],
-    second: Annotated[Path, typer.Argument(help="The same, to compare with.")],
+    first: Path = argument(
+        "Recording, log of an autopilot, .param file, or live:1 for an aircraft of the "
+        "running gateway.",
+        ...,
+    ),
+    second: Path = argument("The same, to compare with.", ...),
     *,
-    page: Annotated[Path | None, output_file("Page to write.", (".html",), "--html")] = None,
+    page: Path | None = output_file("Page to write.", (".html",), "--html"),
     json: JsonOption = False,
-    system: opt.System = None,
-    force: opt.Force = False,
+    system: int | None = opt.SYSTEM,
+    force: bool = opt.FORCE,
 ) -> None:
     """Compare recordings, parameter files or running vehicles: parameters, missions, texts."""
     sides = [_files_of(name) for name in (first, second)]

@@ -5,12 +5,12 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import typer
 
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.options import output_file, read_options, read_settings
+from gateway.cli.support.options import argument, option, output_file, read_options, read_settings
 from gateway.cli.support.recordings import print_remarks, progress_of, recorded_files
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.output import check_output, write_new
@@ -48,44 +48,32 @@ def _out(name: str, text: str, endings: tuple[str, ...]) -> Any:
 
 @app.command()
 def extract(
-    file: Annotated[Path, typer.Argument(help="Recording, by name or file.", show_default=False)],
+    file: Path = argument("Recording, by name or file.", ..., show_default=False),
     *,
-    params: Annotated[
-        Path | None, _out("--params", "Parameters", (".param", ".params"))
-    ] = None,
-    mission: Annotated[
-        Path | None, _out("--mission", "Mission; a .plan also has fence and rally points", ITEMS)
-    ] = None,
-    fence: Annotated[Path | None, _out("--fence", "Fence", ITEMS)] = None,
-    rally: Annotated[Path | None, _out("--rally", "Rally points", ITEMS)] = None,
-    text: Annotated[Path | None, _out("--texts", "Texts with times", (".csv",))] = None,
-    event: Annotated[
-        Path | None, _out("--events", "Changes of mode, arming, landing, mission", (".csv",))
-    ] = None,
-    image: Annotated[Path | None, _out("--images", "Locations of images", (".csv",))] = None,
-    subtitle: Annotated[
-        Path | None, _out("--subtitles", "Subtitles for a video", (".srt", ".ass"))
-    ] = None,
-    fields: Annotated[
-        str, typer.Option("--fields", help="Fields of the subtitles, separated by commas.")
-    ] = ",".join(SUBTITLE_FIELDS),
-    rate_hz: Annotated[
-        float, typer.Option("--rate", min=0.1, max=MAX_RATE_HZ, help="Rate of the subtitles, Hz.")
-    ] = 5.0,
-    offset: Annotated[
-        str | None,
-        typer.Option(
-            "--offset", help="Start of the video in the recording: 80, 1:20 or a time in UTC."
-        ),
-    ] = None,
-    video: Annotated[
-        Path | None,
-        typer.Option("--video", help="The video: it begins at the time (UTC) in its name, or else "
-                     "at that of the file."),
-    ] = None,
-    system: opt.System = None,
-    force: opt.Force = False,
-) -> None:  # fmt: skip
+    params: Path | None = _out("--params", "Parameters", (".param", ".params")),
+    mission: Path | None = _out(
+        "--mission", "Mission; a .plan also has fence and rally points", ITEMS
+    ),
+    fence: Path | None = _out("--fence", "Fence", ITEMS),
+    rally: Path | None = _out("--rally", "Rally points", ITEMS),
+    text: Path | None = _out("--texts", "Texts with times", (".csv",)),
+    event: Path | None = _out("--events", "Changes of mode, arming, landing, mission", (".csv",)),
+    image: Path | None = _out("--images", "Locations of images", (".csv",)),
+    subtitle: Path | None = _out("--subtitles", "Subtitles for a video", (".srt", ".ass")),
+    fields: str = option(
+        "--fields", "Fields of the subtitles, separated by commas.", ",".join(SUBTITLE_FIELDS)
+    ),
+    rate_hz: float = option("--rate", "Rate of the subtitles, Hz.", 5.0, min=0.1, max=MAX_RATE_HZ),
+    offset: str | None = option(
+        "--offset", "Start of the video in the recording: 80, 1:20 or a time in UTC."
+    ),
+    video: Path | None = option(
+        "--video",
+        "The video: it begins at the time (UTC) in its name, or else at that of the file.",
+    ),
+    system: int | None = opt.SYSTEM,
+    force: bool = opt.FORCE,
+) -> None:
     """Extract parameters, missions, texts, subtitles and geotags from a recording.
 
     The exit code is 1 if the recording has only some of them.

@@ -4,14 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import typer
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.options import output_file, read_options, read_settings, recordings_folder
+from gateway.cli.support.options import (
+    argument,
+    option,
+    output_file,
+    read_options,
+    read_settings,
+    recordings_folder,
+)
 from gateway.cli.support.recordings import progress_of, recorded_files, refuse_unused
 from gateway.cli.support.terminal import (
     console_of,
@@ -53,26 +60,18 @@ Report = Callable[[str], None]
 
 @app.command()
 def info(
-    files: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="Recordings, by name or file, or a folder to index; without one, all recordings "
-            "are listed.",
-            show_default=False,
-        ),
-    ] = None,
+    files: list[Path] | None = argument(
+        "Recordings, by name or file, or a folder to index; without one, all recordings "
+        "are listed.",
+        show_default=False,
+    ),
     *,
-    columns: opt.Columns = None,
-    where: Annotated[
-        str,
-        typer.Option(
-            "--where", help="List flights of a folder by SQL: 'duration > 300 and loss > 0.05'."
-        ),
-    ] = "",
-    geojson: Annotated[
-        bool, typer.Option("--geojson", help="The tracks of a folder's flights, for maps.")
-    ] = False,
-    json: Annotated[bool, typer.Option("--json", help="For programs: one line per file.")] = False,
+    columns: Path | None = opt.COLUMNS,
+    where: str = option(
+        "--where", "List flights of a folder by SQL: 'duration > 300 and loss > 0.05'.", ""
+    ),
+    geojson: bool = option("--geojson", "The tracks of a folder's flights, for maps.", False),
+    json: bool = option("--json", "For programs: one line per file.", False),
 ) -> None:
     """Show duration, vehicles, rates, gaps, distance and damage of recordings; or list all.
 
@@ -133,13 +132,10 @@ def _list_all(*, json: bool) -> None:
 
 @app.command()
 def recover(
-    file: Annotated[Path, typer.Argument(help="Damaged recording.", show_default=False)],
+    file: Path = argument("Damaged recording.", ..., show_default=False),
     *,
-    output: Annotated[
-        Path | None,
-        output_file("Output; by default NAME.recovered.EXT.", (".tlog", ".csv")),
-    ] = None,
-    force: opt.Force = False,
+    output: Path | None = output_file("Output; by default NAME.recovered.EXT.", (".tlog", ".csv")),
+    force: bool = opt.FORCE,
 ) -> None:
     """Write the intact part of a damaged recording to a new file, and list the damage.
 

@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import typer
@@ -14,7 +15,7 @@ from rich.text import Text
 
 from gateway.cli.live.run import refuse_conflicts, with_endpoints
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.options import ask, read_options, read_settings
+from gateway.cli.support.options import argument, ask, option, read_options, read_settings
 from gateway.cli.support.recordings import print_remarks, progress_of, read_range, recorded_files
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.live.other_gateways import log_other_gateways
@@ -30,6 +31,7 @@ from gateway.recordings.play import (
     PlayState,
     check_speed,
 )
+from gateway.recordings.table import SettingsChoice
 from gateway.units import counted
 
 app = typer.Typer()
@@ -44,45 +46,31 @@ app.add_typer(group, name="player")
 
 @app.command()
 def play(
-    files: opt.Files,
+    files: list[Path] = opt.FILES,
     *,
-    speed: Annotated[str, typer.Option("--speed", help="0.1 to 100, or max.")] = "1",
-    begin: opt.From = None,
-    end: opt.To = None,
-    loop: Annotated[bool, typer.Option("--loop", help="Restart at the end.")] = False,
-    paused: Annotated[bool, typer.Option("--paused", help="Start paused.")] = False,
-    skip_gaps: Annotated[
-        float | None, typer.Option("--skip-gaps", min=0, help="Shorten gaps to this many seconds.")
-    ] = None,
-    system: Annotated[
-        list[int] | None,
-        typer.Option(
-            "--id",
-            min=1,
-            max=249,
-            help="System id for each recording's first vehicle; its others get the next ids.",
-        ),
-    ] = None,
-    fuse: Annotated[
-        bool,
-        typer.Option("--fuse", help="For an autopilot's log: mavgate's states, not its own."),
-    ] = False,
-    both: opt.BothEstimates = False,
-    fuse_with: opt.FuseWith = "recorded",
-    columns: opt.Columns = None,
-    with_commands: Annotated[
-        bool,
-        typer.Option(
-            "--with-commands",
-            help="Send the ground stations' messages too: live vehicles obey them.",
-        ),
-    ] = False,
-    yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Send commands to other machines without asking.")
-    ] = False,
-    attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
-    endpoint: opt.Endpoint = None,
-    duplicate_ids: opt.DuplicateIds = False,
+    speed: str = option("--speed", "0.1 to 100, or max.", "1"),
+    begin: str | None = opt.FROM,
+    end: str | None = opt.TO,
+    loop: bool = option("--loop", "Restart at the end.", False),
+    paused: bool = option("--paused", "Start paused.", False),
+    skip_gaps: float | None = option("--skip-gaps", "Shorten gaps to this many seconds.", min=0),
+    system: list[int] | None = option(
+        "--id",
+        "System id for each recording's first vehicle; its others get the next ids.",
+        min=1,
+        max=249,
+    ),
+    fuse: bool = option("--fuse", "For an autopilot's log: mavgate's states, not its own.", False),
+    both: bool = opt.BOTH_ESTIMATES,
+    fuse_with: SettingsChoice = opt.FUSE_WITH,
+    columns: Path | None = opt.COLUMNS,
+    with_commands: bool = option(
+        "--with-commands", "Send the ground stations' messages too: live vehicles obey them.", False
+    ),
+    yes: bool = option("--yes -y", "Send commands to other machines without asking.", False),
+    attached: bool = option("--attached", "", False, hidden=True),
+    endpoint: list[str] | None = opt.ENDPOINT,
+    duplicate_ids: bool = opt.DUPLICATE_IDS,
 ) -> None:
     """Play one or several recordings to the ground stations.
 
@@ -126,9 +114,7 @@ def play(
 
 @group.command(context_settings=NEGATIVE_NUMBERS)
 def seek(
-    to: Annotated[
-        str, typer.Argument(help="80 or 1:20 from the start, +10 or -0:30 from here, or a date.")
-    ],
+    to: str = argument("80 or 1:20 from the start, +10 or -0:30 from here, or a date.", ...),
 ) -> None:
     """Go to a moment."""
     _show(ask("seek", of="play", to=to))
@@ -146,13 +132,13 @@ _add_verb("stop", "End the playback.")
 
 
 @group.command()
-def step(count: Annotated[int, typer.Argument(min=1, help="Frames.")] = 1) -> None:
+def step(count: int = argument("Frames.", 1, min=1)) -> None:
     """Pause and play the next frames."""
     _show(ask("play.step", of="play", count=count))
 
 
 @group.command("speed")
-def set_speed(speed: Annotated[str, typer.Argument(help="0.1 to 100, or max.")]) -> None:
+def set_speed(speed: str = argument("0.1 to 100, or max.", ...)) -> None:
     """Play faster or slower from now on."""
     value = _speed(speed)
     _show(ask("play.speed", of="play", speed=None if value == AS_FAST_AS_POSSIBLE else value))

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Final
 
 import typer
 from rich.progress import TimeElapsedColumn
 
 from gateway.cli.support import shared_options as opt
-from gateway.cli.support.options import folder_of, read_options, read_settings
+from gateway.cli.support.options import folder_of, option, read_options, read_settings
 from gateway.cli.support.recordings import (
     are_many,
     files_of,
@@ -31,6 +31,7 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import with_reference
 from gateway.recordings.recorded_fusion import smoothed_latency_in_words
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.table import SettingsChoice
 
 if TYPE_CHECKING:
     from gateway.analysis.case import Case
@@ -55,41 +56,31 @@ UNUSED: Final = {
 
 @app.command()
 def report(
-    flights: opt.Flights = None,
+    flights: list[str] | None = opt.FLIGHTS,
     *,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            help="A folder for figures and tables, or NAME.html for one flight to replay in a "
-            "browser.",
-        ),
-    ] = Path("report"),
-    against: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--against",
-            help="Compare with another recording or other settings (.toml); many recordings with "
-            "the folder of an earlier report.",
-        ),
-    ] = None,
-    reference: opt.Reference = None,
-    columns: opt.Columns = None,
-    system: opt.System = None,
-    smooth: opt.Smooth = False,
-    fuse_with: opt.FuseWith = "recorded",
-    quick: Annotated[
-        bool,
-        typer.Option(
-            "--quick",
-            help="Leave out the comparison of estimators in NAME.html, or the pages of many "
-            "recordings.",
-        ),
-    ] = False,
-    jobs: opt.Jobs = None,
-    scheduler: opt.Scheduler = None,
-    force: opt.Force = False,
+    output: Path = option(
+        "--output -o",
+        "A folder for figures and tables, or NAME.html for one flight to replay in a browser.",
+        Path("report"),
+    ),
+    against: list[Path] | None = option(
+        "--against",
+        "Compare with another recording or other settings (.toml); many recordings with "
+        "the folder of an earlier report.",
+    ),
+    reference: Path | None = opt.REFERENCE,
+    columns: Path | None = opt.COLUMNS,
+    system: int | None = opt.SYSTEM,
+    smooth: bool = opt.SMOOTH,
+    fuse_with: SettingsChoice = opt.FUSE_WITH,
+    quick: bool = option(
+        "--quick",
+        "Leave out the comparison of estimators in NAME.html, or the pages of many recordings.",
+        False,
+    ),
+    jobs: int | None = opt.JOBS,
+    scheduler: str | None = opt.SCHEDULER,
+    force: bool = opt.FORCE,
 ) -> None:
     """Make figures and tables of flights, or one HTML file of a flight.
 

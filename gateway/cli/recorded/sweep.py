@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 import numpy as np
@@ -33,7 +33,7 @@ from gateway.analysis.sweep import (
 from gateway.batch.tasks import SweepTask, without_secrets
 from gateway.cli.support import shared_options as opt
 from gateway.cli.support.batch_work import exit_if_failed, run_on_all
-from gateway.cli.support.options import output_file, read_options, read_settings
+from gateway.cli.support.options import option, output_file, read_options, read_settings
 from gateway.cli.support.recordings import are_many, fusion_of, load_flight, refuse_unused
 from gateway.cli.support.terminal import console_of, progress_bar, refuse, table_of
 from gateway.config import GatewaySettings, render
@@ -41,6 +41,7 @@ from gateway.output import check_output, write_new
 from gateway.printable import figure
 from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.recorded_table import ReadOptions
+from gateway.recordings.table import SettingsChoice
 from gateway.units import counted
 
 if TYPE_CHECKING:
@@ -65,49 +66,40 @@ HEADINGS: Final = {
 
 @app.command()
 def sweep(
-    flights: opt.Flights = None,
+    flights: list[str] | None = opt.FLIGHTS,
     *,
-    vary: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="NAME=FROM:TO:COUNT or NAME=VALUE,VALUE: alpha=0.1:0.9:9, estimator=eskf,paper; "
-            "may be repeated."
-        ),
-    ] = None,
-    optimise: Annotated[
-        int, typer.Option(help="Search the ranges for this many generations, instead of a grid.")
-    ] = 0,
-    metric: Annotated[
-        Metric,
-        typer.Option(
-            help="Minimise the error at withheld fixes, against interpolated GPS, as in the paper, "
-            "or against the reference's position or attitude."
-        ),
-    ] = "held",
-    hold_out: Annotated[
-        int, typer.Option("--hold-out", help="Withhold every n-th fix; 0 for none.", min=0)
-    ] = 5,
-    gps_interval: Annotated[
-        float,
-        typer.Option(
-            "--gps-interval",
-            help="Fuse one fix in this many seconds, and withhold all others; 0 for all.",
-            min=0.0,
-        ),
-    ] = 0.0,
-    jobs: opt.Jobs = None,
-    scheduler: opt.Scheduler = None,
-    output: Annotated[Path, output_file("Settings file for the best.", (".toml",))] = Path(
-        "best.toml"
+    vary: list[str] | None = option(
+        "--vary",
+        "NAME=FROM:TO:COUNT or NAME=VALUE,VALUE: alpha=0.1:0.9:9, estimator=eskf,paper; "
+        "may be repeated.",
     ),
-    table: Annotated[
-        Path | None, output_file("CSV file for every trial.", (".csv",), "--table")
-    ] = None,
-    reference: opt.Reference = None,
-    columns: opt.Columns = None,
-    system: opt.System = None,
-    fuse_with: opt.FuseWith = "recorded",
-    force: opt.Force = False,
+    optimise: int = option(
+        "--optimise", "Search the ranges for this many generations, instead of a grid.", 0
+    ),
+    metric: Metric = option(
+        "--metric",
+        "Minimise the error at withheld fixes, against interpolated GPS, as in the paper, "
+        "or against the reference's position or attitude.",
+        "held",
+    ),
+    hold_out: int = option("--hold-out", "Withhold every n-th fix; 0 for none.", 5, min=0),
+    gps_interval: float = option(
+        "--gps-interval",
+        "Fuse one fix in this many seconds, and withhold all others; 0 for all.",
+        0.0,
+        min=0.0,
+    ),
+    jobs: int | None = opt.JOBS,
+    scheduler: str | None = opt.SCHEDULER,
+    output: Path = output_file(
+        "Settings file for the best.", (".toml",), default=Path("best.toml")
+    ),
+    table: Path | None = output_file("CSV file for every trial.", (".csv",), "--table"),
+    reference: Path | None = opt.REFERENCE,
+    columns: Path | None = opt.COLUMNS,
+    system: int | None = opt.SYSTEM,
+    fuse_with: SettingsChoice = opt.FUSE_WITH,
+    force: bool = opt.FORCE,
 ) -> None:
     """Try settings on one flight or many, and write the best as a settings file.
 

@@ -54,15 +54,27 @@ def settings_file() -> Path:
     return CONFIG.get() or USER_CONFIG.expanduser()
 
 
-def output_file(text: str, endings: Collection[str], *names: str) -> Any:
-    """Return an option, by default `--output`, for a file to write with one of these suffixes."""
+def option(names: str, text: str, default: Any = None, **how: Any) -> Any:
+    """Return an option of a command, with its names, separated by spaces, and its help."""
+    return typer.Option(default, *names.split(), help=text, **how)
+
+
+def argument(text: str, default: Any = None, **how: Any) -> Any:
+    """Return an argument of a command, with its help; required by the default `...`."""
+    return typer.Argument(default, help=text, **how)
+
+
+def output_file(
+    text: str, endings: Collection[str], names: str = "--output -o", default: Any = None
+) -> Any:
+    """Return an option for a file to write with one of these suffixes."""
 
     def check(path: Path | None) -> Path | None:
         if path is not None:
             check_ending(path, endings)
         return path
 
-    return typer.Option(*(names or ("--output", "-o")), help=text, callback=check)
+    return option(names, text, default, callback=check)
 
 
 def folder_of(settings: GatewaySettings) -> Path:
