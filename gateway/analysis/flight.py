@@ -71,7 +71,6 @@ class Reference:
     is_exact: bool
     """Whether it is the exact truth; otherwise it is another estimate."""
     description: str
-    """One sentence on its origin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,6 @@ class Flight:
 
     name: str
     description: str
-    """One sentence on its origin."""
     fusion: FusionSettings
     """The settings for this flight, including its GPS latency."""
     samples: Samples

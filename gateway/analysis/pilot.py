@@ -24,7 +24,6 @@ from gateway.units import US_PER_S
 from gateway.vehicle_state.positions import IntArray, LocalFrame, Position
 
 MAX_SHOWN_TEXTS: Final = 200
-"""Maximum number of texts in the table of events."""
 
 
 @dataclass(frozen=True, slots=True)

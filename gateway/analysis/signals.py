@@ -35,17 +35,6 @@ REST_ACCEL_MPS2: Final = 0.15
 """Maximum standard deviation within a second at rest."""
 
 
-def design_lowpass(
-    kind: Kind, cutoff_hz: float, rate_hz: float, ripple_db: float = 1.0
-) -> Coefficients:
-    """Design a second-order low-pass; see `discretise`.
-
-    The Chebyshev filter is of type I, with its ripple in dB. The cutoff, Hz, is the -3 dB frequency
-    for Butterworth, and the end of the ripple for Chebyshev.
-    """
-    return discretise(*prototype_of(kind, ripple_db), cutoff_hz, rate_hz)
-
-
 def filtered(
     coefficients: Coefficients, x: FloatArray, state: list[float] | None = None
 ) -> FloatArray:
@@ -78,7 +67,8 @@ def apply(kind: Kind, settings: PaperSettings, rate_hz: float, x: FloatArray) ->
 
 
 def _design(kind: Kind, settings: PaperSettings, rate_hz: float) -> Coefficients:
-    return design_lowpass(kind, settings.accel_cutoff_hz, rate_hz, settings.chebyshev_ripple_db)
+    prototype = prototype_of(kind, settings.chebyshev_ripple_db)
+    return discretise(*prototype, settings.accel_cutoff_hz, rate_hz)
 
 
 def compare(settings: PaperSettings, rate_hz: float) -> "pd.DataFrame":

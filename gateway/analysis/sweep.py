@@ -47,7 +47,6 @@ _LACKING: Final[dict[Metric, str]] = {
 SEED: Final = 1
 Scores = dict[str, float]
 Trial = tuple[Values, Scores]
-"""Values that were tried, and their scores."""
 WEIGHTS: Final = (0.1, 0.5, 0.9)
 """Values of alpha and of beta in Table I of the paper."""
 Run = Callable[[Sequence[Values]], Iterator[tuple[int, Scores]]]

@@ -59,7 +59,6 @@ _REMEDIES: Final = {
     sqlite3.SQLITE_READONLY: _NOT_WRITABLE,
     sqlite3.SQLITE_CANTOPEN: _NOT_WRITABLE,
 }
-"""Remedy by SQLite's error code."""
 
 Row = dict[str, Any]
 ENDINGS: Final = (".tlog", ".csv")
@@ -90,7 +89,6 @@ class CataloguedFile:
     digest: str
     """SHA-256 of the content, hexadecimal."""
     error: str | None = None
-    """Reason why the file cannot be read; None if it can."""
     flights: tuple[Flown, ...] = ()
     """One flight per vehicle; empty for an unreadable file."""
 
@@ -353,10 +351,7 @@ def index_folder(
         try:
             for number, outcome in executor.run(partial(read_file, folder, options), wanted):
                 name, digest = wanted[number]
-                if isinstance(outcome, WorkFailed):
-                    file = _unread(folder, name, outcome)
-                else:
-                    file = outcome
+                file = _file_of(folder, name, outcome)
                 read += 1
                 if file.digest and file.digest == digest:
                     catalogue.touch(file.path, file.modified_ns)
@@ -409,11 +404,13 @@ def digest_of(path: Path) -> str:
         return file_digest(file, "sha256").hexdigest()
 
 
-def _unread(folder: Path, name: str, failed: WorkFailed) -> CataloguedFile:
+def _file_of(folder: Path, name: str, outcome: CataloguedFile | WorkFailed) -> CataloguedFile:
+    if isinstance(outcome, CataloguedFile):
+        return outcome
     path = folder / name
     size, modified_ns = _stamp_if_there(path) or (0, 0)
     recording = as_text(recording_name(path))
-    return CataloguedFile(as_text(name), recording, None, size, modified_ns, "", failed.reason)
+    return CataloguedFile(as_text(name), recording, None, size, modified_ns, "", outcome.reason)
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -422,7 +419,6 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 def _stamp_if_there(path: Path) -> tuple[int, int] | None:
-    """Return the stamp of a file; None if the file has been deleted."""
     try:
         return _stamp(path)
     except OSError:

@@ -19,7 +19,6 @@ WAITING: Final = 2
 """Items submitted per process: one in work and one waiting, to bound the memory."""
 CONNECT_S: Final = 10.0
 WORKERS_S: Final = 30.0
-"""Timeout for the first worker, s."""
 M_TRIM_THRESHOLD: Final = -1
 M_MMAP_THRESHOLD: Final = -3
 """Option number of mallopt, from malloc.h."""
@@ -40,12 +39,14 @@ class WorkFailed:
     reason: str
 
 
+Outcomes = Iterator[tuple[int, Result | WorkFailed]]
+"""The index of each item, and its result."""
+
+
 class Executor(Protocol):
     """Runs a function on many items, in any order."""
 
-    def run(
-        self, work: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterator[tuple[int, Result | WorkFailed]]:
+    def run(self, work: Callable[[Item], Result], items: Sequence[Item]) -> Outcomes[Result]:
         """Yield the index of each item and its result when it is finished.
 
         An exception fails that item alone. If a process or machine dies, its items are repeated by
@@ -57,9 +58,7 @@ class Executor(Protocol):
 class ThisProcess:
     """Run small tasks in the calling process, since starting others would take longer."""
 
-    def run(
-        self, work: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterator[tuple[int, Result | WorkFailed]]:
+    def run(self, work: Callable[[Item], Result], items: Sequence[Item]) -> Outcomes[Result]:
         """See `Executor`."""
         for number, item in enumerate(items):
             try:
@@ -74,9 +73,7 @@ class LocalProcesses:
     def __init__(self, jobs: int | None) -> None:
         self._jobs = jobs or cores()
 
-    def run(
-        self, work: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterator[tuple[int, Result | WorkFailed]]:
+    def run(self, work: Callable[[Item], Result], items: Sequence[Item]) -> Outcomes[Result]:
         """See `Executor`."""
         waiting = deque(range(len(items)))
         suspects: deque[int] = deque()
@@ -157,9 +154,7 @@ class DaskCluster:
         """Disconnect; the cluster cancels this client's unfinished work."""
         self._client.close()
 
-    def run(
-        self, work: Callable[[Item], Result], items: Sequence[Item]
-    ) -> Iterator[tuple[int, Result | WorkFailed]]:
+    def run(self, work: Callable[[Item], Result], items: Sequence[Item]) -> Outcomes[Result]:
         """See `Executor`; the items of a worker that dies are repeated by others."""
         done = self._distributed.as_completed(loop=self._client.loop)
         numbers: dict[Any, int] = {}

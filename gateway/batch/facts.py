@@ -57,7 +57,6 @@ def _kept(plane: NDArray[np.float64], tolerance_m: float) -> NDArray[np.bool_]:
 def _distances_m(
     points: NDArray[np.float64], begin: NDArray[np.float64], end: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the distances from the line segment between two points."""
     line = end - begin
     length2 = float(line @ line)
     share = ((points - begin) @ line / length2).clip(0.0, 1.0) if length2 else np.zeros(len(points))
@@ -71,7 +70,6 @@ class CataloguedFlight(msgspec.Struct, frozen=True, kw_only=True):
     """
 
     vehicle: int | None = None
-    """MAVLink system id."""
     began: str | None = None
     """Start in UTC, as YYYY-MM-DD HH:MM:SS."""
     duration: float | None = None
@@ -89,19 +87,13 @@ class CataloguedFlight(msgspec.Struct, frozen=True, kw_only=True):
     fastest: float | None = None
     """Greatest speed over ground, m/s."""
     lat_min: float | None = None
-    """Southern limit, deg."""
     lat_max: float | None = None
-    """Northern limit, deg."""
     lon_min: float | None = None
-    """Western limit, deg."""
     lon_max: float | None = None
     """Eastern limit, deg; less than lon_min across the date line."""
     takeoff_lat: float | None = None
-    """Latitude of the take-off, deg."""
     takeoff_lon: float | None = None
-    """Longitude of the take-off, deg."""
     gps_outages: int | None = None
-    """Number of GPS outages."""
     gps_lost: float | None = None
     """Total duration of the GPS outages, s."""
     faults: int | None = None
@@ -123,7 +115,6 @@ def began_text(unix_us: int | None) -> str | None:
 
 
 def _limits(points: FlightTrackPoints) -> tuple[float, float, float, float]:
-    """Return the southern, northern, western and eastern limit, in the shorter direction."""
     lat, lon = points.lat_deg, points.lon_deg
     turned = lon[0] + wrap_180(lon - lon[0])
     west, east = float(turned.min()), float(turned.max())
@@ -131,7 +122,6 @@ def _limits(points: FlightTrackPoints) -> tuple[float, float, float, float]:
 
 
 Flown = tuple[CataloguedFlight, Segments]
-"""The facts of a flight, and its track."""
 
 
 def flights_of(found: Summary) -> Iterator[Flown]:

@@ -59,7 +59,6 @@ class Versus:
     worse: pd.DataFrame
     """`location`, `estimator`, `before_m` and `after_m` of flights that got worse, worst first."""
     compared: int
-    """Number of flights in both results."""
 
 
 def errors_by_group(results: Sequence[FlightResult]) -> pd.DataFrame:
@@ -114,13 +113,8 @@ def why_leads(results: Sequence[FlightResult]) -> str:
 
 
 def _medians_m(results: Sequence[FlightResult], key: str) -> dict[str, float]:
-    names = {name for result in results for name in result.figures.get(key, {})}
-    return {
-        name: float(
-            np.median([r.figures[key][name] for r in results if name in r.figures.get(key, {})])
-        )
-        for name in names
-    }
+    errors = pd.DataFrame([result.figures.get(key, {}) for result in results])
+    return {str(name): float(median) for name, median in errors.median().items()}
 
 
 def versus(now: Iterable[FlightResult], then: Iterable[FlightResult]) -> Versus:
@@ -168,8 +162,8 @@ def write_flights_page(
             "Errors by aircraft and estimator",
             "Each flight was fused without every fifth fix and scored at those: figures are the "
             f"root mean square errors of the flights, horizontal. {why_leads(evaluated)}".strip(),
-            [_picture(evaluated)] if any(result.figures[HELD] for result in evaluated) else [],
-            [ReportTable("errors", errors_by_group(evaluated), "Errors at withheld fixes.")],
+            *([_picture(evaluated)] if any(result.figures[HELD] for result in evaluated) else []),
+            ReportTable("errors", errors_by_group(evaluated), "Errors at withheld fixes."),
         )
     ]
     if compared is not None:
@@ -178,13 +172,13 @@ def write_flights_page(
         rows = [(_file_name(result.location), result.error) for result in broken]
         failed = ReportTable("failed", pd.DataFrame(rows, columns=["recording", "why"]), "Failed.")
         lead = "These are not in any of the other tables."
-        sections.append(Section("Recordings that failed", lead, tables=[failed]))
+        sections.append(Section("Recordings that failed", lead, failed))
     if len(broken) < len(results):
         flights = flight_table([result for result in results if result.error is None])
         # The page is narrow; the distance of a flight is in flights.csv only.
         flights = flights.drop(columns=["failed", "distance, m"])
         table = ReportTable("flight_errors", flights, "Flights.")
-        sections.append(Section("Flights", "In the order given.", tables=[table]))
+        sections.append(Section("Flights", "In the order given.", table))
     seconds = sum(r.figures.get("summary", {}).get("duration, s", 0.0) for r in results)
     facts = [
         Fact(str(len(results) - len(broken)), "flights"),
@@ -231,7 +225,7 @@ def _versus_section(compared: Versus) -> Any:
         worse = compared.worse.assign(location=compared.worse["location"].map(_file_name))
         worse.columns = pd.Index(["recording", "estimator", "then, m", "now, m"])
         tables.append(ReportTable("worse", worse, f"{len(worse)} that got worse."))
-    return Section("Against the other results", lead, tables=tables)
+    return Section("Against the other results", lead, *tables)
 
 
 def _picture(results: Sequence[FlightResult]) -> Any:

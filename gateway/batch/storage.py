@@ -44,7 +44,6 @@ class BatchItem(msgspec.Struct, frozen=True):
     """One recording to be processed: its parts, in order."""
 
     locations: tuple[str, ...]
-    """Local paths or URLs of the parts."""
 
     @property
     def location(self) -> str:
@@ -152,7 +151,6 @@ def _locations(name: str) -> list[str]:
 
 
 def _plain(location: str) -> str:
-    """Return the absolute path of a local path or URL."""
     if not is_url(location):
         return str(Path(location).absolute())
     storage, remote = _storage(location)

@@ -64,7 +64,6 @@ class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
     """Result of a task on one recording, as it is stored."""
 
     location: str = msgspec.field(name="place")
-    """Path or URL of the first file."""
     digest: str
     key: str
     """Digest of file, task, settings and version."""
@@ -73,11 +72,8 @@ class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
     vehicle: int | None = None
     began: str | None = None
     error: str | None = None
-    """Reason why there are no figures."""
     figures: dict[str, Any] = {}
-    """Figures as JSON."""
     files: tuple[str, ...] = ()
-    """Files written, relative to the folder of results."""
 
 
 class Worked(NamedTuple):

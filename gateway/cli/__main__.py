@@ -5,7 +5,6 @@ import os
 import sys
 
 INTERRUPTED = 128 + 2
-"""Exit code after Ctrl-C, as in shells."""
 
 
 def main() -> None:

@@ -86,7 +86,6 @@ SMALL: Final = frozenset({"flash", "record", "status", "clients"})
 """Commands that mostly send requests to a gateway; extensions are loaded only with settings."""
 ISO: Final = "%Y-%m-%d %H:%M:%S"
 GIT_S: Final = 5.0
-"""Limit of the time in which git names the commit."""
 
 
 def load_command(name: str) -> Any:

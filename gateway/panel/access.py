@@ -221,7 +221,6 @@ class AccessControl:
         return self._large.setdefault(key, asyncio.Lock())
 
     async def _pass_websocket(self, scope: Scope, receive: Receive, send: Send, token: str) -> None:
-        """Pass a WebSocket on for as long as its session lasts."""
         socket = _SessionSocket(receive, send, lambda: self._logins.role_of(token) is not None)
         sockets = self._sockets.setdefault(token, set())
         sockets.add(socket)
@@ -233,7 +232,6 @@ class AccessControl:
                 del self._sockets[token]
 
     def _end_session(self, token: str) -> None:
-        """End all connections and pages of a session."""
         self._on_session_end(token)
         for socket in self._sockets.get(token, ()):
             socket.close_soon()

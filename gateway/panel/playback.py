@@ -61,7 +61,6 @@ class RecordedAircraft:
     """One aircraft of a recording."""
 
     recorded_id: int
-    """Its recorded MAVLink system id."""
     origin: str
     """`RECORDED`, or `FUSED_AGAIN` if it is fused again during playback."""
     profile: Profile
@@ -282,13 +281,11 @@ class Playback:
         self._watching = asyncio.create_task(self._watch())
 
     async def _watch(self) -> None:
-        """Wait until the player has ended."""
         while self._child is not None:
             await self.refresh()
             await asyncio.sleep(WATCH_S)
 
     async def _failure(self) -> str:
-        """Return the reason why the player ended."""
         if self._child is None or self._child.stderr is None or self._child.returncode is None:
             return "the player does not start"
         text = (await self._child.stderr.read()).decode(errors="replace").strip()

@@ -79,7 +79,6 @@ class PlayerBar:
                 self._slider.props[key] = value
 
     async def _play(self, act: Callable[..., Any], *args: Any, **params: Any) -> None:
-        """Change the playback, and show its state."""
         with notify_failure(self._context):
             self._context.check_may_change()
             if (answer := act(*args, **params)) is not None:

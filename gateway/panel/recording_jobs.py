@@ -73,7 +73,6 @@ EXTRACTS: Final = {
     "texts": ("Texts", ("extract", "--texts"), ".csv"),
     "events": ("Events", ("extract", "--events"), ".csv"),
 }
-"""The same for extracts of one vehicle."""
 KINDS: Final = FORMATS | CUTS | EXTRACTS
 
 

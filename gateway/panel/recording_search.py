@@ -25,10 +25,8 @@ TOKEN: Final = re.compile(
 )
 """Parts of a condition from the network: comparisons of columns with constants, and no function."""
 MAX_CONDITION: Final = 500
-"""Maximum length of a condition, in characters."""
 NO_CATALOGUE: Final = "Duration, distance, height and loss appear once the recordings are indexed."
 THUMBNAIL: Final = (46.0, 24.0)
-"""Size of the drawing of a track."""
 MAX_CORNERS: Final = 60
 
 

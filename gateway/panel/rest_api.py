@@ -61,7 +61,6 @@ API_VERSION: Final = 0
 DEFAULT_HEADER: Final = {"system_id": 255, "component_id": 0, "sequence": 0}
 MAX_ID: Final = 255
 NOTHING: Final = "None"
-"""Answer for a path without a value."""
 NOT_A_MESSAGE: Final = "Failed to parse message, not a valid MAVLinkMessage."
 NOT_ALLOWED: Final = "viewers may not send; log in as the operator"
 WS_INVALID: Final = 1007
@@ -157,7 +156,6 @@ class MessageBook:
         return node.as_json() if isinstance(node, _Entry) else node
 
     def _tree(self, parts: list[str], systems: SystemFilter) -> dict[str, Any]:
-        """Build the part of the tree that a path requires."""
         vehicles: dict[str, Any] = {}
         for (system_id, component_id, name), entry in self._chosen(parts):
             if not systems.has((system_id, component_id)):

@@ -81,7 +81,6 @@ class GatewayWatch:
         self.before: dict[str, Any] | None = None
         """The result before it, to compute rates."""
         self.recorder: dict[str, Any] | None = None
-        """Result of `record.status`."""
         self._control = control
         self._fleet = fleet
         self._task: asyncio.Task[None] | None = None
@@ -215,7 +214,6 @@ class Uplink:
         raise CommandFailedError(f"{name or number}: aircraft {system_id} does not answer")
 
     def _sender(self, system_id: int, component_id: int) -> Any:
-        """Return the encoder of a program that sends through the panel."""
         if not system_id:
             return self._mav
         key = (system_id, component_id)

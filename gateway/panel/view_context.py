@@ -76,7 +76,6 @@ class PanelParts:
     watch: GatewayWatch
     """The gateway's status, updated every second."""
     jobs: RecordingJobs
-    """The catalogue and the exports of recordings."""
     tiles: MapTiles
     pages: OpenPages
     logins: Logins
@@ -97,13 +96,10 @@ class ViewContext:
     units: str
     """`metric`, `imperial` or `aviation`."""
     playback: Playback
-    """The recording that this page plays."""
     page: str
-    """Id of the page."""
     shown: str = ""
     """Key of the view that is shown."""
     system_id: int | None = None
-    """The selected aircraft."""
     building: str = ""
     """Key of the view that was built last."""
     _on_select: list[Callable[[], None]] = field(default_factory=list)

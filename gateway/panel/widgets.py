@@ -167,9 +167,7 @@ class RowButton:
 
     icon: str
     title: str
-    """Its tooltip."""
     act: Callable[[str], object]
-    """Called with the key of its row."""
 
 
 class DataTable(Element, component=WEB / "data_table.js"):
@@ -382,7 +380,6 @@ class LiveChart:
         return fields_csv(series, {name: self._unit(name)[1] for name in self.fields}, zero_us)
 
     def _unit(self, name: str) -> tuple[float, str]:
-        """Return the factor and the displayed unit of a field."""
         return shown_unit(self._context.parts.history.unit(self._context.system_id or 0, name))
 
     def _series(self, name: str, after_us: int, until_us: int | None = None) -> Points:

@@ -2,8 +2,21 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from gateway.analysis.signals import design_lowpass, filtered
-from gateway.estimation.vector_filter import PASS_THROUGH, design_highpass
+from gateway.analysis.signals import filtered
+from gateway.estimation.vector_filter import (
+    PASS_THROUGH,
+    Coefficients,
+    Kind,
+    design_highpass,
+    discretise,
+    prototype_of,
+)
+
+
+def design_lowpass(
+    kind: Kind, cutoff_hz: float, rate_hz: float, ripple_db: float = 1.0
+) -> Coefficients:
+    return discretise(*prototype_of(kind, ripple_db), cutoff_hz, rate_hz)
 
 
 def test_cutoff_beyond_half_the_sample_rate_passes_all() -> None:

@@ -70,7 +70,9 @@ BARS: Final = {
     "horizontal, m": "position live (m)",
     DRIFT: f"position after {OUTAGE_S:.0f} s without GPS (m)",
 }
-"""Titles of the bar charts, by the column of the table."""
+SHOWN: Final = {
+    "tilt_deg": "tilt (deg)", "heading_deg": "heading (deg)", "horizontal_m": "horizontal (m)",
+}  # fmt: skip
 TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
 SAME_POSITION_DEG: Final = 0.5
 """Maximum distance of two flights, in deg, that are drawn on one map."""
@@ -101,27 +103,23 @@ def estimators(case: Case) -> Section | None:
     return Section(
         "Estimators compared",
         DESCRIPTION.format(reference.description) + _smoothed_description(case),
-        [
-            Picture(
-                "estimator_errors",
-                lambda width: _draw_errors(case, reference, table, width),
-                "Above, the errors that matter, RMS: of the position as it is live, and of the "
-                f"position after {OUTAGE_S:.0f} s in which the estimator is given no GPS. Below, "
-                "the error over the flight. "
-                + (TILT if np.isfinite(reference.track.q_nb).any() else "")
-                + "Without GPS the position drifts until it is back; its scale is logarithmic. "
-                "The first seconds, in which every estimator converges, do not count.",
-            )
-        ],
-        [
-            ReportTable(
-                "estimators",
-                table,
-                "RMS errors where they count; worst is the greatest. Withheld fixes: horizontal "
-                f"error at every {HOLD_OUT}th fix when the estimator is not given it. {DRIFT}: at "
-                "the end of such spans.",
-            )
-        ],
+        Picture(
+            "estimator_errors",
+            lambda width: _draw_errors(case, reference, table, width),
+            "Above, the errors that matter, RMS: of the position as it is live, and of the "
+            f"position after {OUTAGE_S:.0f} s in which the estimator is given no GPS. Below, "
+            "the error over the flight. "
+            + (TILT if np.isfinite(reference.track.q_nb).any() else "")
+            + "Without GPS the position drifts until it is back; its scale is logarithmic. "
+            "The first seconds, in which every estimator converges, do not count.",
+        ),
+        ReportTable(
+            "estimators",
+            table,
+            "RMS errors where they count; worst is the greatest. Withheld fixes: horizontal "
+            f"error at every {HOLD_OUT}th fix when the estimator is not given it. {DRIFT}: at "
+            "the end of such spans.",
+        ),
     )
 
 
@@ -158,13 +156,8 @@ def _smoothed_description(case: Case) -> str:
 
 def _draw_errors(case: Case, reference: Reference, table: pd.DataFrame, width_in: float) -> Figure:
     errors = {name: errors_over_time(t, reference.track) for name, t in case.tracks.items()}
-    kinds = {
-        "tilt_deg": "tilt (deg)",
-        "heading_deg": "heading (deg)",
-        "horizontal_m": "horizontal (m)",
-    }
-    known = [k for k in kinds if any(np.isfinite(found[k]).any() for found in errors.values())]
-    figure, bars, axes = _error_panels(width_in, [kinds[key] for key in known], table)
+    known = [k for k in SHOWN if any(np.isfinite(found[k]).any() for found in errors.values())]
+    figure, bars, axes = _error_panels(width_in, [SHOWN[key] for key in known], table)
     for panel, column in zip(bars, filter(table.__contains__, BARS), strict=True):
         _draw_bars(panel, table, column)
     for panel, key in zip(axes, known, strict=True):
@@ -196,7 +189,6 @@ def _error_panels(
 
 
 def _draw_bars(axes: Axes, table: pd.DataFrame, column: str) -> None:
-    """Draw a bar with its value for each estimator, the best one on top."""
     rows = table[["estimator", column]].dropna().sort_values(column, ascending=False)
     colours = [COLOURS.get(name, OTHER) for name in rows["estimator"]]
     bars = axes.barh(rows["estimator"], rows[column], color=colours, height=0.6)
@@ -223,7 +215,7 @@ def comparison(a: Case, b: Case) -> Section:
         for is_shown, name, draw, caption in known
         if is_shown
     ]
-    return Section("Comparison", lead, pictures, _tables(a, b))
+    return Section("Comparison", lead, *pictures, *_tables(a, b))
 
 
 def _tables(a: Case, b: Case) -> list[ReportTable]:
@@ -277,10 +269,9 @@ def _draw_profiles(a: Case, b: Case, width_in: float) -> Figure:
 
 def _draw_map(a: Case, b: Case, width_in: float) -> Figure:
     figure, axes = style.ground_map(width_in, min(0.7 * width_in, 4.6), "A's first fix")
-    frame = a.frame
     for case, name, colour, width in zip((a, b), NAMES, AB_COLOURS, (2.6, 1.0), strict=True):
-        if frame is not None:
-            draw_path(axes, frame, case.track, colour, name, lw=width)
+        if a.frame is not None:
+            draw_path(axes, a.frame, case.track, colour, name, lw=width)
     style.legend_above(axes)
     return figure
 
@@ -298,31 +289,27 @@ def weights(case: Case) -> Section | None:
     return Section(
         "Alpha and beta: Table I",
         _lead(thinned),
-        [
-            Picture(
-                "table1_heat_map",
-                lambda width: _draw_heat_map(thinned, width),
-                "Mean error against interpolated GPS, metres, on this flight and in the paper. "
-                "Light is good. All four maps have one scale, which is logarithmic.",
-            )
-        ],
-        [
-            ReportTable(
-                "table1",
-                _renamed(thinned).merge(paper, on=["alpha", "beta"], how="left"),
-                "GPS thinned to one fix a second. Latitude and longitude: mean error against "
-                "interpolated GPS, as in the paper. Held out: horizontal RMS error at the fixes "
-                "withheld from the filter. Against reference: horizontal RMS error over the "
-                "whole flight, stretches without GPS included. All in metres.",
-                strong=(_best(thinned),),
-            ),
-            ReportTable(
-                "table1_all_fixes",
-                _renamed(full),
-                "The same with every fix of the receiver.",
-                strong=(_best(full),),
-            ),
-        ],
+        Picture(
+            "table1_heat_map",
+            lambda width: _draw_heat_map(thinned, width),
+            "Mean error against interpolated GPS, metres, on this flight and in the paper. "
+            "Light is good. All four maps have one scale, which is logarithmic.",
+        ),
+        ReportTable(
+            "table1",
+            _renamed(thinned).merge(paper, on=["alpha", "beta"], how="left"),
+            "GPS thinned to one fix a second. Latitude and longitude: mean error against "
+            "interpolated GPS, as in the paper. Held out: horizontal RMS error at the fixes "
+            "withheld from the filter. Against reference: horizontal RMS error over the "
+            "whole flight, stretches without GPS included. All in metres.",
+            strong=(_best(thinned),),
+        ),
+        ReportTable(
+            "table1_all_fixes",
+            _renamed(full),
+            "The same with every fix of the receiver.",
+            strong=(_best(full),),
+        ),
     )
 
 
@@ -364,15 +351,10 @@ def _draw_heat_map(table: pd.DataFrame, width_in: float) -> Figure:
     wide = width_in >= style.WIDE_IN
     figure = Figure(figsize=(width_in, 2.5 if wide else 4.2))
     axes = figure.subplots(1, 4) if wide else figure.subplots(2, 2)
-    grids = [
-        ("this flight, latitude", table, "north_m"),
-        ("this flight, longitude", table, "east_m"),
-        ("paper, latitude", paper_table(), "north_m"),
-        ("paper, longitude", paper_table(), "east_m"),
-    ]
     values = {
-        title: source.pivot_table(index="alpha", columns="beta", values=column).to_numpy()
-        for title, source, column in grids
+        f"{name}, {way}": source.pivot_table(column, "alpha", "beta").to_numpy()
+        for name, source in (("this flight", table), ("paper", paper_table()))
+        for way, column in (("latitude", "north_m"), ("longitude", "east_m"))
     }
     every = np.concatenate([grid.ravel() for grid in values.values()])
     scale = LogNorm(float(np.nanmin(every)), float(np.nanmax(every)))

@@ -44,24 +44,18 @@ def orientation(case: Case) -> Section | None:
         "flight, which tilts its compass; for some minutes the gyroscope's drift may be less than "
         "this error, but it never decreases. The quaternion has no gimbal lock "
         "and no jump at 360° (figure 8).",
-        [
-            Picture(
-                "fig07_yaw",
-                lambda width: _draw_yaw(case, lines, width),
-                f"Above: unwrapped yaw over the flight. Below: {below}.",
-            ),
-            Picture(
-                "fig08_quaternion",
-                lambda width: _draw_quaternion(case, width),
-                f"The attitude of the estimator `{case.chosen}`, body to north-east-down, the "
-                "scalar w first. The sign is chosen so that no component jumps.",
-            ),
-        ],
-        [
-            ReportTable(
-                "yaw", _yaw_table(lines), f"Yaw error against {lines.description}.", digits=1
-            )
-        ],
+        Picture(
+            "fig07_yaw",
+            lambda width: _draw_yaw(case, lines, width),
+            f"Above: unwrapped yaw over the flight. Below: {below}.",
+        ),
+        Picture(
+            "fig08_quaternion",
+            lambda width: _draw_quaternion(case, width),
+            f"The attitude of the estimator `{case.chosen}`, body to north-east-down, the "
+            "scalar w first. The sign is chosen so that no component jumps.",
+        ),
+        ReportTable("yaw", _yaw_table(lines), f"Yaw error against {lines.description}.", digits=1),
     )
 
 
@@ -74,14 +68,11 @@ class YawLines:
     reference_deg: FloatArray
     """Yaw of the reference, shape (N,)."""
     description: str
-    """Description of the reference."""
 
     def error_deg(self, name: str) -> FloatArray:
         """Return the error of a line; that of the gyroscope may exceed a full turn."""
         error = self.yaw_deg[name] - self.reference_deg
-        if name == GYRO:
-            return error
-        return wrap_180(error)
+        return error if name == GYRO else wrap_180(error)
 
 
 def yaw_lines(case: Case) -> YawLines:
@@ -174,70 +165,60 @@ def continuous(q_nb: FloatArray) -> FloatArray:
 
 def ground_track(case: Case) -> Section | None:
     """Build the section of the map; None without GPS."""
-    if case.frame is None:
+    if (frame := case.frame) is None:
         return None
     broad = f", the broad line the {case.truth_name}" if case.flight.reference else ""
     return Section(
         "Ground track",
         "The flight from above, on a plain local map: no map tiles, so the page needs no network. "
         f"The fused track is that of the estimator `{case.chosen}`.",
-        [
-            Picture(
-                "ground_track",
-                lambda width: _draw_map(case, width),
-                "Metres east and north of the first fix, with a grid of latitude and longitude. "
-                f"Dots are GPS fixes, the line is the fused track{broad}.",
-            )
-        ],
+        Picture(
+            "ground_track",
+            lambda width: _draw_map(case, frame, width),
+            "Metres east and north of the first fix, with a grid of latitude and longitude. "
+            f"Dots are GPS fixes, the line is the fused track{broad}.",
+        ),
     )
 
 
 def gps_interpolation(case: Case) -> Section | None:
     """Build the section with figures 11 to 13; None without GPS."""
-    if case.frame is None:
+    if (frame := case.frame) is None:
         return None
-    count = len(case.fixes)
     return Section(
         "GPS before and after interpolation",
-        f"GPS measures {count} times in this flight, the IMU {len(case.flight.time_us)} "
+        f"GPS measures {len(case.fixes)} times in this flight, the IMU {len(case.flight.time_us)} "
         "times (figures 11 to 13 of the paper). Straight lines between the fixes fill the gaps, "
         "but only afterwards: the next fix must be known. The fused track fills them at once. "
         "Gaps of more than 2 s are left open.",
-        [
-            Picture(
-                "fig11_12_interpolation",
-                lambda width: _draw_interpolation(case, width),
-                "The same stretch of the track as single fixes and with straight lines between "
-                "them.",
-            ),
-            Picture(
-                "fig13_latitude_longitude",
-                lambda width: _draw_coordinates(case, width),
-                f"Latitude and longitude over {EXCERPT_S:.0f} s: fixes held until the next one as "
-                "they arrive, interpolated between the times at which they were valid, and fused.",
-            ),
-            Picture(
-                "fig13_residuals",
-                lambda width: _draw_residuals(case, width),
-                "The whole flight: how far north and east the held fixes and the fused track are "
-                "from the interpolated GPS. The axis ends at what 99.5 % of the held values "
-                "reach; the first seconds, in which the estimator converges, do not count.",
-            ),
-        ],
+        Picture(
+            "fig11_12_interpolation",
+            lambda width: _draw_interpolation(case, frame, width),
+            "The same stretch of the track as single fixes and with straight lines between them.",
+        ),
+        Picture(
+            "fig13_latitude_longitude",
+            lambda width: _draw_coordinates(case, width),
+            f"Latitude and longitude over {EXCERPT_S:.0f} s: fixes held until the next one as "
+            "they arrive, interpolated between the times at which they were valid, and fused.",
+        ),
+        Picture(
+            "fig13_residuals",
+            lambda width: _draw_residuals(case, frame, width),
+            "The whole flight: how far north and east the held fixes and the fused track are "
+            "from the interpolated GPS. The axis ends at what 99.5 % of the held values "
+            "reach; the first seconds, in which the estimator converges, do not count.",
+        ),
     )
 
 
-def _draw_map(case: Case, width_in: float) -> Figure:
-    frame = case.frame
-    assert frame is not None
-    fixes = case.fixes
+def _draw_map(case: Case, frame: LocalFrame, width_in: float) -> Figure:
+    fixes, reference = case.fixes, case.flight.reference
     height_in = width_in * 0.72 if width_in >= style.WIDE_IN else 4.2
     figure, axes = style.ground_map(width_in, height_in, "the first fix")
-    reference = case.flight.reference
     if reference is not None:
-        draw_path(
-            axes, frame, reference.track, style.REFERENCE, case.truth_name, lw=4.0, alpha=0.25
-        )
+        broad = (style.REFERENCE, case.truth_name)
+        draw_path(axes, frame, reference.track, *broad, lw=4.0, alpha=0.25)
     pos_m = frame.local_m(fixes.lat_deg, fixes.lon_deg)
     axes.plot(pos_m[:, 1], pos_m[:, 0], ".", color=style.ORANGE, ms=3.2, label="GPS fixes")
     draw_path(axes, frame, case.track, style.BLUE, "fused", lw=1.2)
@@ -280,7 +261,6 @@ def _graticule(axes: Axes, frame: LocalFrame) -> None:
 
 
 def _scale_and_north(axes: Axes, east_m: FloatArray, north_m: FloatArray) -> None:
-    """Draw the scale in the emptiest corner, and the north arrow in the next one."""
     low, high = axes.get_xlim()
     bottom, top = axes.get_ylim()
     across, up = (east_m - low) / (high - low), (north_m - bottom) / (top - bottom)
@@ -320,11 +300,8 @@ def _excerpt(case: Case) -> tuple[int, int]:
     return chosen
 
 
-def _draw_interpolation(case: Case, width_in: float) -> Figure:
-    frame = case.frame
-    assert frame is not None
-    fixes = case.fixes
-    begin, end = _excerpt(case)
+def _draw_interpolation(case: Case, frame: LocalFrame, width_in: float) -> Figure:
+    fixes, (begin, end) = case.fixes, _excerpt(case)
     figure, axes = style.panels(width_in, 1, 3.4, columns=2, share_x=False)
     pos_m = frame.local_m(fixes.lat_deg[begin:end], fixes.lon_deg[begin:end])
     for panel in axes:
@@ -340,9 +317,7 @@ def _draw_interpolation(case: Case, width_in: float) -> Figure:
 
 
 def _draw_coordinates(case: Case, width_in: float) -> Figure:
-    flight = case.flight
-    fixes = case.fixes
-    begin, end = _excerpt(case)
+    flight, fixes, (begin, end) = case.flight, case.fixes, _excerpt(case)
     low_us, high_us = fixes.arrival_us[begin], fixes.arrival_us[min(end, len(fixes) - 1)]
     rows = (flight.time_us >= low_us) & (flight.time_us <= high_us)
     time_us = flight.time_us[rows]
@@ -361,10 +336,8 @@ def _draw_coordinates(case: Case, width_in: float) -> Figure:
     return figure
 
 
-def _draw_residuals(case: Case, width_in: float) -> Figure:
-    flight, frame = case.flight, case.frame
-    assert frame is not None
-    fixes = case.fixes
+def _draw_residuals(case: Case, frame: LocalFrame, width_in: float) -> Figure:
+    flight, fixes = case.flight, case.fixes
     straight = interpolate(fixes, flight.time_us)
     base = frame.local_m(straight.lat_deg, straight.lon_deg)
     newest = np.searchsorted(fixes.arrival_us, flight.time_us, side="right") - 1

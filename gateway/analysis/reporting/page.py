@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,7 +35,6 @@ class Picture:
     """A figure and its caption."""
 
     name: str
-    """File name without suffix."""
     draw: Callable[[float], Figure]
     """Function that draws the figure for a width in inches."""
     caption: str
@@ -80,15 +79,16 @@ def table_of_series(
     )
 
 
-@dataclass(frozen=True, slots=True)
 class Section:
-    """One topic of the report."""
+    """One topic of the report: a few sentences, then pictures and tables.
 
-    title: str
-    lead: str
-    """A few sentences; parts in backticks are set as code."""
-    pictures: list[Picture] = field(default_factory=list)
-    tables: list[ReportTable] = field(default_factory=list)
+    Parts of the sentences in backticks are set as code.
+    """
+
+    def __init__(self, title: str, lead: str, *parts: Picture | ReportTable) -> None:
+        self.title, self.lead = title, lead
+        self.pictures = [part for part in parts if isinstance(part, Picture)]
+        self.tables = [part for part in parts if isinstance(part, ReportTable)]
 
     @property
     def anchor(self) -> str:

@@ -64,11 +64,9 @@ def the_flight(flight: PilotFlight) -> Section:
     return Section(
         "The flight",
         lead,
-        pictures,
-        [
-            ReportTable("flight_figures", _figures_table(flight), "The flight in figures."),
-            ReportTable("flight_events", events, "Events and texts.", digits=1),
-        ],
+        *pictures,
+        ReportTable("flight_figures", _figures_table(flight), "The flight in figures."),
+        ReportTable("flight_events", events, "Events and texts.", digits=1),
     )
 
 
@@ -178,7 +176,6 @@ def _mark_events(axes: Axes, flight: PilotFlight) -> None:
 
 
 def _lines(flight: PilotFlight) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return the known quantities over time: seconds and values by label."""
     points, attitude = flight.points, flight.tally.attitude.arrays()
     battery = flight.tally.battery.arrays()
     q_nb = np.column_stack([attitude[f"q_{part}"] for part in "wxyz"])

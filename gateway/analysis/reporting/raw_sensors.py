@@ -42,8 +42,7 @@ def acceleration(case: Case) -> Section:
             f"At this flight's {rate_hz:.0f} samples/s a low-pass at {cutoff:g} Hz has no effect: "
             "half the sample rate is the highest possible frequency. So there is nothing to "
             "plot for this flight; the table is for the filters at the paper's rate.",
-            [],
-            [_paper_table(case)],
+            _paper_table(case),
         )
     return Section(
         "Acceleration filters",
@@ -52,26 +51,22 @@ def acceleration(case: Case) -> Section:
         "step and delays unevenly. "
         "The paper states that it also takes longer; with the same order both are the same five "
         f"multiplications per sample, and the table gives their time here.",
-        [
-            _excerpt(case, 0, "fig09_acceleration_x"),
-            _excerpt(case, 1, "fig10_acceleration_y"),
-            Picture(
-                "filter_response",
-                lambda width: _draw_response(case, width),
-                f"Gain, phase and group delay at {rate_hz:.0f} samples/s. The Chebyshev filter is "
-                "scaled to unit gain at 0 Hz, so that gravity keeps its size; its ripple is the "
-                "hump below the cutoff.",
-            ),
-        ],
-        [
-            ReportTable(
-                "filters_flight",
-                compare(paper, rate_hz),
-                f"At this flight's {rate_hz:.0f} samples/s; times were taken on this machine for "
-                "three axes.",
-            ),
-            _paper_table(case),
-        ],
+        _excerpt(case, 0, "fig09_acceleration_x"),
+        _excerpt(case, 1, "fig10_acceleration_y"),
+        Picture(
+            "filter_response",
+            lambda width: _draw_response(case, width),
+            f"Gain, phase and group delay at {rate_hz:.0f} samples/s. The Chebyshev filter is "
+            "scaled to unit gain at 0 Hz, so that gravity keeps its size; its ripple is the "
+            "hump below the cutoff.",
+        ),
+        ReportTable(
+            "filters_flight",
+            compare(paper, rate_hz),
+            f"At this flight's {rate_hz:.0f} samples/s; times were taken on this machine for "
+            "three axes.",
+        ),
+        _paper_table(case),
     )
 
 
@@ -172,7 +167,7 @@ def noise(case: Case) -> Section:
     return Section(
         "Noise",
         "Spectrum of the inertial sensors, and the effect of averaging at rest." + tail,
-        pictures,
+        *pictures,
     )
 
 
@@ -186,15 +181,13 @@ def timing(case: Case) -> Section | None:
         "Timing and loss",
         "Regularity of the samples, by the gateway's clock and by the node's own, and "
         "samples that are missing.",
-        [
-            Picture(
-                "timing",
-                lambda width: _draw_timing(case.flight, node, width),
-                "Left: interval between neighbouring samples; a sample that is lost doubles it, "
-                "jitter spreads it. Right: samples lost in each second.",
-            )
-        ],
-        [ReportTable("timing", table, "Samples lost are gaps in the node's own time.", digits=3)],
+        Picture(
+            "timing",
+            lambda width: _draw_timing(case.flight, node, width),
+            "Left: interval between neighbouring samples; a sample that is lost doubles it, "
+            "jitter spreads it. Right: samples lost in each second.",
+        ),
+        ReportTable("timing", table, "Samples lost are gaps in the node's own time.", digits=3),
     )
 
 
@@ -232,19 +225,13 @@ def magnetometer(case: Case) -> Section | None:
         "A magnetometer that turns in the Earth's field alone measures points on a sphere about "
         "zero. Hard iron of the aircraft shifts it, soft iron deforms it; the calibration corrects "
         "both.",
-        [
-            Picture(
-                "magnetometer_sphere",
-                lambda width: _draw_sphere(before, after, width),
-                "Each dot is one sample, seen from two sides; the circle is the mean field after "
-                "calibration.",
-            )
-        ],
-        [
-            ReportTable(
-                "magnetometer", table, "On a sphere about zero the spread is the noise alone."
-            )
-        ],
+        Picture(
+            "magnetometer_sphere",
+            lambda width: _draw_sphere(before, after, width),
+            "Each dot is one sample, seen from two sides; the circle is the mean field after "
+            "calibration.",
+        ),
+        ReportTable("magnetometer", table, "On a sphere about zero the spread is the noise alone."),
     )
 
 
@@ -259,17 +246,17 @@ def heights(case: Case) -> Section | None:
         "Height above mean sea level by GPS, by the barometer and fused. The barometer gives the "
         f"standard atmosphere's height; it is shifted by {offset_m:+.1f} m here, so that it agrees "
         "with GPS in the mean.",
-        [
-            Picture(
-                "heights",
-                lambda width: _draw_heights(case, offset_m, width),
-                "Above: heights. Below: the difference of each from "
-                + (f"the {case.truth_name}." if flight.reference else "the fused height."),
-            )
-        ],
-        [ReportTable("heights", _height_table(case, offset_m), "Height errors.")]
-        if flight.reference
-        else [],
+        Picture(
+            "heights",
+            lambda width: _draw_heights(case, offset_m, width),
+            "Above: heights. Below: the difference of each from "
+            + (f"the {case.truth_name}." if flight.reference else "the fused height."),
+        ),
+        *(
+            [ReportTable("heights", _height_table(case, offset_m), "Height errors.")]
+            if flight.reference
+            else []
+        ),
     )
 
 
@@ -349,7 +336,6 @@ def _draw_allan(flight: Flight, rest: slice, width_in: float) -> Figure:
 def _draw_logarithmic(
     lines: dict[str, tuple[FloatArray, FloatArray]], xlabel: str, line_width: float, width_in: float
 ) -> Figure:
-    """Draw the values of three axes over x, by the label of the panel."""
     figure, axes = style.panels(width_in, 1, 2.7, columns=2, share_x=False)
     for panel, (label, (x, values)) in zip(axes, lines.items(), strict=True):
         for part, name, colour in zip(values.T, "xyz", AXIS_COLOURS, strict=True):

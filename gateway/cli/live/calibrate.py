@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 import typer
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import TextColumn
 
 from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import (
@@ -29,7 +29,7 @@ from gateway.cli.support.options import (
     read_settings,
 )
 from gateway.cli.support.recordings import files_of
-from gateway.cli.support.terminal import console_of, refuse, table_of
+from gateway.cli.support.terminal import console_of, progress_bar, refuse, table_of
 from gateway.clock import GatewayClock, unix_time_us
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.live.control_verbs import raw_of
@@ -289,7 +289,6 @@ def _poses_of_log(samples: NodeSamples) -> Poses:
 
 
 def _six_sides(capture: Capture) -> list[NodeSamples]:
-    """Collect poses until the node has been laid on all its sides."""
     held: list[NodeSamples] = []
     for _ in range(MAX_TRIES):
         missing = _missing(held)
@@ -310,7 +309,6 @@ def _six_sides(capture: Capture) -> list[NodeSamples]:
 
 
 def _missing(samples: list[NodeSamples]) -> list[str]:
-    """Return the names of the sides on which the node has not been laid yet."""
     seen = calibrating.sides_of(samples)
     return [name for number, name in enumerate(SIDES) if number not in seen]
 
@@ -387,11 +385,8 @@ class _Collecting:
         label = "sides of the field measured" if turned else "listening"
         total = calibrating.FIELD_SIDES if turned else seconds
         unit = f"of {total}" if turned else "s"
-        self.bar = Progress(
-            TextColumn(label), BarColumn(), TextColumn(f"{{task.completed:.0f}} {unit}"),
-            console=console, transient=True, auto_refresh=False, disable=not console.is_terminal,
-        )  # fmt: skip
-        self._task = self.bar.add_task("", total=total)
+        self.bar = progress_bar(TextColumn(f"{{task.completed:.0f}} {unit}"))
+        self._task = self.bar.add_task(label, total=total)
         self.limit_s = MAG_LIMIT_S if turned else seconds
 
     def add(self, records: Iterable[RawRecord]) -> bool:

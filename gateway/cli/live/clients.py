@@ -289,7 +289,6 @@ def _clients(clients: Sequence[Record], now_us: int) -> Table:
 
 
 def _first_systems(systems: Sequence[tuple[int, int]]) -> list[str]:
-    """Return system and component ids as text, and the number of further ones."""
     named = [f"{system}.{component}" for system, component in systems[:MOST_SYSTEMS]]
     more = len(systems) - len(named)
     return [*named, f"and {more} more"] if more else named

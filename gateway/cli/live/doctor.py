@@ -290,7 +290,6 @@ def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
 
 
 def _write_template(text: str) -> None:
-    """Write the settings file, which is never overwritten."""
     file = settings_file()
     file.parent.mkdir(parents=True, exist_ok=True)
     try:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, Literal, NoReturn
 
 import typer
 from msgspec.structs import replace
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import TimeElapsedColumn
 
 from gateway.cli.live.calibrate import (
     STEPS,
@@ -24,7 +24,7 @@ from gateway.cli.live.calibrate import (
 from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import argument, option, read_settings, settings_file
 from gateway.cli.support.phone import guide_phone
-from gateway.cli.support.terminal import console_of, refuse, table_of
+from gateway.cli.support.terminal import console_of, progress_bar, refuse, table_of
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.extras import require
 from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
@@ -269,12 +269,8 @@ def _observe(
     serial: SerialSettings, feed: Callable[[list[RawRecord]], bool], limit_s: float
 ) -> LinkReport:
     """Read the receiver until `feed` has enough, at most for a time; shows progress."""
-    bar = Progress(
-        TextColumn("listening"), BarColumn(), TimeElapsedColumn(),
-        console=console, transient=True, disable=not console.is_terminal,
-    )  # fmt: skip
-    bar.add_task("", total=None)
-    with bar:
+    with progress_bar(TimeElapsedColumn(), auto_refresh=True) as bar:
+        bar.add_task("listening", total=None)
         return asyncio.run(listen(serial, feed, limit_s))[0]
 
 
@@ -291,5 +287,4 @@ def _hint(text: str) -> None:
 
 
 def _stop(text: str, *hints: str) -> NoReturn:
-    """End the command with the reason and remedies."""
     refuse("\n".join([text, *(f"- {hint}" for hint in hints)]))

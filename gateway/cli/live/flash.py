@@ -162,7 +162,6 @@ def _address(text: str | None) -> int | None:
 
 
 def _list() -> None:
-    """List the serial ports and the bootloader behind each USB adapter."""
     found = list_serial_ports()
     if not any(port.usb_id for port in found):
         refuse("no USB adapter is connected: connect a board by USB, then list again")
@@ -191,7 +190,6 @@ def _write(
     keep: bool,
     duty: float | None,
 ) -> None:
-    """Patch an image and write it to a board."""
     # Invalid settings are refused before a port is opened.
     settings = _changed(program, boards.block_of(image).settings, changes, duty)
     device = find_port(port, list_serial_ports())

@@ -112,7 +112,6 @@ def set_id(
 
 
 def _rows(site: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Return a row for each vehicle of a site, or one for the site."""
     state = "here" if site["is_here"] else "gone"
     if site["sessions"] > 1:
         state = f"{site['sessions']} of this name"

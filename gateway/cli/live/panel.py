@@ -26,7 +26,6 @@ app = typer.Typer()
 NICENESS: Final = 5
 """Niceness of the panel, set before its imports, so that the gateway has priority."""
 LINK: Final = "panel: "
-"""Prefix of the line with the page's address."""
 RESTART_S: Final = 5.0
 LONGEST_RESTART_S: Final = 300.0
 """Longest pause between restarts, so that repeated failures do not fill the log."""

@@ -211,7 +211,6 @@ def _read_anonymity(
 
 
 def _print_edits(edits: Sequence[FrameEdit]) -> None:
-    """Print the numbers of changed fields and of frames left out, by message."""
     table = table_of("message", "field", "changed", "left out", left=2)
     changed = sum((edit.changed for edit in edits if isinstance(edit, Anonymiser)), Counter())
     left_out = sum((edit.left_out for edit in edits), Counter[tuple[str, str]]())
@@ -234,7 +233,6 @@ def _read_renames(texts: Sequence[str]) -> dict[int, int]:
 
 
 def _check_edits(edits: TlogEdits, output: Path, message: list[str], system: list[int]) -> None:
-    """Refuse edits for formats without frames."""
     if output.suffix == ".tlog":
         return
     if message and (

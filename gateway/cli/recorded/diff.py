@@ -90,7 +90,6 @@ def _read(name: str, files: list[Path], options: ReadOptions) -> Contents:
 
 
 def _read_live(name: str, vehicle_id: int) -> Contents:
-    """Read the parameters, version and plans of an aircraft of the running gateway."""
     answers = LogAnswers()
     first, verb = 0, "vehicle.introduction"
     while frames := ask(verb, vehicle_id=vehicle_id, first=first):

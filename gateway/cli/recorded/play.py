@@ -196,7 +196,6 @@ def _next_speed(speed: float | None, *, faster: bool) -> float:
 
 
 async def _watch(daemon: PlayerDaemon) -> None:
-    """Show the position until the end."""
     console = console_of()
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[at]}")

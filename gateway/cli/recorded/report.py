@@ -124,7 +124,6 @@ def _report_one(
     *,
     smooth: bool,
 ) -> None:
-    """Write the folder with page, figures and tables of one flight."""
     # These require the extra, and take a second to import.
     from gateway.analysis.case import make_case
     from gateway.analysis.reporting.compose import make_report
@@ -199,7 +198,6 @@ def _write_html(
     compare: bool,
     force: bool,
 ) -> None:
-    """Write the HTML file of one flight."""
     require(f"{output}", "panel")
     # These take a second to import.
     from gateway.panel.flight_page import add_comparison, begin_comparison, read_flight, render_page
@@ -228,7 +226,6 @@ def _report_many(
     jobs: int | None,
     cluster: str | None,
 ) -> None:
-    """Score every estimator on every flight, and write the folder of the results."""
     # Imported here: these import pandas.
     from gateway.batch.statistics import (
         errors_by_group,

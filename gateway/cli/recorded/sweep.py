@@ -217,7 +217,6 @@ def _parse_axes(options: SweepOptions) -> list[Axis]:
 
 
 def _print_idle(contest: Contest, axes: Sequence[Axis]) -> None:
-    """Print in advance the settings that have no effect."""
     idle = sweeping.idle_axes(contest, axes)
     if not idle:
         return

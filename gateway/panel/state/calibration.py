@@ -114,7 +114,6 @@ PARAMS: Final[dict[CalibrationStep, tuple[float, ...]]] = {
     CalibrationStep.ACCEL: (0.0, 0.0, 0.0, 0.0, 1.0),
     CalibrationStep.LEVEL: (0.0, 0.0, 0.0, 0.0, 2.0),
 }
-"""Parameters of the command."""
 
 
 class RunState(StrEnum):
@@ -160,7 +159,6 @@ class CalibrationRun:
         self.progress = 0
         """Progress in percent, as reported by the vehicle."""
         self.trouble = ""
-        """The reason why it failed."""
         self.sides_done: list[str] = []
         self.side_now: str | None = None
         """The present lower side, if it is unambiguous."""
@@ -334,7 +332,6 @@ class CalibrationRun:
 
 
 def _sample(message: Any, *scales: float) -> Iterator[FloatArray]:
-    """Return specific force, angular rate and magnetic field of a message, in SI and uT."""
     for name, scale in zip(("acc", "gyro", "mag"), scales, strict=True):
         yield np.array([getattr(message, f"{axis}{name}") for axis in "xyz"]) * scale
 

@@ -130,7 +130,6 @@ class _Columns:
 
 
 def _readers_of(message: Any) -> dict[str, Callable[[Any], float]]:
-    """Return functions that read each number in a message, by its name."""
     found: dict[str, Callable[[Any], float]] = {}
     for field in message.fieldnames:
         value = getattr(message, field)

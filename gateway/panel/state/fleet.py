@@ -23,7 +23,6 @@ class Origin:
     word: str
     """`recorded` or `fused again`."""
     recorded_id: int
-    """System id in the recording."""
     page: str = ""
     """Id of the page that plays it; no other page shows it."""
 

@@ -15,13 +15,11 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     time_us: int
     """When the newest attitude or position was received, on the panel's clock."""
     title: str
-    """Displayed name."""
     model: str
     """Its 3D model, see `VehicleState.model`."""
     origin: str
     """`live`, `recorded` or `fused again`."""
     generation: int
-    """Number of restarts of its path."""
     silent_s: float
     """Time since the newest heartbeat."""
     q_nb: tuple[float, float, float, float]
@@ -31,7 +29,6 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     lon_deg: float
     alt_amsl_m: float
     alt_home_m: float
-    """Height above home."""
     vel_n_mps: tuple[float, float, float]
     groundspeed_mps: float
     airspeed_mps: float

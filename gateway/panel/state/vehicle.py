@@ -46,9 +46,7 @@ class VehicleState:
         self.state = NewestState()
         """The newest messages of its autopilot, with their times on the panel's clock."""
         self.history = FlightHistory()
-        """Its past states, a few a second."""
         self.fixes: deque[TrackPoint] = deque(maxlen=MAX_TRACK)
-        """GPS fixes."""
         self.texts = StatusTexts()
         self.exact_mark: Location | None = None
         """The exact mark from the gateway's control socket; that from MAVLink is rounded."""
@@ -161,7 +159,6 @@ class VehicleState:
         return "Board supply" if is_supply else "Battery"
 
     def _alt_home_m(self, at: Position) -> float:
-        """Return the height above home, as reported or else from that of home."""
         if math.isfinite(at.alt_home_m) or self.home is None:
             return at.alt_home_m
         return at.alt_amsl_m - self.home.alt_amsl_m

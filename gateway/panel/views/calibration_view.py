@@ -91,7 +91,6 @@ class CalibrationView:
         self._refresh()
 
     def _run(self) -> CalibrationRun | None:
-        """Return the newest calibration if it belongs to the shown step."""
         dialogue = self._context.dialogue
         run = None if dialogue is None else dialogue.calibration
         return run if run is not None and run.step is self._step else None
@@ -228,7 +227,6 @@ class CalibrationView:
             allow(button, self._why_not(ready=ready))
 
     def _orientation(self) -> str:
-        """Return the orientation that corresponds to the parameters."""
         dialogue = self._context.dialogue
         entries = {} if dialogue is None else dialogue.parameters.entries
         now = [entries[name].value for name in MNT_NAMES if name in entries]
@@ -317,7 +315,6 @@ class CalibrationView:
         )
 
     def _changes(self) -> dict[str, tuple[float, float]]:
-        """Return the parameters that the calibration changed."""
         dialogue = self._context.dialogue
         if dialogue is None:
             return {}

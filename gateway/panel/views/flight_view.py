@@ -61,7 +61,6 @@ def build_map(context: ViewContext) -> None:
 async def _at(
     context: ViewContext, act: Callable[..., Awaitable[None]], event: GenericEventArguments
 ) -> None:
-    """Apply a choice at a position of the map."""
     spot = Location(float(event.args["lat_deg"]), float(event.args["lon_deg"]), _ground_m(context))
     with notify_failure(context):
         await act(context, spot)

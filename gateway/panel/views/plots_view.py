@@ -88,7 +88,6 @@ class PlotsView:
             strip.chart.refresh()
 
     def _offer(self) -> None:
-        """Offer the fields received so far."""
         fields = self._context.parts.history.fields(self._context.system_id or 0)
         names = [f"{kind}.{field}" for kind, inner in fields.items() for field in inner]
         if names != self._names:
