@@ -67,7 +67,7 @@ class Dialogue:
     def calibrate(self, step: CalibrationStep) -> None:
         """Start a calibration."""
         if self.unanswered is None:
-            self.before = {name: entry.value for name, entry in self.parameters.entries.items()}
+            self.before = self.parameters.values
         self.calibration = CalibrationRun(self.parameters.system_id, step, self._now_us())
         self.ask_for_samples()
         self._send(self.calibration.start_message())

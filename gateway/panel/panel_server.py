@@ -39,9 +39,7 @@ from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.recording_transfer import add_recording_files
 from gateway.panel.response_headers import ScriptNonces
 from gateway.panel.rest_api import RestApi
-from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState
-from gateway.panel.state.samples import SampleMemory
 from gateway.panel.telemetry_feed import PATH, TelemetryFeed, add_tracks
 from gateway.panel.uplink import ControlClient, GatewayWatch, Uplink
 from gateway.panel.view_context import WEB, PanelParts
@@ -175,17 +173,12 @@ def make_parts(
     clock, fleet = GatewayClock(), FleetState()
     control = ControlClient(control_socket)
     uplink = Uplink(connect, fleet, control, clock)
-    history, samples = FieldHistory(), SampleMemory()
-    fleet.listen(history.add)
-    fleet.listen(samples.add)
-    fleet.on_discard(history.discard)
-    fleet.on_discard(samples.discard)
     dialogues = Dialogues(fleet, uplink.send, clock)
     watch = GatewayWatch(control, fleet)
     logins = Logins(settings.password, settings.viewer_password)
     return PanelParts(
-        settings, recordings, clock, fleet, control, uplink, history, samples, dialogues, watch,
-        RecordingJobs(), MapTiles(settings), OpenPages(), logins,
+        settings, recordings, clock, fleet, control, uplink, dialogues, watch, RecordingJobs(),
+        MapTiles(settings), OpenPages(), logins,
     )  # fmt: skip
 
 

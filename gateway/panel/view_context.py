@@ -46,7 +46,6 @@ from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.state.commands import command_at, command_long
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState
-from gateway.panel.state.samples import SampleMemory
 from gateway.panel.state.vehicle import VehicleState
 from gateway.panel.uplink import READING, ControlClient, GatewayWatch, Uplink
 from gateway.vehicle.plan import Location
@@ -70,8 +69,6 @@ class PanelParts:
     fleet: FleetState
     control: ControlClient
     uplink: Uplink
-    history: FieldHistory
-    samples: SampleMemory
     dialogues: Dialogues
     watch: GatewayWatch
     """The gateway's status, updated every second."""
@@ -113,6 +110,11 @@ class ViewContext:
     def vehicle(self) -> VehicleState | None:
         """The selected aircraft; None before the first."""
         return None if self.system_id is None else self.parts.fleet.vehicles.get(self.system_id)
+
+    @property
+    def received(self) -> FieldHistory:
+        """The received fields of the selected aircraft; empty before the first."""
+        return FieldHistory() if self.vehicle is None else self.vehicle.received
 
     @property
     def dialogue(self) -> Dialogue | None:

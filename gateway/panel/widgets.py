@@ -380,12 +380,10 @@ class LiveChart:
         return fields_csv(series, {name: self._unit(name)[1] for name in self.fields}, zero_us)
 
     def _unit(self, name: str) -> tuple[float, str]:
-        return shown_unit(self._context.parts.history.unit(self._context.system_id or 0, name))
+        return shown_unit(self._context.received.unit(name))
 
     def _series(self, name: str, after_us: int, until_us: int | None = None) -> Points:
-        system_id = self._context.system_id or 0
-        history = self._context.parts.history
-        time_us, values = history.series(system_id, name, after_us, until_us)
+        time_us, values = self._context.received.series(name, after_us, until_us)
         return time_us, values * self._unit(name)[0]
 
     def _on_ready(self) -> None:

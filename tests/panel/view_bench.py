@@ -18,9 +18,7 @@ from gateway.panel.open_pages import OpenPages
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
 from gateway.panel.recording_jobs import RecordingJobs
-from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState
-from gateway.panel.state.samples import SampleMemory
 from gateway.panel.uplink import CommandFailedError, GatewayWatch
 from gateway.panel.view_context import PanelParts, ViewContext
 from tests.kit.process import START_LIMIT_S
@@ -44,13 +42,11 @@ class ViewBench:
         self._outgoing: list[Any] = []
         self._ticks: list[Callable[[], Any]] = []
         self.vehicle = VehicleBench(self)
-        fleet, history, samples = FleetState(), FieldHistory(), SampleMemory()
-        fleet.listen(history.add)
-        fleet.listen(samples.add)
+        fleet = FleetState()
         settings = PanelSettings(tiles_folder=str(folder / "tiles"), map_styles=())
         us: Any = self
         self.parts = PanelParts(
-            settings, folder, us.now_us, fleet, us, us, history, samples,
+            settings, folder, us.now_us, fleet, us, us,
             Dialogues(fleet, self._outgoing.append, us.now_us), GatewayWatch(us, fleet),
             RecordingJobs(), MapTiles(settings), OpenPages(), Logins("", ""),
         )  # fmt: skip

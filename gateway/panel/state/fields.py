@@ -1,4 +1,4 @@
-"""Received numeric fields over the last minutes, by aircraft and message; as CSV."""
+"""Received numeric fields of an aircraft over the last minutes, by message; as CSV."""
 
 import math
 from array import array
@@ -48,39 +48,32 @@ def shown_unit(unit: str) -> tuple[float, str]:
 
 
 class FieldHistory:
-    """Received fields as columns over time, by aircraft and message."""
+    """Received fields of one aircraft as columns over time, by message."""
 
     def __init__(self) -> None:
-        self._vehicles: dict[int, dict[str, _Columns]] = {}
+        self._kinds: dict[str, _Columns] = {}
 
-    def add(self, system_id: int, message: Any, now_us: int) -> None:
+    def add(self, message: Any, now_us: int) -> None:
         """Store one message."""
-        kinds = self._vehicles.setdefault(system_id, {})
         name = _kind_of(message)
-        columns = kinds.get(name)
-        if columns is None:
-            if len(kinds) >= MAX_KINDS:
+        if name not in self._kinds:
+            if len(self._kinds) >= MAX_KINDS:
                 return
-            columns = kinds[name] = _Columns(message)
-        columns.add(message, now_us)
+            self._kinds[name] = _Columns(message)
+        self._kinds[name].add(message, now_us)
 
-    def discard(self, system_id: int) -> None:
-        """Delete the data of an aircraft."""
-        self._vehicles.pop(system_id, None)
+    def fields(self) -> dict[str, tuple[str, ...]]:
+        """Return the fields of each message, in alphabetical order."""
+        kinds = sorted(self._kinds.items())
+        return {kind: columns.names for kind, columns in kinds if columns.names}
 
-    def fields(self, system_id: int) -> dict[str, tuple[str, ...]]:
-        """Return the fields of each message of an aircraft, in alphabetical order."""
-        kinds = self._vehicles.get(system_id, {})
-        return {kind: kinds[kind].names for kind in sorted(kinds) if kinds[kind].names}
-
-    def unit(self, system_id: int, name: str) -> str:
+    def unit(self, name: str) -> str:
         """Return a field's unit as MAVLink writes it; empty if it has none or is unknown."""
         kind, _, field = name.partition(".")
-        columns = self._vehicles.get(system_id, {}).get(kind)
-        return "" if columns is None else columns.unit(field)
+        return self._kinds[kind].unit(field) if kind in self._kinds else ""
 
     def series(
-        self, system_id: int, name: str, after_us: int = -1, until_us: int | None = None
+        self, name: str, after_us: int = -1, until_us: int | None = None
     ) -> tuple[IntArray, FloatArray]:
         """Return the times, on the panel's clock, and values of a field; empty if never received.
 
@@ -88,7 +81,7 @@ class FieldHistory:
         have the unit of the message, and times after the first and up to the second limit.
         """
         kind, _, field = name.partition(".")
-        columns = self._vehicles.get(system_id, {}).get(kind)
+        columns = self._kinds.get(kind)
         if columns is None or field not in columns.names:
             return np.empty(0, np.int64), np.empty(0)
         return columns.column(field, after_us, until_us)

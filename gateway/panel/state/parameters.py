@@ -259,6 +259,11 @@ class ParameterClient:
         """Names of changed parameters that are not confirmed yet."""
         return frozenset(self._changes)
 
+    @property
+    def values(self) -> dict[str, float]:
+        """The values by name."""
+        return {name: entry.value for name, entry in self.entries.items()}
+
     def load(self, now_us: int) -> list[Any]:
         """Request all parameters; return the messages to send."""
         self.state, self._attempts = ListState.LOADING, 0

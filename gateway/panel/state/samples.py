@@ -1,4 +1,4 @@
-"""The newest sensor frames of each aircraft, to be fused again."""
+"""The newest sensor frames of an aircraft, to be fused again."""
 
 from collections import Counter, deque
 from typing import Any, Final
@@ -27,34 +27,25 @@ TimedFrames = list[tuple[int, bytes]]
 
 
 class SampleMemory:
-    """Sensor frames of each aircraft."""
+    """Sensor frames of one aircraft."""
 
     def __init__(self) -> None:
-        self._frames: dict[int, deque[tuple[int, bytes]]] = {}
+        self.frames: deque[tuple[int, bytes]] = deque(maxlen=MAX_FRAMES)
+        """The oldest first, with the time at which each was received."""
 
-    def add(self, system_id: int, message: Any, now_us: int) -> None:
+    def add(self, message: Any, now_us: int) -> None:
         """Store a message, if it is a sensor's."""
         if message.get_msgId() not in SENSOR_MESSAGES:
             return
-        frames = self._frames.setdefault(system_id, deque(maxlen=MAX_FRAMES))
-        frames.append((now_us, bytes(message.get_msgbuf())))
-        while frames[0][0] < now_us - SPAN_US:
-            frames.popleft()
+        self.frames.append((now_us, bytes(message.get_msgbuf())))
+        while self.frames[0][0] < now_us - SPAN_US:
+            self.frames.popleft()
 
-    def discard(self, system_id: int) -> None:
-        """Delete the frames of an aircraft."""
-        self._frames.pop(system_id, None)
-
-    def frames(self, system_id: int) -> TimedFrames:
-        """Return the frames of an aircraft, the oldest first."""
-        return list(self._frames.get(system_id, ()))
-
-    def collected(self, system_id: int, span_s: float, rate_hz: float) -> float:
+    def collected(self, span_s: float, rate_hz: float) -> float:
         """Return the collected share of a span up to the newest sample at a rate, at most 1."""
-        frames = self._frames.get(system_id, ())
-        newest_us = frames[-1][0] if frames else 0
+        newest_us = self.frames[-1][0] if self.frames else 0
         counts, first_us = Counter[int](), dict[int, int]()
-        for time_us, frame in reversed(frames):
+        for time_us, frame in reversed(self.frames):
             if newest_us - time_us > (span_s + 1.0) * US_PER_S:
                 break
             kind = message_id_of(frame)

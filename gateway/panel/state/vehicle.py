@@ -8,8 +8,10 @@ import pymap3d.vincenty as vincenty
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.angle import wrap_180
+from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.history import MAX_TRACK, TRACK_INTERVAL_US, FlightHistory
 from gateway.panel.state.instant import Instant
+from gateway.panel.state.samples import SampleMemory
 from gateway.panel.state.texts import StatusTexts
 from gateway.records import NAN
 from gateway.units import US_PER_S
@@ -46,6 +48,7 @@ class VehicleState:
         self.state = NewestState()
         """The newest messages of its autopilot, with their times on the panel's clock."""
         self.history = FlightHistory()
+        self.received, self.samples = FieldHistory(), SampleMemory()
         self.fixes: deque[TrackPoint] = deque(maxlen=MAX_TRACK)
         self.texts = StatusTexts()
         self.exact_mark: Location | None = None
@@ -62,6 +65,8 @@ class VehicleState:
             self._note_fix(now_us)
         if has_moved and now_us - self.history.newest_us >= TRACK_INTERVAL_US:
             self.history.add(now_us, self.instant(now_us))
+        self.received.add(message, now_us)
+        self.samples.add(message, now_us)
 
     @property
     def name(self) -> str:

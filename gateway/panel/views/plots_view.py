@@ -88,8 +88,8 @@ class PlotsView:
             strip.chart.refresh()
 
     def _offer(self) -> None:
-        fields = self._context.parts.history.fields(self._context.system_id or 0)
-        names = [f"{kind}.{field}" for kind, inner in fields.items() for field in inner]
+        fields = self._context.received.fields().items()
+        names = [f"{kind}.{field}" for kind, inner in fields for field in inner]
         if names != self._names:
             self._names = names
             for strip in self._strips:

@@ -203,24 +203,23 @@ class ComparisonCard:
             self._context.dialogue.ask_for_samples()
 
     def _refresh(self) -> None:
-        system_id, samples = self._context.system_id, self._context.parts.samples
-        share = samples.collected(system_id or 0, LEAST_S, LEAST_HZ)
+        vehicle = self._context.vehicle
+        share = 0.0 if vehicle is None else vehicle.samples.collected(LEAST_S, LEAST_HZ)
         reason = "" if share >= 1.0 else f"Collecting samples: {share:.0%}"
         allow(self._button, "The samples are being fused." if self._is_fusing else reason)
         self._collecting.set_text(reason)
         self._collecting.set_visibility(bool(reason))
 
     async def _compare(self) -> None:
-        context, system_id = self._context, self._context.system_id
-        if system_id is None:
+        vehicle, dialogue = self._context.vehicle, self._context.dialogue
+        if vehicle is None or dialogue is None:
             return
-        parameters = context.parts.dialogues.of(system_id).parameters.entries
-        values = {name: entry.value for name, entry in parameters.items()}
+        values = dialogue.parameters.values
         self._is_fusing = True
         self._refresh()
         self._summary.set_text("Fusing …")
         try:
-            self._estimates = await compare_apart(context.parts.samples.frames(system_id), values)
+            self._estimates = await compare_apart([*vehicle.samples.frames], values)
         except ComparisonError as error:
             self._summary.set_text(f"Cannot be compared: {error}.")
             return
@@ -241,7 +240,7 @@ class ComparisonCard:
         key = str(self._quantity.value)
         _, unit, field, factor = QUANTITIES[key]
         zero_us = unix_time_us() - self._context.now_us
-        flown_us, flown = self._context.parts.history.series(self._context.system_id or 0, field)
+        flown_us, flown = self._context.received.series(field)
         begin_us, end_us = self._estimates[0].time_us[[0, -1]]
         inside = (flown_us >= begin_us) & (flown_us <= end_us)
         curves: list[tuple[str, IntArray, FloatArray]] = [

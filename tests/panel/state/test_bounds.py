@@ -5,10 +5,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.state.history import MAX_TRACK
-from gateway.panel.state.samples import SPAN_US, SampleMemory
+from gateway.panel.state.samples import SPAN_US
 from gateway.units import US_PER_S
 from tests.panel.messages import decoded, heartbeat, position
 
@@ -20,11 +19,7 @@ class Memory:
     """All that is kept by aircraft, fed on a manual clock."""
 
     def __init__(self) -> None:
-        self.fleet, self.history, self.samples = FleetState(), FieldHistory(), SampleMemory()
-        for listener in (self.history.add, self.samples.add):
-            self.fleet.listen(listener)
-        for discard in (self.history.discard, self.samples.discard):
-            self.fleet.on_discard(discard)
+        self.fleet = FleetState()
 
     def fly(self, begin_s: int, end_s: int) -> None:
         imu = decoded(mavlink.MAVLink_highres_imu_message(0, *[0.0] * 13, 63))
@@ -44,8 +39,8 @@ class Memory:
             "track": len(vehicle.history),
             "texts": len(vehicle.texts.all),
             "newest": len(vehicle.state.fields),
-            "frames": len(self.samples.frames(1)),
-            "rows": len(self.history.series(1, "ATTITUDE.roll")[0]),
+            "frames": len(vehicle.samples.frames),
+            "rows": len(vehicle.received.series("ATTITUDE.roll")[0]),
         }
 
 
@@ -66,5 +61,3 @@ def test_discarded_aircraft_leaves_no_data() -> None:
     memory.fly(0, 5)
     memory.fleet.discard(1)
     assert memory.fleet.vehicles == {}
-    assert memory.history.fields(1) == {}
-    assert memory.samples.frames(1) == []
