@@ -24,8 +24,7 @@ from gateway.analysis.metrics import euler_rad, rms
 from gateway.estimation.select import ESTIMATORS, EstimationSettings
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
-from gateway.panel.state.fields import FloatArray
-from gateway.panel.state.samples import TimedFrames
+from gateway.panel.state.fields import FloatArray, TimedFrames
 from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.fuse import FusionSettings, with_estimator
 from gateway.recordings.table import TableBlock

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.estimation.select import ESTIMATORS
 from gateway.panel.estimator_trial import LEAST_HZ, LEAST_S, ComparisonError, compare, settings_of
-from gateway.panel.state.samples import SPAN_US, SampleMemory
+from gateway.panel.state.fields import FUSED_SPAN_US, SampleMemory
 from gateway.units import US_PER_S
 from tests.kit.recordings import START_US
 from tests.panel.messages import decoded
@@ -89,4 +89,4 @@ def test_only_the_newest_minutes_of_sensor_frames_are_stored() -> None:
     assert not memory.frames
     memory = collected(range(0, 400 * US_PER_S, US_PER_S))
     times = [time_us for time_us, _ in memory.frames]
-    assert times[-1] - times[0] == SPAN_US
+    assert times[-1] - times[0] == FUSED_SPAN_US

@@ -2,17 +2,16 @@
 
 import math
 from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, Final
 
 import pymap3d.vincenty as vincenty
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.angle import wrap_180
-from gateway.panel.state.fields import FieldHistory
-from gateway.panel.state.history import MAX_TRACK, TRACK_INTERVAL_US, FlightHistory
-from gateway.panel.state.instant import Instant
-from gateway.panel.state.samples import SampleMemory
-from gateway.panel.state.texts import StatusTexts
+from gateway.panel.state.fields import FieldHistory, SampleMemory
+from gateway.panel.state.history import MAX_TRACK, TRACK_INTERVAL_US, FlightHistory, Instant
 from gateway.records import NAN
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
@@ -25,6 +24,7 @@ from gateway.vehicle_state.positions import (
     named_position,
     position_of,
 )
+from gateway.vehicle_state.status_texts import JoinedText, TextJoiner
 
 AVIONICS: Final = mavlink.MAV_BATTERY_FUNCTION_AVIONICS
 LIVE: Final = "live"
@@ -34,6 +34,45 @@ UNKNOWN_POSITION: Final = Position(NAN, NAN)
 PLANES: Final = frozenset((1, 16, 17, 19, 20, 21, 22, 23, 24, 25, 28))
 COPTERS: Final = frozenset((2, 3, 13, 14, 15, 29, 35))
 OTHERS: Final = {4: "heli", 7: "balloon", 8: "balloon", 10: "rover", 11: "boat", 12: "boat"}
+MAX_TEXTS: Final = 500
+MAX_LETTERS: Final = 2_000
+"""Maximum characters; longer texts are cut."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimedText:
+    """One text."""
+
+    number: int
+    """Counts up from 1, so that a page can find the new ones."""
+    time_us: int
+    """Time on the panel's clock."""
+    severity: int
+    """MAV_SEVERITY: 0 emergency to 7 debug."""
+    text: str
+
+
+class StatusTexts:
+    """The texts of one aircraft, the oldest first."""
+
+    def __init__(self) -> None:
+        self.all: deque[TimedText] = deque(maxlen=MAX_TEXTS)
+        self._count = 0
+        self._joiner = TextJoiner()
+
+    def feed(self, message: Any, now_us: int) -> None:
+        """Add one STATUSTEXT; chunks of a long text share an entry, blank texts are ignored."""
+        self._add(self._joiner.feed(bytes(message.get_msgbuf()), now_us))
+
+    def poll(self, now_us: int) -> None:
+        """Add the texts whose last chunks are lost."""
+        self._add(self._joiner.poll(now_us))
+
+    def _add(self, texts: Iterable[JoinedText]) -> None:
+        for joined in texts:
+            if text := joined.text.strip()[:MAX_LETTERS]:
+                self._count += 1
+                self.all.append(TimedText(self._count, joined.time_us, joined.severity, text))
 
 
 class VehicleState:

@@ -7,7 +7,7 @@ from nicegui import ui
 
 from gateway.clock import unix_time_us
 from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of
-from gateway.panel.state.texts import TimedText
+from gateway.panel.state.vehicle import TimedText
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets import Cells, DataTable, choice
 from gateway.printable import printable

@@ -5,9 +5,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.panel.state.fields import FUSED_SPAN_US
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.state.history import MAX_TRACK
-from gateway.panel.state.samples import SPAN_US
 from gateway.units import US_PER_S
 from tests.panel.messages import decoded, heartbeat, position
 
@@ -53,7 +53,7 @@ def test_second_hour_of_flight_needs_no_more_memory() -> None:
     assert 0 < first.pop("track") <= MAX_TRACK
     assert MAX_TRACK // 2 < second.pop("track") <= MAX_TRACK
     assert first == second
-    assert second["frames"] == pytest.approx(SPAN_US // US_PER_S * RATE_HZ, abs=1)
+    assert second["frames"] == pytest.approx(FUSED_SPAN_US // US_PER_S * RATE_HZ, abs=1)
 
 
 def test_discarded_aircraft_leaves_no_data() -> None:
