@@ -1,7 +1,6 @@
 """`mavgate sweep`: try settings on one flight or many, and write the best as a settings file."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -30,17 +29,16 @@ from gateway.analysis.sweep import (
     with_estimator_of,
     with_values,
 )
-from gateway.batch.tasks import SweepTask, without_secrets
+from gateway.batch.tasks import FlightResult, SweepTask, without_secrets
 from gateway.cli.support import shared_options as opt
 from gateway.cli.support.batch_work import exit_if_failed, run_on_all
 from gateway.cli.support.options import option, output_file, read_options, read_settings
 from gateway.cli.support.recordings import are_many, fusion_of, load_flight, refuse_unused
 from gateway.cli.support.terminal import console_of, progress_bar, refuse, table_of
-from gateway.config import GatewaySettings, render
+from gateway.config import render
 from gateway.output import check_output, write_new
 from gateway.printable import figure
 from gateway.recordings.fuse import FusionSettings
-from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.table import SettingsChoice
 from gateway.units import counted
 
@@ -106,55 +104,57 @@ def sweep(
     Without a flight the built-in simulated one is used. The filter runs causally and is scored by
     fixes that are withheld from it. Of many flights each has the same weight.
     """
-    current = read_settings()
-    options = SweepOptions(
-        vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table, force
-    )
-    given = flights or []
+    current, given = read_settings(), flights or []
     read = read_options(current, columns, choice=fuse_with, system_id=system)
-    if are_many(given):
+    are_all = are_many(given)
+    if are_all:
         refuse_unused("many recordings", {"--reference": reference, "--system": system})
-        run_sweep_of_many(given, scheduler, without_secrets(read), current, options)
-        return
-    refuse_unused("one recording", {"--scheduler": scheduler})
-    path = Path(given[0]) if given else None
-    run_sweep(path, current, options, lambda: load_flight(path, current, read, reference))
+    else:
+        refuse_unused("one recording", {"--scheduler": scheduler})
+    path = Path(given[0]) if given and not are_all else None
+    for out in filter(None, (output, table)):
+        check_output(out, [path], overwrite=force)
+    if are_all and optimise:
+        refuse("--optimise searches on one flight; give a grid for many")
+    axes, results = _parse_axes(vary or []), list[FlightResult]()
+    if are_all:
+        fusion = with_estimator_of(fusion_of(current), [axis.key for axis in axes])
+        points, column = grid(axes), COLUMN_OF[metric]
+        task = SweepTask(without_secrets(read), axes, column, hold_out, gps_interval)
+        results = run_on_all(given, task, None, jobs=jobs, scheduler=scheduler)
+        best, rows = _best_of_many(task, points, results, fusion)
+    else:
+        flight = load_flight(path, current, read, reference)
+        best, rows = _best_of_one(
+            flight, axes, metric, (hold_out, gps_interval), jobs=jobs, generations=optimise
+        )
+    keys = [axis.key for axis in axes]
+    if best.estimation.estimator != current.estimation.estimator:
+        keys.insert(0, ESTIMATOR_KEY)
+    merged = render(msgspec.structs.replace(current, estimation=best.estimation), keys)
+    write_new(output, [merged.encode()], overwrite=force, inputs=[path])
+    print(output)
+    if table is not None:
+        write_new(table, [rows.to_csv(index=False).encode()], overwrite=force, inputs=[path])
+    exit_if_failed(results)
 
 
-@dataclass(frozen=True, slots=True)
-class SweepOptions:
-    """Options of the command line for a sweep."""
-
-    vary: Sequence[str]
-    """Settings as `NAME=VALUES`."""
-    generations: int
-    """Number of generations to search; 0 for a grid."""
-    metric: Metric
-    hold_out: int
-    gps_interval_s: float
-    jobs: int | None
-    output: Path
-    table: Path | None
-    overwrite: bool
+Found = tuple[FusionSettings, "pd.DataFrame"]
+"""The settings with the best values, and a table of the trials or flights."""
 
 
-def run_sweep(
-    path: Path | None,
-    settings: GatewaySettings,
-    options: SweepOptions,
-    load: Callable[[], Flight],
-) -> None:
-    """Try the settings, show the best, and write it as a settings file."""
-    _check_outputs(options, path)
-    axes = _parse_axes(options)
-    flight = load()
-    contest = sweeping.make_contest(
-        flight,
-        flight.fusion,
-        [axis.key for axis in axes],
-        hold_out=options.hold_out,
-        interval_s=options.gps_interval_s,
-    )
+def _best_of_one(
+    flight: Flight,
+    axes: Sequence[Axis],
+    metric: Metric,
+    withheld: tuple[int, float],
+    *,
+    jobs: int | None,
+    generations: int,
+) -> Found:
+    """Try the values on one flight, and show the best."""
+    keys = [axis.key for axis in axes]
+    contest = sweeping.make_contest(flight, flight.fusion, keys, *withheld)
     fastest = pilot_flight_of_samples(flight).facts.fastest_mps or 0.0
     if fastest < AT_REST_MPS:
         console_of(stderr=True).print(
@@ -163,57 +163,30 @@ def run_sweep(
             style="yellow",
         )
     _print_idle(contest, axes)
-    with forked(partial(run_trial, contest), options.jobs) as run:
-        if options.generations:
-            trials = _search(axes, run, options.generations, options.metric)
-        else:
-            trials = _try_all(grid(axes), run)
-    results = sweeping.tabulate(contest.keys, trials, options.metric)
-    _show(results, contest, options.metric)
-    best = with_values(contest.fusion, contest.keys, sweeping.best_of(trials, options.metric))
-    _write(options, settings, best, contest.keys, results, path)
-
-
-def _check_outputs(options: SweepOptions, path: Path | None = None) -> None:
-    """Raise OSError if an output cannot be written, or is the input itself."""
-    for out in (options.output, options.table):
-        if out is not None:
-            check_output(out, [path], overwrite=options.overwrite)
-
-
-def _write(
-    options: SweepOptions,
-    settings: GatewaySettings,
-    best: FusionSettings,
-    keys: Sequence[str],
-    table: "pd.DataFrame",
-    path: Path | None = None,
-) -> None:
-    """Write a settings file with the best of the varied values, and the table if requested."""
-    if best.estimation.estimator != settings.estimation.estimator:
-        keys = [ESTIMATOR_KEY, *keys]
-    merged = render(msgspec.structs.replace(settings, estimation=best.estimation), keys)
-    write_new(options.output, [merged.encode()], overwrite=options.overwrite, inputs=[path])
-    print(options.output)
-    if options.table is not None:
-        rows = table.to_csv(index=False).encode()
-        write_new(options.table, [rows], overwrite=options.overwrite, inputs=[path])
+    with forked(partial(run_trial, contest), jobs) as run:
+        trials = (
+            _search(axes, run, generations, metric) if generations else _try_all(grid(axes), run)
+        )
+    results = sweeping.tabulate(contest.keys, trials, metric)
+    _show(results, contest, metric)
+    best = with_values(contest.fusion, contest.keys, sweeping.best_of(trials, metric))
+    return best, results
 
 
 def _cell(value: object) -> str:
     return figure(value, ".4g") if isinstance(value, float) else str(value)
 
 
-def _parse_axes(options: SweepOptions) -> list[Axis]:
+def _parse_axes(varied: Sequence[str]) -> tuple[Axis, ...]:
     wanted = list[tuple[str, str]]()
-    for item in options.vary:
+    for item in varied:
         name, equals, text = item.partition("=")
         if not equals:
             raise SweepError(f"--vary {item}: write NAME=VALUES")
         wanted.append((name, text))
     if not wanted:
         raise SweepError("nothing to vary: give --vary NAME=VALUES, such as --vary alpha=0.1:0.9:9")
-    return [parse_axis(name, text) for name, text in wanted]
+    return tuple(parse_axis(name, text) for name, text in wanted)
 
 
 def _print_idle(contest: Contest, axes: Sequence[Axis]) -> None:
@@ -270,27 +243,14 @@ def _show(results: "pd.DataFrame", contest: Contest, metric: Metric) -> None:
     console_of().print(title, shown, sep="\n")
 
 
-def run_sweep_of_many(
-    names: Sequence[str],
-    scheduler: str | None,
-    read: ReadOptions,
-    settings: GatewaySettings,
-    options: SweepOptions,
-) -> None:
-    """Score every point on every flight, show the point that is best overall, and write it."""
+def _best_of_many(
+    task: SweepTask, points: list[Values], results: Sequence[FlightResult], fusion: FusionSettings
+) -> Found:
+    """Choose the point of a grid that is best on all flights, and show it."""
     import pandas as pd
 
     from gateway.batch.statistics import choose
 
-    _check_outputs(options)
-    if options.generations:
-        refuse("--optimise searches on one flight; give a grid for many")
-    axes = tuple(_parse_axes(options))
-    points, keys = grid(axes), [axis.key for axis in axes]
-    fusion = with_estimator_of(fusion_of(settings), keys)
-    column = COLUMN_OF[options.metric]
-    task = SweepTask(read, axes, column, options.hold_out, options.gps_interval_s)
-    results = run_on_all(names, task, None, jobs=options.jobs, scheduler=scheduler)
     swept = [result for result in results if result.error is None]
     if not swept:
         refuse("the sweep failed on all flights")
@@ -301,8 +261,7 @@ def run_sweep_of_many(
         choice = choose(errors, base)
     except ValueError as error:
         refuse(f"{error}; choose another --metric")
-    _show_choice(axes, points, choice, column, len(swept))
-    best = with_values(fusion, keys, points[choice.winner])
+    _show_choice(task, points, choice, len(swept))
     table = pd.DataFrame(
         {
             "recording": [result.location for result in swept],
@@ -312,17 +271,14 @@ def run_sweep_of_many(
             "best settings": errors[:, choice.winner],
         }
     )
-    _write(options, settings, best, keys, table)
-    exit_if_failed(results)
+    best = with_values(fusion, [axis.key for axis in task.axes], points[choice.winner])
+    return best, table
 
 
-def _show_choice(
-    axes: Sequence[Axis], points: Sequence[Values], choice: "Choice", column: str, flights: int
-) -> None:
+def _show_choice(task: SweepTask, points: list[Values], choice: "Choice", flights: int) -> None:
     console = console_of()
-    grid_ = table_of(
-        *(axis.key.rsplit(".", 1)[-1] for axis in axes), f"mean {HEADINGS[column]}", left=0
-    )
+    names = (axis.key.rsplit(".", 1)[-1] for axis in task.axes)
+    grid_ = table_of(*names, f"mean {HEADINGS[task.metric_column]}", left=0)
     for number in np.argsort(choice.means, kind="stable")[:SHOWN].tolist():
         grid_.add_row(*map(_cell, points[number]), _cell(float(choice.means[number])))
     console.print(grid_)
