@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from gateway.analysis import metrics
 from gateway.analysis.flight import (
     BoolArray,
     Fixes,
@@ -19,13 +20,6 @@ from gateway.analysis.flight import (
     FloatArray,
     IntArray,
     fixes_of,
-)
-from gateway.analysis.metrics import (
-    mean_abs,
-    position_error_m,
-    rms,
-    rotation_error,
-    total_error_rad,
 )
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
@@ -154,24 +148,24 @@ class SplitFlight:
 def score(track: FlightTrack, split: SplitFlight) -> dict[str, float]:
     """Score one track; NaN if there is nothing to compare with."""
     flight, held = split.fused, split.held_fixes
-    to_gps = position_error_m(track, split.interpolated)[flight.scored]
+    to_gps = metrics.position_error_m(track, split.interpolated)[flight.scored]
     # Only withheld fixes during scored samples.
     nearest = np.searchsorted(flight.time_us, held.valid_us).clip(0, len(flight.time_us) - 1)
     to_held = error_at_fixes_m(track, held)[flight.scored[nearest]]
     found = {
-        "north_m": mean_abs(to_gps[:, 0]),
-        "east_m": mean_abs(to_gps[:, 1]),
-        "interpolated_m": rms(np.hypot(to_gps[:, 0], to_gps[:, 1])),
-        "held_m": rms(np.hypot(*to_held.T)),
+        "north_m": metrics.mean_abs(to_gps[:, 0]),
+        "east_m": metrics.mean_abs(to_gps[:, 1]),
+        "interpolated_m": metrics.rms(np.hypot(to_gps[:, 0], to_gps[:, 1])),
+        "held_m": metrics.rms(np.hypot(*to_held.T)),
         "reference_m": float("nan"),
         "attitude_deg": float("nan"),
     }
     if flight.reference is not None:
         truth = flight.reference.track
-        error = position_error_m(track, truth)[flight.scored]
-        turned = total_error_rad(rotation_error(track.q_nb, truth.q_nb))
-        found["reference_m"] = rms(np.hypot(error[:, 0], error[:, 1]))
-        found["attitude_deg"] = rms(np.degrees(turned[flight.scored]))
+        error = metrics.position_error_m(track, truth)[flight.scored]
+        turned = metrics.total_error_rad(metrics.rotation_error(track.q_nb, truth.q_nb))
+        found["reference_m"] = metrics.rms(np.hypot(error[:, 0], error[:, 1]))
+        found["attitude_deg"] = metrics.rms(np.degrees(turned[flight.scored]))
     return found
 
 

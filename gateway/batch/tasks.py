@@ -29,15 +29,9 @@ from gateway.analysis.case import (
 from gateway.analysis.flight import Flight, flight_of_files
 from gateway.analysis.pilot import PilotFlight, read_pilot_flight
 from gateway.analysis.sweep import Axis, SweepError, grid, make_contest, run_trial, score_of
+from gateway.batch import storage
 from gateway.batch.executors import Executor, WorkFailed
 from gateway.batch.facts import began_text
-from gateway.batch.storage import (
-    BatchItem,
-    digest_of_files,
-    local_files,
-    stamp_of_item,
-    without_user,
-)
 from gateway.output import write_new
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import fuse
@@ -208,7 +202,7 @@ def read_batch_flight(
 
 
 def work_on(
-    task: FlightTask, wanted: tuple[BatchItem, str, FlightResult]
+    task: FlightTask, wanted: tuple[storage.BatchItem, str, FlightResult]
 ) -> tuple[FlightResult, Files]:
     """Do a task on one recording, and complete its result.
 
@@ -216,9 +210,9 @@ def work_on(
     """
     item, name, result = wanted
     result = msgspec.structs.replace(result, version=__version__)
-    with local_files(item) as files:
+    with storage.local_files(item) as files:
         if item.is_fetched:
-            result = msgspec.structs.replace(result, digest=digest_of_files(files))
+            result = msgspec.structs.replace(result, digest=storage.digest_of_files(files))
         try:
             worked = task.do(files, name)
         except SweepError:
@@ -227,7 +221,7 @@ def work_on(
         except (FlightError, ValueError) as error:
             text = str(error) or type(error).__name__
             for location, file in zip(item.locations, files, strict=True):
-                text = text.replace(str(file), without_user(location))
+                text = text.replace(str(file), storage.without_user(location))
             return msgspec.structs.replace(result, error=as_text(text)), {}
     known = worked._asdict() | {"files": tuple(worked.files)}
     return msgspec.structs.replace(result, **known), worked.files
@@ -249,7 +243,7 @@ def without_secrets(options: ReadOptions) -> ReadOptions:
     return replace(options, current=stripped, progress=None)
 
 
-def name_of(item: BatchItem) -> str:
+def name_of(item: storage.BatchItem) -> str:
     """Return the name of a recording in the folder of results."""
     name = as_text(recording_name(Path(item.location)))
     for ending in (".gz", ".csv", ".tlog"):
@@ -344,14 +338,14 @@ def _read(path: Path) -> FlightResult | None:
 
 def run_batch(
     task: FlightTask,
-    items: Sequence[BatchItem],
+    items: Sequence[storage.BatchItem],
     executor: Executor,
     folder: ResultFolder | None,
     report: Report,
 ) -> list[FlightResult]:
     """Do a task on every recording for which it is not done yet."""
     found: list[FlightResult | None] = [None] * len(items)
-    todo: dict[int, tuple[BatchItem, str, FlightResult]] = {}
+    todo: dict[int, tuple[storage.BatchItem, str, FlightResult]] = {}
     stamps = _stamps(items, executor, report)
     names = _names(items, stamps)
     for number, (item, stamp) in enumerate(zip(items, stamps, strict=True)):
@@ -389,16 +383,16 @@ def run_batch(
 
 
 def _stamps(
-    items: Sequence[BatchItem], executor: Executor, report: Report
+    items: Sequence[storage.BatchItem], executor: Executor, report: Report
 ) -> list[str | WorkFailed]:
     found: list[str | WorkFailed] = [""] * len(items)
-    for done, (number, outcome) in enumerate(executor.run(stamp_of_item, items), 1):
+    for done, (number, outcome) in enumerate(executor.run(storage.stamp_of_item, items), 1):
         found[number] = outcome
         report(LOOKING, done, len(items))
     return found
 
 
-def _names(items: Sequence[BatchItem], stamps: Sequence[str | WorkFailed]) -> list[str]:
+def _names(items: Sequence[storage.BatchItem], stamps: Sequence[str | WorkFailed]) -> list[str]:
     """Return names for the results; recordings of equal names get a part of their digests."""
     names = [name_of(item) for item in items]
     often = Counter(names)

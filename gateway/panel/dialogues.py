@@ -11,18 +11,10 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
+from gateway.panel.state import parameters
 from gateway.panel.state.calibration import CalibrationRun, CalibrationStep, RunState
 from gateway.panel.state.commands import command_long
 from gateway.panel.state.fleet import FleetState
-from gateway.panel.state.parameters import (
-    GENERAL_PATHS,
-    FileClient,
-    ListState,
-    ParameterClient,
-    ParameterMeta,
-    parameter_path,
-    parse_parameters,
-)
 
 POLL_S: Final = 0.05
 SAMPLES_US: Final = 20_000
@@ -35,9 +27,9 @@ class Dialogue:
         self, system_id: int, send: Callable[[Any], object], now_us: Callable[[], int]
     ) -> None:
         self._send, self._now_us = send, now_us
-        self.parameters = ParameterClient(system_id)
-        self.files = FileClient(system_id)
-        self.metas: dict[str, ParameterMeta] = {}
+        self.parameters = parameters.ParameterClient(system_id)
+        self.files = parameters.FileClient(system_id)
+        self.metas: dict[str, parameters.ParameterMeta] = {}
         """Metadata of the parameters, as far as the aircraft provides it."""
         self._reading: str | None = None
         """Metadata file that is being read."""
@@ -48,11 +40,14 @@ class Dialogue:
 
     def load(self, *, again: bool = False) -> None:
         """Request parameters and metadata; known or requested ones only with `again`."""
-        if not again and self.parameters.state not in (ListState.UNKNOWN, ListState.FAILED):
+        if not again and self.parameters.state not in (
+            parameters.ListState.UNKNOWN,
+            parameters.ListState.FAILED,
+        ):
             return
         self._send_all(self.parameters.load(self._now_us()))
         if not self.metas:
-            self._read(GENERAL_PATHS[0])
+            self._read(parameters.GENERAL_PATHS[0])
 
     def change(self, name: str, value: float) -> None:
         """Set a parameter; raises ValueError for an invalid one."""
@@ -113,11 +108,11 @@ class Dialogue:
             return
         content = self.files.content
         if content is None:
-            following = GENERAL_PATHS[1] if path == GENERAL_PATHS[0] else None
-        elif path in GENERAL_PATHS:
-            following = parameter_path(content)
+            following = parameters.GENERAL_PATHS[1] if path == parameters.GENERAL_PATHS[0] else None
+        elif path in parameters.GENERAL_PATHS:
+            following = parameters.parameter_path(content)
         else:
-            self.metas = parse_parameters(content)
+            self.metas = parameters.parse_parameters(content)
         self._reading = None
         if following is not None:
             self._read(following)

@@ -5,22 +5,13 @@ import re
 from pathlib import Path, PurePath
 from typing import Any, Final
 
-from gateway.batch.catalogue import (
-    CATALOGUE_NAME,
-    COLUMNS,
-    CatalogueError,
-    Figures,
-    FlightFigures,
-    figures_of,
-    find_flights,
-    geojson_of,
-)
+from gateway.batch import catalogue
 from gateway.geometry.angle import wrap_180
 
 OPERATORS: Final = frozenset("<>=")
 """Characters that make a search a condition."""
 TOKEN: Final = re.compile(
-    rf"\b(?:and|or|not|is|null|{'|'.join(COLUMNS)})\b|[-+]?\d+(?:\.\d+)?|'[^']*'|[<>=!]+|[()]",
+    rf"\b(?:and|or|not|is|null|{'|'.join(catalogue.COLUMNS)})\b|[-+]?\d+(?:\.\d+)?|'[^']*'|[<>=!]+|[()]",
     re.IGNORECASE,
 )
 """Parts of a condition from the network: comparisons of columns with constants, and no function."""
@@ -35,7 +26,7 @@ class RecordingFacts:
 
     def __init__(self) -> None:
         self._searched: tuple[Path, tuple[int, int] | None, str] | None = None
-        self._figures: Figures = {}
+        self._figures: catalogue.Figures = {}
         self._broken: set[str] = set()
         self._found: frozenset[str] | None = None
         self._tracks: dict[str, str] = {}
@@ -54,19 +45,19 @@ class RecordingFacts:
         self._searched, self.trouble = (folder, stamp, search), "" if stamp else NO_CATALOGUE
         is_condition = not OPERATORS.isdisjoint(search)
         try:
-            rows = [] if stamp is None else find_flights(folder)
-            self._figures = figures_of(rows)
+            rows = [] if stamp is None else catalogue.find_flights(folder)
+            self._figures = catalogue.figures_of(rows)
             self._broken = {row["name"] for row in rows if row["error"] is not None}
-            self._tracks = {} if stamp is None else _thumbnails(geojson_of(folder))
+            self._tracks = {} if stamp is None else _thumbnails(catalogue.geojson_of(folder))
             self._found = (
-                frozenset(row["name"] for row in find_flights(folder, _checked(search)))
+                frozenset(row["name"] for row in catalogue.find_flights(folder, _checked(search)))
                 if is_condition
                 else None
             )
-        except CatalogueError as error:
+        except catalogue.CatalogueError as error:
             self.trouble, self._found = str(error), frozenset()
 
-    def of(self, name: str) -> FlightFigures | str | None:
+    def of(self, name: str) -> catalogue.FlightFigures | str | None:
         """Return the figures of the longest recorded vehicle of a recording, or "broken"."""
         flown = self._figures.get(PurePath(name), {})
         longest = max(flown.values(), key=lambda figures: figures.duration, default=None)
@@ -87,10 +78,10 @@ def _checked(condition: str) -> str:
     """Return a condition; raises CatalogueError unless it only compares columns."""
     other = TOKEN.sub(" ", condition[:MAX_CONDITION]).split()
     if other or len(condition) > MAX_CONDITION:
-        raise CatalogueError(
+        raise catalogue.CatalogueError(
             f"{(other or ['it'])[0][:40]!r} cannot be used here; write a condition such as "
             f"duration > 300 and loss > 0.05, of at most {MAX_CONDITION} characters, with the "
-            f"columns {', '.join(COLUMNS)}"
+            f"columns {', '.join(catalogue.COLUMNS)}"
         )
     return condition
 
@@ -98,7 +89,7 @@ def _checked(condition: str) -> str:
 def _stamp(folder: Path) -> tuple[int, int] | None:
     """Return a value that changes with the catalogue; None without a catalogue."""
     try:
-        found = (folder / CATALOGUE_NAME).stat()
+        found = (folder / catalogue.CATALOGUE_NAME).stat()
     except OSError:
         return None
     return found.st_mtime_ns, found.st_size

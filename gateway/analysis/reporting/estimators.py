@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
+from gateway.analysis import metrics
 from gateway.analysis.blending import grows, interpolate, paper_table
 from gateway.analysis.case import (
     HOLD_OUT,
@@ -20,14 +21,6 @@ from gateway.analysis.case import (
     withheld_error_m,
 )
 from gateway.analysis.flight import BoolArray, FlightTrack, Reference
-from gateway.analysis.metrics import (
-    errors_over_time,
-    position_error_m,
-    rms,
-    rotation_error,
-    total_error_rad,
-    worst,
-)
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.ground_track import draw_path
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
@@ -55,15 +48,15 @@ OWN_GPS: Final = (
 )
 OTHER: Final = style.GREEN
 ERROR_COLUMNS: Final = (
-    ("roll, deg", rms, "roll_deg"),
-    ("pitch, deg", rms, "pitch_deg"),
-    ("yaw, deg", rms, "yaw_deg"),
-    ("tilt, deg", rms, "tilt_deg"),
-    ("worst tilt, deg", worst, "tilt_deg"),
-    ("horizontal, m", rms, "horizontal_m"),
-    ("worst horizontal, m", worst, "horizontal_m"),
-    ("height, m", rms, "height_m"),
-    ("speed, m/s", rms, "speed_mps"),
+    ("roll, deg", metrics.rms, "roll_deg"),
+    ("pitch, deg", metrics.rms, "pitch_deg"),
+    ("yaw, deg", metrics.rms, "yaw_deg"),
+    ("tilt, deg", metrics.rms, "tilt_deg"),
+    ("worst tilt, deg", metrics.worst, "tilt_deg"),
+    ("horizontal, m", metrics.rms, "horizontal_m"),
+    ("worst horizontal, m", metrics.worst, "horizontal_m"),
+    ("height, m", metrics.rms, "height_m"),
+    ("speed, m/s", metrics.rms, "speed_mps"),
 )
 DRIFT: Final = f"{OUTAGE_S:.0f} s without GPS, m"
 BARS: Final = {
@@ -127,7 +120,9 @@ def error_table(
     tracks: dict[str, FlightTrack], reference: Reference, scored: BoolArray
 ) -> pd.DataFrame:
     """Return a table of the errors of tracks against a reference."""
-    errors = {name: errors_over_time(track, reference.track) for name, track in tracks.items()}
+    errors = {
+        name: metrics.errors_over_time(track, reference.track) for name, track in tracks.items()
+    }
     rows = [
         {"estimator": name, **{c: figure(of[key][scored]) for c, figure, key in ERROR_COLUMNS}}
         for name, of in errors.items()
@@ -155,7 +150,7 @@ def _smoothed_description(case: Case) -> str:
 
 
 def _draw_errors(case: Case, reference: Reference, table: pd.DataFrame, width_in: float) -> Figure:
-    errors = {name: errors_over_time(t, reference.track) for name, t in case.tracks.items()}
+    errors = {name: metrics.errors_over_time(t, reference.track) for name, t in case.tracks.items()}
     known = [k for k in SHOWN if any(np.isfinite(found[k]).any() for found in errors.values())]
     figure, bars, axes = _error_panels(width_in, [SHOWN[key] for key in known], table)
     for panel, column in zip(bars, filter(table.__contains__, BARS), strict=True):
@@ -243,8 +238,8 @@ def _draw_difference(a: Case, b: Case, width_in: float) -> Figure:
         width_in, 1.9, ["distance (m)", "attitude difference (deg)"]
     )
     time = a.flight.time_s
-    apart = position_error_m(b.track, a.track)
-    turned = total_error_rad(rotation_error(b.track.q_nb, a.track.q_nb))
+    apart = metrics.position_error_m(b.track, a.track)
+    turned = metrics.total_error_rad(metrics.rotation_error(b.track.q_nb, a.track.q_nb))
     style.draw(above, time, np.hypot(apart[:, 0], apart[:, 1]), style.BLUE, "horizontal")
     style.draw(above, time, np.abs(apart[:, 2]), style.ORANGE, "vertical")
     style.draw(below, time, np.degrees(turned), style.GREEN, "attitude")

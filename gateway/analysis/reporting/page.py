@@ -13,15 +13,7 @@ from matplotlib.figure import Figure
 
 from gateway.analysis.flight import FloatArray
 from gateway.analysis.processes import START, forked
-from gateway.analysis.reporting.style import (
-    NARROW_IN,
-    WIDE_IN,
-    for_page,
-    stand_alone,
-    styled,
-    to_png,
-    to_svg,
-)
+from gateway.analysis.reporting import style
 from gateway.output import write_new, written_together
 from gateway.printable import figure
 
@@ -170,11 +162,11 @@ def prose(text: str) -> Markup:
 
 
 def _drawn(picture: Picture, folder: Path) -> Drawn:
-    with styled():
-        wide = picture.draw(WIDE_IN)
-        wide_svg = to_svg(wide)
-        write_new(folder / f"{picture.name}.png", [to_png(wide)])
-        narrow_svg = to_svg(picture.draw(NARROW_IN))
-    write_new(folder / f"{picture.name}.svg", [stand_alone(wide_svg).encode()])
-    wide_part, narrow_part = Markup(for_page(wide_svg)), Markup(for_page(narrow_svg))
+    with style.styled():
+        wide = picture.draw(style.WIDE_IN)
+        wide_svg = style.to_svg(wide)
+        write_new(folder / f"{picture.name}.png", [style.to_png(wide)])
+        narrow_svg = style.to_svg(picture.draw(style.NARROW_IN))
+    write_new(folder / f"{picture.name}.svg", [style.stand_alone(wide_svg).encode()])
+    wide_part, narrow_part = Markup(style.for_page(wide_svg)), Markup(style.for_page(narrow_svg))
     return Drawn(picture.name, wide_part, narrow_part, prose(picture.caption))

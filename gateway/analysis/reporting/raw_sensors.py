@@ -6,22 +6,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from gateway.analysis import signals
 from gateway.analysis.blending import MAX_GAP_S
 from gateway.analysis.case import Case
 from gateway.analysis.flight import Flight, FloatArray, IntArray
 from gateway.analysis.metrics import rms, worst
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Figures, Picture, ReportTable, Section, table_of_series
-from gateway.analysis.signals import (
-    KINDS,
-    PAPER_RATE_HZ,
-    allan_deviation,
-    apply,
-    compare,
-    longest_rest,
-    power_density,
-    response,
-)
 from gateway.recordings.flight_facts import NODE_WRAP_US, lost_share, missing_samples
 
 EXCERPT_S: Final = 6.0
@@ -62,7 +53,7 @@ def acceleration(case: Case) -> Section:
         ),
         ReportTable(
             "filters_flight",
-            compare(paper, rate_hz),
+            signals.compare(paper, rate_hz),
             f"At this flight's {rate_hz:.0f} samples/s; times were taken on this machine for "
             "three axes.",
         ),
@@ -73,8 +64,8 @@ def acceleration(case: Case) -> Section:
 def _paper_table(case: Case) -> ReportTable:
     return ReportTable(
         "filters_paper",
-        compare(case.fusion.estimation.paper, PAPER_RATE_HZ),
-        f"At the paper's {PAPER_RATE_HZ:.0f} samples/s.",
+        signals.compare(case.fusion.estimation.paper, signals.PAPER_RATE_HZ),
+        f"At the paper's {signals.PAPER_RATE_HZ:.0f} samples/s.",
     )
 
 
@@ -110,8 +101,8 @@ def _draw_excerpt(case: Case, axis: int, width_in: float) -> Figure:
     raw = flight.imu.accel_b_mps2[part, axis]
     axes[0].plot(time, raw, color=style.MUTED, lw=0.7, alpha=0.6, label="raw")
     filtered = {
-        kind: apply(kind, paper, flight.rate_hz, flight.imu.accel_b_mps2)[part, axis]
-        for kind in KINDS
+        kind: signals.apply(kind, paper, flight.rate_hz, flight.imu.accel_b_mps2)[part, axis]
+        for kind in signals.KINDS
     }
     for kind, line in filtered.items():
         dashes = (0, (4, 2)) if kind == "chebyshev" else "-"
@@ -126,8 +117,8 @@ def _draw_excerpt(case: Case, axis: int, width_in: float) -> Figure:
 def _draw_response(case: Case, width_in: float) -> Figure:
     rate_hz, paper = case.flight.rate_hz, case.fusion.estimation.paper
     figure, axes = style.panels(width_in, 1, 2.6, columns=3, share_x=True)
-    for kind in KINDS:
-        frequency_hz, *lines = response(kind, paper, rate_hz)
+    for kind in signals.KINDS:
+        frequency_hz, *lines = signals.response(kind, paper, rate_hz)
         for panel, line in zip(axes, lines, strict=True):
             panel.semilogx(frequency_hz, line, color=COLOURS[kind], label=kind.capitalize())
     for panel, label in zip(axes, ("gain (dB)", "phase (deg)", "group delay (ms)"), strict=True):
@@ -141,7 +132,7 @@ def _draw_response(case: Case, width_in: float) -> Figure:
 def noise(case: Case) -> Section:
     """Build the section on spectra and Allan deviations."""
     flight = case.flight
-    rest = longest_rest(flight.imu.accel_b_mps2, flight.imu.gyro_b_radps, flight.rate_hz)
+    rest = signals.longest_rest(flight.imu.accel_b_mps2, flight.imu.gyro_b_radps, flight.rate_hz)
     rest_s = (rest.stop - rest.start) / flight.rate_hz
     pictures = [
         Picture(
@@ -318,8 +309,8 @@ def _draw_heights(case: Case, offset_m: float, width_in: float) -> Figure:
 def _draw_spectrum(flight: Flight, width_in: float) -> Figure:
     accel, gyro = flight.imu.accel_b_mps2, flight.imu.gyro_b_radps
     lines = {
-        "specific force ((m/s²)²/Hz)": power_density(accel, flight.rate_hz),
-        "angular rate ((rad/s)²/Hz)": power_density(gyro, flight.rate_hz),
+        "specific force ((m/s²)²/Hz)": signals.power_density(accel, flight.rate_hz),
+        "angular rate ((rad/s)²/Hz)": signals.power_density(gyro, flight.rate_hz),
     }
     return _draw_logarithmic(lines, "frequency (Hz)", 1.0, width_in)
 
@@ -327,8 +318,8 @@ def _draw_spectrum(flight: Flight, width_in: float) -> Figure:
 def _draw_allan(flight: Flight, rest: slice, width_in: float) -> Figure:
     accel, gyro = flight.imu.accel_b_mps2[rest], np.degrees(flight.imu.gyro_b_radps)[rest]
     lines = {
-        "Allan deviation,\nspecific force (m/s²)": allan_deviation(accel, flight.rate_hz),
-        "Allan deviation,\nangular rate (deg/s)": allan_deviation(gyro, flight.rate_hz),
+        "Allan deviation,\nspecific force (m/s²)": signals.allan_deviation(accel, flight.rate_hz),
+        "Allan deviation,\nangular rate (deg/s)": signals.allan_deviation(gyro, flight.rate_hz),
     }
     return _draw_logarithmic(lines, "averaging time (s)", 1.2, width_in)
 

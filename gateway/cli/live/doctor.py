@@ -17,6 +17,7 @@ from typing import Final, Literal, NamedTuple
 
 import typer
 
+from gateway import config
 from gateway.cli.support.options import (
     CONFIG,
     argument,
@@ -27,15 +28,6 @@ from gateway.cli.support.options import (
 )
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.compiled.entry_point import LibraryError, load_entry_points
-from gateway.config import (
-    USUAL,
-    ConfigError,
-    GatewaySettings,
-    aircraft_folder,
-    exposed_secrets,
-    load_aircraft,
-    render,
-)
 from gateway.extras import how_to_add, missing
 from gateway.hub.endpoint import LISTENING, Endpoint, EndpointKind, parse_endpoint
 from gateway.hub.transports.tls import valid_until_s
@@ -79,18 +71,18 @@ class Diagnosis(NamedTuple):
 
 ok, info, fail = (partial(Diagnosis, grade) for grade in STYLES)
 
-Check = Callable[[GatewaySettings], Iterator[Diagnosis]]
+Check = Callable[[config.GatewaySettings], Iterator[Diagnosis]]
 
 
-def check_settings(settings: GatewaySettings) -> Iterator[Diagnosis]:
+def check_settings(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Check the aircraft's files, the rights of secrets, and what no single setting shows."""
     file = settings_file()
     try:
-        found = load_aircraft(settings)
-    except ConfigError as error:
+        found = config.load_aircraft(settings)
+    except config.ConfigError as error:
         yield from (fail("settings", line) for line in str(error).splitlines())
         return
-    for warning in exposed_secrets(file, settings, found):
+    for warning in config.exposed_secrets(file, settings, found):
         yield fail("secrets", warning)
     for endpoint in map(parse_endpoint, settings.hub.endpoints):
         if endpoint.port == 0 and endpoint.kind in LISTENING:
@@ -100,17 +92,19 @@ def check_settings(settings: GatewaySettings) -> Iterator[Diagnosis]:
                 "know in advance; set one of 1 to 65535",
             )
     text = f"{file}: all settings are valid" if file.exists() else f"no {file}: the defaults"
-    others = f", and of {len(found)} aircraft in {aircraft_folder(settings)}" if found else ""
+    others = (
+        f", and of {len(found)} aircraft in {config.aircraft_folder(settings)}" if found else ""
+    )
     yield ok("settings", f"{text}{others}")
 
 
-def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
+def check_aircraft(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Check write access to the aircraft's files."""
-    folder = aircraft_folder(settings)
+    folder = config.aircraft_folder(settings)
     yield _writable("aircraft", folder, f"calibrations and parameters are stored in {folder}")
 
 
-def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
+def check_receiver(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     """List the USB adapters, and check the receiver's port and access to it."""
     wanted, found = settings.serial.port, list_serial_ports()
     for port in found:
@@ -174,7 +168,7 @@ def _latency(device: Path) -> Iterator[Diagnosis]:
         )
 
 
-def check_kernels(_: GatewaySettings) -> Iterator[Diagnosis]:
+def check_kernels(_: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether the compiled kernels can be loaded."""
     try:
         load_entry_points()
@@ -184,7 +178,7 @@ def check_kernels(_: GatewaySettings) -> Iterator[Diagnosis]:
         yield ok("kernels", "compiled")
 
 
-def check_clock(_: GatewaySettings) -> Iterator[Diagnosis]:
+def check_clock(_: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether the system time is synchronised, as recordings are named by it."""
     if not shutil.which("timedatectl"):
         yield info("clock", "synchronisation unknown")
@@ -198,7 +192,7 @@ def check_clock(_: GatewaySettings) -> Iterator[Diagnosis]:
         yield info("clock", text)
 
 
-def check_disk(settings: GatewaySettings) -> Iterator[Diagnosis]:
+def check_disk(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Check the free space for recordings."""
     folder = folder_of(settings)
     try:
@@ -223,7 +217,7 @@ def _writable(what: str, folder: Path, text: str) -> Diagnosis:
     return fail(what, f"{folder} cannot be written by {os.environ.get('USER', 'us')}")
 
 
-def check_ports(settings: GatewaySettings) -> Iterator[Diagnosis]:
+def check_ports(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether a gateway runs, otherwise whether its ports are free."""
     if running := live_sockets("run"):
         yield ok("gateway", f"runs, and listens at {', '.join(map(str, running))}")
@@ -260,7 +254,7 @@ def _trouble_of(endpoint: Endpoint) -> str:
     return ""
 
 
-def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
+def check_certificates(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Check the validity of the certificates of hub and panel."""
     hub, panel = settings.hub, settings.panel
     for what, certificate, key in (
@@ -282,7 +276,7 @@ def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
             yield made(what, f"{file}, valid until {until:%Y-%m-%d}")
 
 
-def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
+def check_extras(_: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Name the missing extras, their use, and the command that installs each."""
     for extra, use in EXTRA_USES.items():
         if missing(extra):
@@ -331,7 +325,7 @@ def doctor(
     fails.
     """
     if template or write:
-        text = render(GatewaySettings(), ("",) if template == "all" else USUAL)
+        text = config.render(config.GatewaySettings(), ("",) if template == "all" else config.USUAL)
         _write_template(text) if write else print(text, end="")
         return
     console = console_of()
@@ -349,7 +343,7 @@ def _findings(file: Path | None) -> Iterator[Diagnosis]:
         CONFIG.set(file)
     try:
         settings = read_settings()
-    except ConfigError as error:
+    except config.ConfigError as error:
         yield from (fail("settings", line) for line in str(error).splitlines())
         return
     yield from chain.from_iterable(check(settings) for check in CHECKS[: 1 if file else None])

@@ -10,20 +10,12 @@ from intelhex import IntelHex
 from gateway.cli.support.options import argument, option, output_file
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.flashing import airtime, boards
-from gateway.flashing.boards import (
-    BoardSettings,
-    FlashError,
-    Program,
-    Radio,
-    SettingsBlock,
-    used_by,
-)
 from gateway.live.serial_port import Port, PortNotFoundError, find_port, list_serial_ports
 from gateway.output import write_new
 from gateway.printable import reason_of
 from gateway.settings import Field, fields_of
 
-FIELDS: Final = {field.name: field for field in fields_of(BoardSettings)}
+FIELDS: Final = {field.name: field for field in fields_of(boards.BoardSettings)}
 OPTIONS: Final = {
     "vehicle_id": "--vehicle",
     "node_id": "--node",
@@ -85,7 +77,7 @@ def flash(
     clock: int = option("--clock", "Crystal: 16 or 8 MHz.", 16),
     output: Path | None = output_file("Write the image to this file, not to a board.", (".hex",)),
     force: bool = option("--force", "Replace an existing file.", False),
-    radio: Radio = option("--radio", "The radio of all boards: nRF24L01+ or LoRa.", "nrf24"),
+    radio: boards.Radio = option("--radio", "The radio of all boards: nRF24L01+ or LoRa.", "nrf24"),
     power: int | None = option(
         "--power", "Transmit power: -18, -12, -6, 0 dBm; with LoRa 2 to 20."
     ),
@@ -138,7 +130,7 @@ def flash(
         elif board is None:
             _list()
         else:
-            program = Program[board.upper()]
+            program = boards.Program[board.upper()]
             _check(program, radio, changes)
             image = boards.read_image(boards.image_path(program, clock, radio))
             if output is None:
@@ -150,7 +142,7 @@ def flash(
         refuse(f"{output} already exists; use --force to overwrite")
     except OSError as error:
         refuse(f"{error.filename or port}: {reason_of(error)}")
-    except (FlashError, PortNotFoundError) as error:
+    except (boards.FlashError, PortNotFoundError) as error:
         refuse(str(error))
 
 
@@ -176,13 +168,13 @@ def _bootloader_text(port: Port) -> str:
     try:
         with boards.reserved(port.device):
             loader = boards.find_bootloader(port.device)
-    except FlashError as error:
+    except boards.FlashError as error:
         return str(error).removeprefix(f"{port.device}: ")
     return "no response" if loader is None else f"{loader.name}, {loader.baud} baud"
 
 
 def _write(
-    program: Program,
+    program: boards.Program,
     image: IntelHex,
     changes: dict[str, Any],
     *,
@@ -207,12 +199,12 @@ def _write(
     _print(device, boards.block_of(image))
 
 
-def _check(program: Program, radio: Radio, changes: dict[str, Any]) -> None:
+def _check(program: boards.Program, radio: boards.Radio, changes: dict[str, Any]) -> None:
     """End the command if an option does not apply to the program, or its value is invalid."""
     for name, value in changes.items():
         option = OPTIONS[name]
-        if name not in used_by(program, radio):
-            other = next((r for r in boards.RADIOS if name in used_by(program, r)), None)
+        if name not in boards.used_by(program, radio):
+            other = next((r for r in boards.RADIOS if name in boards.used_by(program, r)), None)
             no_such = f"the program {program.name.lower()} has no such setting"
             refuse(f"{option}: {f'needs --radio {other}' if other else no_such}")
         try:
@@ -225,19 +217,24 @@ def _check(program: Program, radio: Radio, changes: dict[str, Any]) -> None:
 
 
 def _changed(
-    program: Program, before: BoardSettings, changes: dict[str, Any], duty: float | None
-) -> BoardSettings:
+    program: boards.Program,
+    before: boards.BoardSettings,
+    changes: dict[str, Any],
+    duty: float | None,
+) -> boards.BoardSettings:
     """Apply the options, with a pipe for another vehicle, and check the time on the air of LoRa."""
     after = msgspec.structs.replace(before, **changes)
     if "vehicle_id" in changes and "radio_pipe" not in changes:
         pipe = boards.default_pipe(program, after.vehicle_id)
         after = msgspec.structs.replace(after, radio_pipe=pipe)
-    if after.radio == "sx1276" and program is not Program.RECEIVER:
+    if after.radio == "sx1276" and program is not boards.Program.RECEIVER:
         _check_airtime(program, after, duty)
     return after
 
 
-def _check_airtime(program: Program, settings: BoardSettings, duty: float | None) -> None:
+def _check_airtime(
+    program: boards.Program, settings: boards.BoardSettings, duty: float | None
+) -> None:
     """Refuse settings that overload the channel; warn if they exceed the limit of the band."""
     most = airtime.MOST_SHARE if duty is None else duty / 100
     used = airtime.check(program, settings, most)
@@ -250,7 +247,7 @@ def _check_airtime(program: Program, settings: BoardSettings, duty: float | None
         )
 
 
-def _print(device: str, block: SettingsBlock) -> None:
+def _print(device: str, block: boards.SettingsBlock) -> None:
     major, minor = block.firmware_version
     name = block.program.name.lower()
     console.print(f"{device}: {name}, version {major}.{minor}, for {block.clock_mhz} MHz")
@@ -258,6 +255,6 @@ def _print(device: str, block: SettingsBlock) -> None:
     values["radio_address"] = f"{values['radio_address']:08x}"
     rows = (
         (name, str(values[name]), FIELDS[name].unit, OPTIONS.get(name, ""))
-        for name in ("radio", *used_by(block.program, block.settings.radio))
+        for name in ("radio", *boards.used_by(block.program, block.settings.radio))
     )
     console.print(table_of("setting", "value", "unit", "option", left=4, rows=rows))

@@ -10,25 +10,12 @@ from urllib.parse import quote
 from nicegui import ui
 
 from gateway.batch.catalogue import FlightFigures
+from gateway.panel import widgets
 from gateway.panel.access import RECORDINGS
 from gateway.panel.player_bar import open_playback
 from gateway.panel.recording_jobs import CUTS, EXTRACTS, FORMATS, KINDS, ExportError, Order
 from gateway.panel.recording_search import RecordingFacts
 from gateway.panel.view_context import ViewContext
-from gateway.panel.widgets import (
-    IDLE,
-    Cells,
-    DataTable,
-    RecorderControls,
-    RowButton,
-    UploadButton,
-    asking,
-    close_and,
-    confirm,
-    heading,
-    notify_failure,
-    progress_shown,
-)
 from gateway.printable import figure, printable
 from gateway.recordings.index import Recording, delete_recording, list_recordings
 from gateway.recordings.moment import parse_moment
@@ -49,33 +36,33 @@ class RecordingsView:
         self._facts = RecordingFacts()
         with ui.element("div").classes("cards one"):
             with ui.element("div").classes("card padded live-only"):
-                RecorderControls(context)
+                widgets.RecorderControls(context)
             with ui.element("div").classes("card padded"):
                 with ui.element("div").classes("line"):
-                    heading("Recordings").classes("spring")
+                    widgets.heading("Recordings").classes("spring")
                     self._search = ui.input(placeholder="Name, or duration > 300 and loss > 0.05")
                     self._search.props('dense outlined clearable aria-label="Search recordings"')
                     if context.may_change:
-                        upload = UploadButton(
+                        upload = widgets.UploadButton(
                             context, RECORDINGS, ".tlog,.csv",
                             label="Upload…", title="Upload a recording",
                         )  # fmt: skip
                         upload.on("uploaded", self.refresh)
                 self._trouble = ui.label().classes("soft")
-                self._table = DataTable(
+                self._table = widgets.DataTable(
                     ("Name", "Last written (UTC)", "Size", "Files", *FACTS),
                     "Nothing was recorded yet.",
                     buttons=self._buttons(),
                 )
         context.every(REFRESH_S, self.refresh)
 
-    def _buttons(self) -> list[RowButton]:
-        buttons = [RowButton("play_arrow", "Open", self._open)]
-        buttons += [RowButton("download", "Download", self._download)]
-        buttons += [RowButton("share", "Export", self._ask_export)]
+    def _buttons(self) -> list[widgets.RowButton]:
+        buttons = [widgets.RowButton("play_arrow", "Open", self._open)]
+        buttons += [widgets.RowButton("download", "Download", self._download)]
+        buttons += [widgets.RowButton("share", "Export", self._ask_export)]
         if self._context.may_change:
-            buttons += [RowButton("content_cut", "Cut or extract", self._ask_part)]
-            buttons += [RowButton("delete", "Delete", self._ask_delete)]
+            buttons += [widgets.RowButton("content_cut", "Cut or extract", self._ask_part)]
+            buttons += [widgets.RowButton("delete", "Delete", self._ask_delete)]
         return buttons
 
     async def refresh(self) -> None:
@@ -88,7 +75,7 @@ class RecordingsView:
         self._trouble.set_text(facts.trouble)
         recordings = list_recordings(folder)
         recorder = parts.watch.recorder
-        if recorder is None or recorder["state"] == IDLE:
+        if recorder is None or recorder["state"] == widgets.IDLE:
             parts.jobs.index(folder, recordings)
         if parts.jobs.is_indexing:
             self._trouble.set_text("Indexing the recordings …")
@@ -104,11 +91,13 @@ class RecordingsView:
         )
 
     def _ask_delete(self, name: str) -> None:
-        confirm(f"Delete the recording {name} permanently?", "Delete", partial(self._delete, name))
+        widgets.confirm(
+            f"Delete the recording {name} permanently?", "Delete", partial(self._delete, name)
+        )
 
     async def _delete(self, name: str) -> None:
         context = self._context
-        with notify_failure(context):
+        with widgets.notify_failure(context):
             context.check_may_change()
             if context.parts.watch.recorder is None:
                 delete_recording(context.parts.recordings_folder, name)
@@ -121,14 +110,14 @@ class RecordingsView:
         ui.download.from_url(f"/recordings/{quote(name)}")
 
     def _ask_export(self, name: str) -> None:
-        with asking(f"Export {name}") as dialog:
+        with widgets.asking(f"Export {name}") as dialog:
             for kind, (label, _, _) in FORMATS.items():
-                export = close_and(dialog, partial(self._export, name, kind))
+                export = widgets.close_and(dialog, partial(self._export, name, kind))
                 ui.button(label, on_click=export).props("no-caps outline")
 
     def _ask_part(self, name: str) -> None:
         """Ask for a part of a recording: a cut or anonymised tlog, or an extract."""
-        with asking(f"Cut or extract {name}") as dialog:
+        with widgets.asking(f"Cut or extract {name}") as dialog:
             with ui.element("div").classes("line"):
                 begin = ui.input("From", placeholder="1:20").props("dense outlined")
                 end = ui.input("To", placeholder="2026-06-11T14:25:30Z").props("dense outlined")
@@ -146,7 +135,7 @@ class RecordingsView:
                 return found + (ARMED_OPTIONS if armed.value else ())
 
             for kind, (label, *_) in CUTS.items():
-                make = close_and(dialog, partial(self._make_part, name, kind, cut_options))
+                make = widgets.close_and(dialog, partial(self._make_part, name, kind, cut_options))
                 ui.button(label, on_click=make).props("no-caps outline")
             number = ui.number("Vehicle", min=1, max=255, precision=0)
             number.props("dense outlined")
@@ -155,20 +144,22 @@ class RecordingsView:
                 return () if number.value is None else (f"--system={int(number.value)}",)
 
             for kind, (label, *_) in EXTRACTS.items():
-                make = close_and(dialog, partial(self._make_part, name, kind, extract_options))
+                make = widgets.close_and(
+                    dialog, partial(self._make_part, name, kind, extract_options)
+                )
                 ui.button(label, on_click=make).props("no-caps outline")
 
     async def _make_part(
         self, name: str, kind: str, options: Callable[[], tuple[str, ...]]
     ) -> None:
-        with notify_failure(self._context):
+        with widgets.notify_failure(self._context):
             self._context.check_may_change()
             await self._export(name, kind, options())
 
     async def _export(self, name: str, kind: str, options: tuple[str, ...] = ()) -> None:
         parts = self._context.parts
         text = f"{name}: making {KINDS[kind][0]} …"
-        with notify_failure(self._context), progress_shown(text):
+        with widgets.notify_failure(self._context), widgets.progress_shown(text):
             holder = parts.pages.holder(self._context.page)
             url = await parts.jobs.export(
                 Order(parts.recordings_folder, name, kind, options), holder
@@ -179,7 +170,7 @@ class RecordingsView:
         await open_playback(self._context, name)
 
 
-def _row(recording: Recording, facts: FlightFigures | str | None, track: str) -> Cells:
+def _row(recording: Recording, facts: FlightFigures | str | None, track: str) -> widgets.Cells:
     when = datetime.fromtimestamp(recording.modified_s, UTC)
     endings = [file.suffix for file in recording.files]
     kinds = [(endings.count(".csv"), "table"), (endings.count(".tlog"), "tlog")]
@@ -192,7 +183,7 @@ def _row(recording: Recording, facts: FlightFigures | str | None, track: str) ->
     )
 
 
-def _facts_cells(facts: FlightFigures | str | None) -> Cells:
+def _facts_cells(facts: FlightFigures | str | None) -> widgets.Cells:
     """Return the catalogue's cells; blank where unknown."""
     if facts is None:
         return ("",) * len(FACTS)

@@ -12,6 +12,7 @@ from nicegui import ui
 from gateway.analysis.metrics import rms
 from gateway.clock import unix_time_us
 from gateway.geometry.angle import wrap_180
+from gateway.panel import widgets
 from gateway.panel.dialogues import Dialogue
 from gateway.panel.estimator_trial import (
     LEAST_HZ,
@@ -23,16 +24,6 @@ from gateway.panel.estimator_trial import (
 from gateway.panel.state.fields import FloatArray, IntArray, parameter_unit
 from gateway.panel.state.parameters import ListState, ParameterMeta, is_same_value
 from gateway.panel.view_context import NotAllowedError, ViewContext
-from gateway.panel.widgets import (
-    DataTable,
-    LiveChart,
-    StripChart,
-    allow,
-    choice,
-    heading,
-    icon_button,
-    store_parameters,
-)
 from gateway.printable import figure, printable, reason_of
 from gateway.units import counted
 
@@ -174,7 +165,7 @@ class ComparisonCard:
         self._is_fusing = False
         with ui.element("div").classes("card").props("data-card=comparison"):
             with ui.element("div").classes("tools"):
-                heading("Estimators on the last minutes")
+                widgets.heading("Estimators on the last minutes")
                 ui.element("div").classes("spring")
                 titles = {key: title for key, (title, *_) in QUANTITIES.items()}
                 self._quantity = ui.select(titles, value="roll_deg", on_change=self._draw)
@@ -186,9 +177,9 @@ class ComparisonCard:
                 "with the present parameters."
             ).classes("soft")
             self._collecting = ui.label().classes("figure").props("role=status")
-            self._chart = StripChart().classes("strip")
+            self._chart = widgets.StripChart().classes("strip")
             self._chart.set_visibility(False)
-            self._table = DataTable(
+            self._table = widgets.DataTable(
                 ("Estimator", "RMS difference from flight", "RMS distance to the GPS fixes")
             ).classes("residuals")
             self._table.set_visibility(False)
@@ -206,7 +197,7 @@ class ComparisonCard:
         vehicle = self._context.vehicle
         share = 0.0 if vehicle is None else vehicle.samples.collected(LEAST_S, LEAST_HZ)
         reason = "" if share >= 1.0 else f"Collecting samples: {share:.0%}"
-        allow(self._button, "The samples are being fused." if self._is_fusing else reason)
+        widgets.allow(self._button, "The samples are being fused." if self._is_fusing else reason)
         self._collecting.set_text(reason)
         self._collecting.set_visibility(bool(reason))
 
@@ -292,11 +283,11 @@ class TuningView:
             self._search = ui.input(placeholder="Search: gps, cutoff, heading …")
             self._search.props('dense outlined clearable debounce=200 aria-label="Search"')
             self._search.classes("spring").on_value_change(self._draw)
-            self._group = choice("Group", [ALL], ALL, self._draw)
+            self._group = widgets.choice("Group", [ALL], ALL, self._draw)
             self._state = ui.label().classes("soft")
             self._button = ui.button("Store all", icon="save", on_click=self._store)
             self._button.props("no-caps unelevated dense")
-            icon_button("refresh", "Read all parameters again", self._reload)
+            widgets.icon_button("refresh", "Read all parameters again", self._reload)
         with ui.element("div").classes("tuning"):
             self._list = ui.element("div").classes("card settings")
             with ui.element("div").classes("effect"):
@@ -309,11 +300,11 @@ class TuningView:
     def _build_effect(self) -> None:
         with ui.element("div").classes("card"):
             with ui.element("div").classes("tools"):
-                heading("Effect")
+                widgets.heading("Effect")
                 ui.element("div").classes("spring")
                 effect = ui.select(list(EFFECTS), value="attitude")
                 effect.props('dense borderless options-dense aria-label="What is plotted"')
-            self._chart = LiveChart(self._context, EFFECTS["attitude"])
+            self._chart = widgets.LiveChart(self._context, EFFECTS["attitude"])
             effect.on_value_change(lambda event: self._chart.choose(EFFECTS[event.value]))
         ComparisonCard(self._context)
 
@@ -325,7 +316,7 @@ class TuningView:
         self._refresh()
 
     def _refresh(self) -> None:
-        allow(self._button, self._context.why_fixed)
+        widgets.allow(self._button, self._context.why_fixed)
         dialogue = self._context.dialogue
         if dialogue is None:
             self._state.set_text("")
@@ -398,7 +389,7 @@ class TuningView:
             self._context.dialogue.load(again=True)
 
     async def _store(self) -> None:
-        await store_parameters(self._context, "All parameters are stored")
+        await widgets.store_parameters(self._context, "All parameters are stored")
 
 
 def _group_of(name: str, metas: dict[str, ParameterMeta]) -> str:
