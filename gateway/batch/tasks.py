@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -97,6 +97,7 @@ class FlightTask(ABC):
             "choice": self.options.choice,
             "columns": self.options.columns,
             "system": self.options.system_id,
+            "task": {own.name: getattr(self, own.name) for own in fields(self)[1:]},
         }
         return msgspec.json.encode(values, order="sorted")
 
@@ -111,11 +112,6 @@ class EvaluateTask(FlightTask):
 
     pages: bool
     name: ClassVar[str] = "report"
-
-    @property
-    def fingerprint(self) -> bytes:
-        """See `FlightTask`."""
-        return super().fingerprint + msgspec.json.encode(self.pages)
 
     def do(self, files: list[Path], name: str) -> Worked:
         """See `FlightTask`."""
@@ -166,13 +162,6 @@ class SweepTask(FlightTask):
     hold_out: int
     interval_s: float
     name: ClassVar[str] = "sweep"
-
-    @property
-    def fingerprint(self) -> bytes:
-        """See `FlightTask`."""
-        axes = [(axis.key, axis.values) for axis in self.axes]
-        asked = (axes, self.metric_column, self.hold_out, self.interval_s)
-        return super().fingerprint + msgspec.json.encode(asked)
 
     def do(self, files: list[Path], name: str) -> Worked:
         """See `FlightTask`."""

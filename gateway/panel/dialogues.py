@@ -15,6 +15,7 @@ from gateway.panel.state import parameters
 from gateway.panel.state.calibration import CalibrationRun, CalibrationStep, RunState
 from gateway.panel.state.commands import command_long
 from gateway.panel.state.fleet import FleetState
+from gateway.panel.uplink import BackgroundTask
 
 POLL_S: Final = 0.05
 SAMPLES_US: Final = 20_000
@@ -118,7 +119,7 @@ class Dialogue:
             self._read(following)
 
 
-class Dialogues:
+class Dialogues(BackgroundTask):
     """The dialogues with all aircraft."""
 
     def __init__(
@@ -127,18 +128,8 @@ class Dialogues:
         self._all: dict[int, Dialogue] = {}
         self._send = send
         self._clock = clock
-        self._task: asyncio.Task[None] | None = None
         fleet.listen(self._handle)
         fleet.on_discard(self._discard)
-
-    def start(self) -> None:
-        """Start repeating requests without an answer; needs a running event loop."""
-        self._task = asyncio.get_running_loop().create_task(self._poll())
-
-    def close(self) -> None:
-        """Stop repeating requests."""
-        if self._task is not None:
-            self._task.cancel()
 
     def of(self, system_id: int) -> Dialogue:
         """Return the dialogue with an aircraft."""
@@ -151,7 +142,7 @@ class Dialogues:
         if (dialogue := self._all.get(system_id)) is not None:
             dialogue.handle(message, now_us)
 
-    async def _poll(self) -> None:
+    async def _run(self) -> None:
         while True:
             await asyncio.sleep(POLL_S)
             for dialogue in tuple(self._all.values()):

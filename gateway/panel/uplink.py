@@ -72,7 +72,25 @@ class ControlClient:
         )
 
 
-class GatewayWatch:
+class BackgroundTask:
+    """A coroutine, `_run`, that runs from `start` to `close`."""
+
+    _task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Start it; needs a running event loop."""
+        self._task = asyncio.get_running_loop().create_task(self._run())
+
+    def close(self) -> None:
+        """Cancel it."""
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _run(self) -> None:
+        raise NotImplementedError
+
+
+class GatewayWatch(BackgroundTask):
     """The newest answers of the gateway on this machine."""
 
     def __init__(self, control: ControlClient, fleet: FleetState) -> None:
@@ -83,18 +101,8 @@ class GatewayWatch:
         self.recorder: dict[str, Any] | None = None
         self._control = control
         self._fleet = fleet
-        self._task: asyncio.Task[None] | None = None
         self._polling = asyncio.Lock()
         """Held during a request, so that an earlier answer cannot arrive after a later one."""
-
-    def start(self) -> None:
-        """Start polling; needs a running event loop."""
-        self._task = asyncio.get_running_loop().create_task(self._watch())
-
-    def close(self) -> None:
-        """Stop polling."""
-        if self._task is not None:
-            self._task.cancel()
 
     async def refresh(self) -> None:
         """Poll now, so that the status is not older than this call."""
@@ -110,7 +118,7 @@ class GatewayWatch:
             if vehicle is not None:
                 vehicle.exact_mark = _spot_of(aircraft["mark"])
 
-    async def _watch(self) -> None:
+    async def _run(self) -> None:
         while True:
             with suppress(OSError):
                 await self.refresh()
@@ -128,7 +136,7 @@ class CommandFailedError(Exception):
     """A command was refused or not answered; the text gives the reason."""
 
 
-class Uplink:
+class Uplink(BackgroundTask):
     """Frames in, requests out."""
 
     def __init__(
@@ -151,18 +159,16 @@ class Uplink:
         self._received_us = -SILENT_US
         self._local = self._reported = ""
         self._acks: dict[tuple[int, int], asyncio.Queue[int]] = {}
-        self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
         """Connect; needs a running event loop. Failed connections are retried."""
         self._hub.start()
         self._player_hub.start()
-        self._task = asyncio.get_running_loop().create_task(self._keep_alive())
+        super().start()
 
     def close(self) -> None:
         """End the connection."""
-        if self._task is not None:
-            self._task.cancel()
+        super().close()
         self._hub.close()
         self._player_hub.close()
 
@@ -256,7 +262,7 @@ class Uplink:
         for listener in self._listeners:
             listener(message)
 
-    async def _keep_alive(self) -> None:
+    async def _run(self) -> None:
         beat = mavlink.MAVLink_heartbeat_message(
             mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
         )

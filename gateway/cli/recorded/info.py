@@ -114,14 +114,11 @@ def _list_all(*, json: bool) -> None:
     found = list_recordings(folder)
     figures = _figures(found) if found else {}
     if json:
+        flights = [figures.get(recording.name, {}) for recording in found]
         listed = [
-            {
-                "duration_s": _length_s(flown),
-                "vehicles": sorted(flown),
-            }
+            {"duration_s": _length_s(flown), "vehicles": sorted(flown)}
             | msgspec.to_builtins(recording, enc_hook=str)
-            for recording in found
-            for flown in [figures.get(recording.name, {})]
+            for recording, flown in zip(found, flights, strict=True)
         ]
         print_json(listed)
     elif found:
@@ -220,19 +217,11 @@ def _show(file: Path, found: FileInfo) -> None:
     for note in found.notes:
         console.print(f"note at {_clock((note.time_us - begin_us) / US_PER_S)}: {note.text}")
     if found.damaged_bytes:
-        console.print(
-            DAMAGED.format(
-                counted(found.damaged_bytes, "byte"), counted(found.damaged_runs, "place")
-            ),
-            style="red",
-        )
+        damage = (counted(found.damaged_bytes, "byte"), counted(found.damaged_runs, "place"))
+        console.print(DAMAGED.format(*damage), style="red")
     if found.unfinished_bytes:
-        console.print(
-            INCOMPLETE.format(
-                "record" if found.kind == "tlog" else "line",
-                counted(found.unfinished_bytes, "byte"),
-            )
-        )
+        unit = "record" if found.kind == "tlog" else "line"
+        console.print(INCOMPLETE.format(unit, counted(found.unfinished_bytes, "byte")))
     for remark in found.remarks:
         console.print(remark)
 
@@ -380,10 +369,7 @@ def _show_list(recordings: list[Recording], figures: dict[str, dict[int, FlightF
         def each(text: Callable[[FlightFigures], str], flown: Any = flown) -> str:
             return " ".join(text(flown[system_id]) for system_id in sorted(flown)) or UNKNOWN
 
-        when, length_s = (
-            civil_time(recording.modified_s * US_PER_S),
-            _length_s(flown),
-        )
+        when, length_s = civil_time(recording.modified_s * US_PER_S), _length_s(flown)
         grid.add_row(
             recording.name,
             UNKNOWN if length_s is None else duration_text(length_s),
