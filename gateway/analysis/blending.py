@@ -115,6 +115,13 @@ def error_at_fixes_m(track: FlightTrack, fixes: Fixes) -> FloatArray:
     )
 
 
+def scored_error_m(track: FlightTrack, flight: Flight, fixes: Fixes) -> float:
+    """Return the horizontal RMS error of a track at the fixes during scored samples."""
+    nearest = np.searchsorted(flight.time_us, fixes.valid_us).clip(0, len(flight.time_us) - 1)
+    error_m = error_at_fixes_m(track, fixes)[flight.scored[nearest]]
+    return metrics.rms(np.hypot(*error_m.T))
+
+
 def paper_table() -> "pd.DataFrame":
     """Return the paper's Table I as `sweep.blend_table` returns ours."""
     import pandas as pd
@@ -149,14 +156,11 @@ def score(track: FlightTrack, split: SplitFlight) -> dict[str, float]:
     """Score one track; NaN if there is nothing to compare with."""
     flight, held = split.fused, split.held_fixes
     to_gps = metrics.position_error_m(track, split.interpolated)[flight.scored]
-    # Only withheld fixes during scored samples.
-    nearest = np.searchsorted(flight.time_us, held.valid_us).clip(0, len(flight.time_us) - 1)
-    to_held = error_at_fixes_m(track, held)[flight.scored[nearest]]
     found = {
         "north_m": metrics.mean_abs(to_gps[:, 0]),
         "east_m": metrics.mean_abs(to_gps[:, 1]),
         "interpolated_m": metrics.rms(np.hypot(to_gps[:, 0], to_gps[:, 1])),
-        "held_m": metrics.rms(np.hypot(*to_held.T)),
+        "held_m": scored_error_m(track, flight, held),
         "reference_m": float("nan"),
         "attitude_deg": float("nan"),
     }

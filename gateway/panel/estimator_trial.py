@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from gateway.analysis.blending import scored_error_m
 from gateway.analysis.flight import (
     Flight,
     FlightTrack,
@@ -20,10 +21,8 @@ from gateway.analysis.flight import (
     flight_of_blocks,
     fuse_track,
 )
-from gateway.analysis.metrics import euler_rad, rms
+from gateway.analysis.metrics import euler_rad
 from gateway.estimation.select import ESTIMATORS, EstimationSettings
-from gateway.geometry.angle import wrap_180
-from gateway.geometry.geodesy import radii_m
 from gateway.panel.state.fields import FloatArray, TimedFrames
 from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.fuse import FusionSettings, with_estimator
@@ -134,18 +133,5 @@ def _estimate(name: str, flight: Flight, track: FlightTrack, zero_us: int) -> Es
         pitch_deg=angles[:, 1],
         yaw_deg=angles[:, 2],
         alt_amsl_m=track.alt_amsl_m[::step],
-        to_fixes_m=_to_fixes_m(flight, track),
+        to_fixes_m=scored_error_m(track, flight, fixes_of(flight)),
     )
-
-
-def _to_fixes_m(flight: Flight, track: FlightTrack) -> float:
-    """Compare each fix with the estimate at the time of its validity, after convergence."""
-    fixes = fixes_of(flight)
-    if not len(fixes):
-        return float("nan")
-    rows = np.clip(np.searchsorted(track.time_us, fixes.valid_us), 0, len(track.time_us) - 1)
-    meridian, parallel = radii_m(float(fixes.lat_deg[0]), float(fixes.alt_amsl_m[0]))
-    north_m = np.radians(track.lat_deg[rows] - fixes.lat_deg) * meridian
-    turned_deg = wrap_180(track.lon_deg[rows] - fixes.lon_deg)
-    away_m = np.hypot(north_m, np.radians(turned_deg) * parallel)
-    return rms(away_m[flight.scored[rows]])
