@@ -1,7 +1,6 @@
 """Access recordings anywhere: local paths, and URLs that fsspec can open."""
 
 import re
-import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,7 +14,7 @@ import msgspec
 
 from gateway.batch.catalogue import ENDINGS, digest_of, recordings_below
 from gateway.batch.executors import WorkError
-from gateway.recordings.files import CHUNK, GZIP
+from gateway.recordings.files import GZIP
 from gateway.recordings.index import parts_together, recording_name
 
 MARK: Final = "://"
@@ -119,8 +118,8 @@ def _fetched(location: str, folder: Path) -> Path:
     folder.mkdir()
     path = folder / location.rsplit("/", 1)[-1]
     storage, remote = _storage(location)
-    with _storage_errors(location), storage.open(remote, "rb") as source, path.open("wb") as target:
-        shutil.copyfileobj(source, target, CHUNK)
+    with _storage_errors(location):
+        storage.get_file(remote, str(path))
     return path
 
 

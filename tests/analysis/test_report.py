@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib import rc_context
 from PIL import Image
 
 from gateway.analysis.case import make_case
@@ -52,7 +53,7 @@ def test_flight_without_a_sample_that_counts_has_no_comparison_of_estimators() -
 
 
 def drawn() -> str:
-    with style.styled():
+    with rc_context(style.RC):
         figure, (axes,) = style.panels(style.NARROW_IN, 1, 2.0)
         axes.plot([0.0, 1.0], [110.37101, 110.37499], color=style.BLUE, label="line")
         axes.yaxis.get_major_formatter().set_useOffset(False)
@@ -79,7 +80,7 @@ def test_svg_has_css_colours_on_page_and_fixed_ones_in_file() -> None:
 
 
 def test_narrow_figure_stacks_its_panels() -> None:
-    with style.styled():
+    with rc_context(style.RC):
         wide, _ = style.panels(style.WIDE_IN, 1, 2.0, columns=3)
         narrow, axes = style.panels(style.NARROW_IN, 1, 2.0, columns=3)
     assert wide.get_size_inches().tolist() == [style.WIDE_IN, 2.0]
@@ -100,7 +101,7 @@ def test_envelope_of_long_line_keeps_extremes_and_gaps(rng: np.random.Generator)
 
 
 def test_square_axes_contain_all_points() -> None:
-    with style.styled():
+    with rc_context(style.RC):
         _, (axes,) = style.panels(style.WIDE_IN, 1, 3.0)
         style.fit_square(axes, np.array([0.0, 10.0]), np.array([5.0, 7.0]))
     assert np.ptp(axes.get_xlim()) == pytest.approx(np.ptp(axes.get_ylim()))
@@ -183,7 +184,7 @@ def test_every_figure_is_drawn_at_phone_width(report: Report, page: Report) -> N
     assert {"fig07_yaw", "fig08_quaternion", "fig09_acceleration_x", "table1_heat_map"} <= names
     others = [section for section in report.sections if section not in page.sections]
     for picture in (picture for section in others for picture in section.pictures):
-        with style.styled():
+        with rc_context(style.RC):
             picture.draw(style.NARROW_IN).draw_without_rendering()
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import jinja2
+import matplotlib as mpl
 import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
@@ -18,6 +19,8 @@ from gateway.output import write_new, written_together
 from gateway.printable import figure
 
 PAGE_NAME: Final = "index.html"
+Drawn = tuple[Markup, Markup]
+"""A picture as embedded in the page, wide and narrow."""
 Figures = Mapping[str, Callable[[FloatArray], Any]]
 """Figures of a series of values, by title."""
 
@@ -106,16 +109,6 @@ class Report:
     sections: list[Section]
 
 
-@dataclass(frozen=True, slots=True)
-class Drawn:
-    """A picture as embedded in the page."""
-
-    name: str
-    wide: Markup
-    narrow: Markup
-    caption: Markup
-
-
 def write_report(
     report: Report,
     folder: Path,
@@ -135,8 +128,8 @@ def write_report(
             return _drawn(pictures[number], fresh)
 
         with forked(draw, jobs if START == "fork" else 1) as run:
-            for _, picture in run(range(len(pictures))):
-                drawn[picture.name] = picture
+            for number, both in run(range(len(pictures))):
+                drawn[pictures[number].name] = both
                 on_picture()
         write_new(fresh / PAGE_NAME, [render_page(report, drawn).encode()])
     return folder / PAGE_NAME
@@ -162,11 +155,11 @@ def prose(text: str) -> Markup:
 
 
 def _drawn(picture: Picture, folder: Path) -> Drawn:
-    with style.styled():
+    with mpl.rc_context(style.RC):
         wide = picture.draw(style.WIDE_IN)
         wide_svg = style.to_svg(wide)
         write_new(folder / f"{picture.name}.png", [style.to_png(wide)])
         narrow_svg = style.to_svg(picture.draw(style.NARROW_IN))
     write_new(folder / f"{picture.name}.svg", [style.stand_alone(wide_svg).encode()])
     wide_part, narrow_part = Markup(style.for_page(wide_svg)), Markup(style.for_page(narrow_svg))
-    return Drawn(picture.name, wide_part, narrow_part, prose(picture.caption))
+    return wide_part, narrow_part

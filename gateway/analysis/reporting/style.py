@@ -6,11 +6,9 @@ replaced by CSS variables, so the page's theme colours it.
 
 import io
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Final
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -80,13 +78,6 @@ RC: Final = {
     "path.simplify": True,
     "path.simplify_threshold": 0.3,
 }
-
-
-@contextmanager
-def styled() -> Iterator[None]:
-    """Apply the report's style while drawing."""
-    with mpl.rc_context(RC):
-        yield
 
 
 def panels(

@@ -188,8 +188,7 @@ def check_clock(_: config.GatewaySettings) -> Iterator[Diagnosis]:
     if said.stdout.strip() == "yes":
         yield ok("clock", "synchronised")
     else:
-        text = "not synchronised: recordings get their right times from GPS"
-        yield info("clock", text)
+        yield info("clock", "not synchronised: recordings get their right times from GPS")
 
 
 def check_disk(settings: config.GatewaySettings) -> Iterator[Diagnosis]:

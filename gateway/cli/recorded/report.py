@@ -171,13 +171,8 @@ def _drawn(make: Callable[[], Report], output: Path) -> Path:
         made = make()
         count = sum(len(section.pictures) for section in made.sections)
         progress.update(task, description="drawing", total=count)
-
-        def advance() -> None:
-            # No thread for the progress bar, since drawing processes are forked from this one.
-            progress.advance(task)
-            progress.refresh()
-
-        return write_report(made, output, advance)
+        # No thread for the progress bar, since drawing processes are forked from this one.
+        return write_report(made, output, lambda: progress.update(task, advance=1, refresh=True))
 
 
 def _read_recorded(path: Path, settings: GatewaySettings, options: ReadOptions) -> PilotFlight:

@@ -70,10 +70,8 @@ def _items_of(names: Sequence[str]) -> list[BatchItem]:
             log.setLevel(logging.WARNING)
     found = list[str]()
     for name in names:
-        is_file = not is_url(name)
-        found += (
-            map(str, recorded_files([Path(name).expanduser()], "tables")) if is_file else [name]
-        )
+        path = Path(name).expanduser()
+        found += [name] if is_url(name) else [*map(str, recorded_files([path], "tables"))]
     try:
         items = items_of(found)
     except OSError as error:

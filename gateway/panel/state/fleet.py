@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.vehicle import VehicleState
+from gateway.panel.state.vehicle import LIVE, VehicleState
 from gateway.vehicle_state.newest import VehicleComponents
 
 MAX_VEHICLES: Final = 32
@@ -81,9 +81,8 @@ class FleetState:
         if vehicle is None:
             if len(self.vehicles) >= MAX_VEHICLES:
                 return
-            vehicle = VehicleState(system_id)
-            if origin := self.origins.get(system_id):
-                vehicle = VehicleState(system_id, origin.word, origin.recorded_id)
+            origin = self.origins.get(system_id, Origin(LIVE, system_id))
+            vehicle = VehicleState(system_id, origin.word, origin.recorded_id)
             self.vehicles[system_id] = vehicle
         vehicle.update(message, now_us)
         self.version += 1
