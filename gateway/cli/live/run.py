@@ -209,7 +209,7 @@ async def _live_view(
     with Live(screen=True, auto_refresh=False) as live:
         keyboard.start()
         try:
-            while not await _is_set_within(stopped, VIEW_INTERVAL_S):
+            while not await is_set_within(stopped, VIEW_INTERVAL_S):
                 view.link = "" if panel is None else panel.link or "loading; its address follows"
                 if not held:
                     live.update(view.draw(daemon.snapshot()), refresh=True)
@@ -218,11 +218,12 @@ async def _live_view(
 
 
 async def _log_lines(daemon: Daemon, stopped: asyncio.Event) -> None:
-    while not await _is_set_within(stopped, LOG_INTERVAL_S):
+    while not await is_set_within(stopped, LOG_INTERVAL_S):
         log.info(summary_line(daemon.snapshot()))
 
 
-async def _is_set_within(event: asyncio.Event, seconds: float) -> bool:
+async def is_set_within(event: asyncio.Event, seconds: float) -> bool:
+    """Wait for an event; return False if it is not set in time."""
     try:
         async with asyncio.timeout(seconds):
             return await event.wait()

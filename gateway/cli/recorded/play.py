@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-from gateway.cli.live.run import refuse_conflicts, with_endpoints
+from gateway.cli.live.run import is_set_within, refuse_conflicts, with_endpoints
 from gateway.cli.support import shared_options as opt
 from gateway.cli.support.options import argument, ask, option, read_options, read_settings
 from gateway.cli.support.recordings import print_remarks, progress_of, read_range, recorded_files
@@ -223,11 +223,7 @@ async def _watch(daemon: PlayerDaemon) -> None:
             )
             if console.is_terminal:
                 live.refresh()
-            try:
-                async with asyncio.timeout(VIEW_INTERVAL_S):
-                    await daemon.ended.wait()
-            except TimeoutError:
-                continue
+            await is_set_within(daemon.ended, VIEW_INTERVAL_S)
     console.print(f"ended: {_position(daemon.edge.status())}")
 
 
