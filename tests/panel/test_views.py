@@ -314,7 +314,7 @@ class TestTuning:
             parsed.append(content)
             return {}
 
-        monkeypatch.setattr("gateway.panel.dialogues.parse_parameters", parse)
+        monkeypatch.setattr("gateway.panel.state.parameters.parse_parameters", parse)
         dialogue = bench.parts.dialogues.of(1)
         for count in (1, 2):
             dialogue.load(again=True)
