@@ -20,7 +20,8 @@ from gateway.analysis.blending import (
     withhold_spans,
 )
 from gateway.analysis.flight import Fixes, fixes_of, flight_of_blocks
-from gateway.analysis.reporting.estimators import weights
+from gateway.analysis.reporting.estimators import _draw_heat_map, weights
+from gateway.analysis.reporting.style import WIDE_IN
 from gateway.analysis.sweep import blend_table, with_value
 from gateway.recordings.files import read_chunks
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
@@ -119,6 +120,10 @@ def test_table_with_one_decrease_does_not_grow() -> None:
     assert grows(table, "east_m")
     table.loc[4, "east_m"] = 1.0
     assert not grows(table, "east_m")
+
+
+def test_heat_map_of_a_flight_along_a_meridian_is_drawn() -> None:
+    _draw_heat_map(paper_table().assign(east_m=0.0), WIDE_IN)
 
 
 def test_errors_of_simulated_flight_grow_with_both_weights() -> None:

@@ -352,7 +352,8 @@ def _draw_heat_map(table: pd.DataFrame, width_in: float) -> Figure:
         for way, column in (("latitude", "north_m"), ("longitude", "east_m"))
     }
     every = np.concatenate([grid.ravel() for grid in values.values()])
-    scale = LogNorm(float(np.nanmin(every)), float(np.nanmax(every)))
+    # The error of a flight along a meridian or a parallel is zero, which has no logarithm.
+    scale = LogNorm(float(every[every > 0.0].min()), float(np.nanmax(every)))
     for panel, (title, grid) in zip(axes.ravel(), values.items(), strict=True):
         panel.imshow(grid, cmap=COLOUR_MAP, norm=scale, origin="lower", aspect="auto")
         for (row, col), value in np.ndenumerate(grid):

@@ -65,11 +65,11 @@ def run_gateway(
     file = CONFIG.get()
 
     def read() -> GatewaySettings:
-        settings = with_sources(read_settings(file), source)
-        if port is not None:
-            serial = msgspec.structs.replace(settings.serial, port=port)
-            settings = msgspec.structs.replace(settings, serial=serial)
-        return with_endpoints(settings, endpoint)
+        settings = with_endpoints(read_settings(file), endpoint, source)
+        if port is None:
+            return settings
+        serial = msgspec.structs.replace(settings.serial, port=port)
+        return msgspec.structs.replace(settings, serial=serial)
 
     settings = read()
     if panel:
@@ -84,23 +84,19 @@ def run_gateway(
     run_event_loop(daemon, settings.hub.event_loop)
 
 
-def with_sources(settings: GatewaySettings, urls: list[str] | None) -> GatewaySettings:
-    """Replace the sources in the settings by those of the command line."""
-    try:
-        sources = tuple(SourceSettings(url=url) for url in urls or ())
-    except ValueError as error:
-        refuse(f"--source: {error}")
-    return msgspec.structs.replace(settings, sources=sources or settings.sources)
-
-
-def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:
-    """Replace the endpoints in the settings by those of the command line."""
-    hub = settings.hub
+def with_endpoints(
+    settings: GatewaySettings, endpoints: list[str] | None, sources: list[str] | None = None
+) -> GatewaySettings:
+    """Replace the endpoints and sources in the settings by those of the command line."""
+    option, hub = "--endpoint", settings.hub
     try:
         hub = msgspec.structs.replace(hub, endpoints=tuple(endpoints or hub.endpoints))
+        settings = msgspec.structs.replace(settings, hub=hub)
+        option = "--source"
+        found = tuple(SourceSettings(url=url) for url in sources or ())
+        return msgspec.structs.replace(settings, sources=found or settings.sources)
     except ValueError as error:
-        refuse(f"--endpoint: {error}")
-    return msgspec.structs.replace(settings, hub=hub)
+        refuse(f"{option}: {error}")
 
 
 def refuse_conflicts(systems: Collection[int], settings: GatewaySettings, *, allowed: bool) -> None:
