@@ -60,6 +60,8 @@ HEADINGS: Final = {
     "attitude_deg": "attitude error, deg",
 }
 """Headings of the columns with a sweep's scores."""
+Found = tuple[FusionSettings, "pd.DataFrame"]
+"""The settings with the best values, and a table of the trials or flights."""
 
 
 @app.command()
@@ -137,10 +139,6 @@ def sweep(
     if table is not None:
         write_new(table, [rows.to_csv(index=False).encode()], overwrite=force, inputs=[path])
     exit_if_failed(results)
-
-
-Found = tuple[FusionSettings, "pd.DataFrame"]
-"""The settings with the best values, and a table of the trials or flights."""
 
 
 def _best_of_one(
