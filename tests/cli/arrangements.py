@@ -38,7 +38,9 @@ from tests.kit.recordings import (
     write_tlog,
 )
 from tests.kit.records import raw_at, state_at
+from tests.recordings import test_autopilot_record
 from tests.recordings.flights import flown_table, read
+from tests.recordings.formats import flown
 
 NAMES = "time_s,ax,ay,az,gx,gy,gz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m"
 NUMBERS = ("0", "0", "-9.8", "0", "0", "0", "100", "0.1", "47", "8", "500")
@@ -100,6 +102,13 @@ def mixed(folder: Path) -> None:
     """Write a tlog of systems 1, 2 and 7."""
     found = [*make_records(90), *make_records(90, 2), *make_records(30, 7)]
     write_tlog(folder / "a.tlog", sorted(found, key=lambda record: record.time_us))
+
+
+def autopilots(folder: Path) -> None:
+    """Write `flight.bin`, with plans, and `flight.ulg`, each with defaults of its parameters."""
+    test_autopilot_record.write_with_plans(folder / "flight.bin")
+    default = flown.ulog_message(b"Q", b"\x01" + flown.ulog_parameter("MAV_SYS_ID", 1))
+    flown.write(folder / "flight.ulg", test_autopilot_record.px4_log() + default)
 
 
 def half_minute(folder: Path, speed: str = "") -> None:
@@ -288,8 +297,9 @@ def turning(folder: Path) -> None:
 MAKE: dict[str, Callable[..., object]] = {
     made.__name__: made
     for made in (
-        log, odd_log, table, flight, mixed, short, half_minute, recordings, zipped, endless,
-        introduced, future, compared, mission, images, dataflash, empty_dataflash, dialect, turning,
+        log, odd_log, table, flight, mixed, short, autopilots, half_minute, recordings, zipped,
+        endless, introduced, future, compared, mission, images, dataflash, empty_dataflash,
+        dialect, turning,
         machines.link,
     )
 }  # fmt: skip

@@ -273,33 +273,6 @@ def test_plans_texts_and_parameters_of_a_log_are_extracted(tmp_path: Path) -> No
     assert "BATT_CAPACITY,5000\n" in params.read_text()
 
 
-def test_diff_shows_the_defaults_that_a_log_states(tmp_path: Path) -> None:
-    path, other = write_with_plans(tmp_path / "flight.bin"), tmp_path / "other.param"
-    other.write_text("SYSID_THISMAV,7\nFRAME_CLASS,1\nBATT_CAPACITY,5000\n")
-    found = json.loads(run("diff", path, other, "--json"))
-    assert found["parameters"] == {"FRAME_CLASS": ["2", "1"]}
-    assert found["known"] == {"FRAME_CLASS": ["8", ""]}
-
-
-def test_diff_shows_the_defaults_that_a_ulog_states(tmp_path: Path) -> None:
-    default = flown.ulog_message(b"Q", b"\x01" + flown.ulog_parameter("MAV_SYS_ID", 1))
-    path, other = flown.write(tmp_path / "a.ulg", px4_log() + default), tmp_path / "other.param"
-    other.write_text("MAV_SYS_ID,9\n")
-    found = json.loads(run("diff", path, other, "--json"))
-    assert found["parameters"] == {"MAV_SYS_ID": ["7", "9"]}
-    assert found["known"] == {"MAV_SYS_ID": ["1", ""]}
-
-
-def test_map_shows_the_autopilots_own_positions_or_fused_ones(tmp_path: Path) -> None:
-    path = write(tmp_path / "flight.bin")
-    out = tmp_path / "flight.geojson"
-    run("convert", path, "-o", out)
-    shapes = [feature["geometry"] for feature in json.loads(out.read_text())["features"]]
-    lines = [one["coordinates"] for one in shapes if one["type"] == "LineString"]
-    assert [one[0][:2] for one in lines] == [[8.5455939, 47.3977418]]
-    assert "nothing to draw" in run("fuse", path, "-o", out, "--force", code=2)
-
-
 def test_units_of_the_log_go_before_those_of_the_table(tmp_path: Path) -> None:
     formats = FORMATS | {
         "FMTU": (200, "QBNN", "TimeUS,FmtType,UnitIds,MultIds"),
@@ -452,11 +425,6 @@ def test_value_with_a_time_outside_the_log_does_not_lengthen_it(
     records = translated(path)
     assert messages_of(records, "STATUSTEXT")[0]["text"] == b"Low battery"
     assert messages_of(records, "HOME_POSITION")[0]["latitude"] == 473977000
-
-
-def test_info_lists_rows_without_counterpart(tmp_path: Path) -> None:
-    output = run("info", write(tmp_path / "flight.bin"))
-    assert "without a counterpart in MAVLink: ODD 40" in output
 
 
 @pytest.mark.parametrize("name", ["flight.bin", "flight.ulg"])

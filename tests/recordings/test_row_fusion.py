@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 
 import msgspec
 import pytest
@@ -14,9 +15,8 @@ from gateway.recordings.recorded_fusion import Replay
 from gateway.recordings.recorded_table import Line, header_for
 from gateway.recordings.rows import RowBuilder, TableRow, row_to_line
 from gateway.recordings.table import TableEvent, TableHeader, TableNote, block_of
-from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, ImuRaw
-from gateway.simulator.simulator_settings import SimulatorSettings
-from tools.simulated_flight import fly
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix
+from tests.recordings.flights import flown_table, read
 
 DURATION_S = 25.0
 BLOCK = 700
@@ -26,24 +26,15 @@ def settings_for(estimator: str) -> AircraftSettings:
     return AircraftSettings(estimation=EstimationSettings(estimator=estimator))
 
 
-def flown() -> list[Line]:
-    """Return rows as a recording has them, with rows that no sample stands in."""
-    rows: list[Line] = []
-    simulator = SimulatorSettings(gps_first_fix_s=2.0)
-    baro: BaroRaw | None = None
-    gps: GpsFix | None = None
-    for number, record in enumerate(fly(simulator, duration_s=DURATION_S).records()):
-        if isinstance(record, BaroRaw):
-            if baro is not None or gps is not None or number % 7 == 0:
-                rows += [TableRow(r.time_us, b, g) for r, b, g in [(gps or baro, baro, gps)] if r]
-                gps = None
-            baro = record
-        elif isinstance(record, GpsFix):
-            gps = record
-        elif isinstance(record, ImuRaw):
-            rows.append(TableRow(record.time_us, baro, gps, record))
-            baro = gps = None
-    return rows
+@cache
+def flown() -> tuple[TableRow, ...]:
+    """Return the rows of a flight, some of whose pressures are rows of their own."""
+    rows: list[TableRow] = []
+    for number, row in enumerate(read(flown_table(DURATION_S))[1]):
+        if row.baro and number % 2:
+            rows.append(TableRow(row.time_us, row.baro))
+        rows.append(replace(row, baro=None) if number % 2 else row)
+    return tuple(rows)
 
 
 def one_by_one(lines: Iterable[Line], settings: AircraftSettings) -> Iterator[TableRow]:

@@ -43,6 +43,7 @@ def test_messages_of_one_time_and_of_other_instances_are_rows_of_their_own(folde
     assert {row["time"] for row in rows} == {"2025-10-09T08:53:20.000000Z"}
     assert [row["voltages[0]"] for row in rows] == ["4100", "4101", "4100"]
     assert rows[0]["voltages[9]"] == "65535"
+    assert rows_of(folder, "BATTERY_STATUS", "--system", 2) == rows[2:]
 
 
 def test_texts_are_whole_and_floats_have_their_shortest_text(folder: Path) -> None:
@@ -50,26 +51,3 @@ def test_texts_are_whole_and_floats_have_their_shortest_text(folder: Path) -> No
     (row,) = rows_of(folder, "attitude")
     expected = {"roll": "0.1", "pitch": "-1e-09", "yaw": "nan", "time_boot_ms": "7"}
     assert row.items() >= expected.items()
-
-
-def test_rows_are_chosen_by_sender(folder: Path) -> None:
-    assert len(rows_of(folder, "BATTERY_STATUS", "--system", 2)) == 1
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        (("--message", "VFR_HUD"), "contains no VFR_HUD, but ATTITUDE, BATTERY_STATUS, STATUSTEXT"),
-        (("--message", "60001"), "not known"),
-        (("--message", "ATTITUDE*"), "one message"),
-        (("--message", "ATTITUDE", "--message", "VFR_HUD"), "one message"),
-        (("--message", "ATTITUDE", "--anonymise"), "ends in .tlog"),
-        (("--without", "ATTITUDE"), "ends in .tlog"),
-    ],
-)
-def test_csv_without_exactly_one_known_message_is_refused(
-    folder: Path, options: tuple[str, ...], text: str
-) -> None:
-    out = folder / "out.csv"
-    assert text in run("convert", folder / "a.tlog", "-o", out, *options, code=2)
-    assert not out.exists()
