@@ -2,30 +2,34 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 import numpy as np
 
 from gateway.recordings.columns import BARO, GPS, MAG, NAV, RAW, SI, FloatArray, has_group
-from gateway.recordings.file_format import NO_RECORDING, TABLE
+from gateway.recordings.file_format import NO_RECORDING, TABLE, TLOG
 from gateway.recordings.files import FlightError, Progress, read_blocks
 from gateway.recordings.flight_facts import FlightFacts, FlightTally, checksum
 from gateway.recordings.recorded_clock import Gap, TimesSpan
 from gateway.recordings.recording import RecordedFile
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableNote, TableReader
-from gateway.recordings.tallies import MessageTally, RowTally
+from gateway.recordings.tallies import MessageTally, RowTally, VehicleTally
 from gateway.recordings.tlog_index import DAMAGED_TIME, TlogIndex
 from gateway.units import US_PER_S, counted
-from gateway.vehicle_state.senders import Senders
+from gateway.vehicle_state.senders import RecordedSender, Senders
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.recorded_frames import Batch
 
 if TYPE_CHECKING:
     from gateway.recordings.recorded_table import ReadOptions
+
+OTHERS: Final = {"baro": BARO, "gps": GPS, "state": NAV}
+RATES: Final = ("imu", "mag", *OTHERS)
+"""Kinds of records of a table whose rates are listed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,138 +91,120 @@ class Summary:
     tallies: Mapping[int, FlightTally] = field(default_factory=dict)
 
 
-class TlogSummary:
-    """Summarise MAVLink, batch by batch."""
-
-    def __init__(self, senders: Senders) -> None:
-        self._index, self._senders = TlogIndex(), senders
-        self._tally = MessageTally(senders)
-        self._counts: Counter[tuple[int, int]] = Counter()
-        self._span = TimesSpan()
-
-    def add(self, batch: Batch) -> None:
-        """Add the next batch of the file."""
-        self._index.add(batch)
-        if not len(batch):
-            return
-        self._span.add_all(batch.time_us)
-        keys, counts = np.unique((batch.origins >> 8) << 24 | batch.message_ids, return_counts=True)
-        for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
-            self._counts[key >> 24, key & 0xFFFFFF] += count
-        self._tally.add(batch)
-
-    def result(self, size: int) -> Summary:
-        """Return the summary of a file of that size."""
-        index = self._index
-        self._tally.flush()
-        duration_s = self._span.length_us / US_PER_S
-        info = FileInfo(
-            kind="tlog",
-            size=size,
-            records=index.count,
-            first_us=index.first_us,
-            last_us=index.last_us,
-            duration_s=duration_s,
-            vehicles=tuple(
-                self._vehicle(system_id, duration_s)
-                for system_id in sorted({system_id for system_id, _ in self._counts})
-            ),
-            gaps=tuple(self._span.gaps),
-            damaged_bytes=index.damaged_bytes,
-            damaged_runs=len(index.damage),
-            unfinished_bytes=index.unfinished,
-            remarks=(DAMAGED_TIME.format(counted(index.mended, "record")),) if index.mended else (),
-        )
-        return Summary(info, self._tally.vehicles)
-
-    def _vehicle(self, system_id: int, duration_s: float) -> VehicleInfo:
-        mav_type, autopilot = self._senders.vehicle(system_id).heartbeat or (None, None)
-        counts = {key: n for (system, key), n in self._counts.items() if system == system_id}
-        rates = tuple(
-            _rate(MESSAGE_NAMES.get(key, f"message {key}"), counts[key], duration_s)
-            for key in sorted(counts)
-        )
-        found = VehicleInfo(system_id, mav_type, autopilot, None, rates)
-        tally = self._tally.vehicles.get(system_id)
-        if tally is None:
-            return found
-        return replace(
-            found,
-            positions=tally.positions,
-            facts=tally.facts(),
-            version=tally.firmware,
-            settings=tally.settings_checksum,
-        )
+def of_messages(
+    senders: Senders,
+    batches: Iterable[Batch],
+    size: int,
+    kind: str = TLOG,
+    remarks: Iterable[str] = (),
+) -> Summary:
+    """Summarise MAVLink in a file of that size."""
+    index, tally, span = TlogIndex(), MessageTally(senders), TimesSpan()
+    counts: Counter[tuple[int, int]] = Counter()
+    for batch in batches:
+        index.add(batch)
+        span.add_all(batch.time_us)
+        keys = (batch.origins >> 8) << 24 | batch.message_ids
+        for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
+            counts[int(key) >> 24, int(key) & 0xFFFFFF] += int(count)
+        tally.add(batch)
+    tally.flush()
+    duration_s = span.length_us / US_PER_S
+    systems: defaultdict[int, list[Rate]] = defaultdict(list)
+    for (system_id, key), count in sorted(counts.items()):
+        name = MESSAGE_NAMES.get(key, f"message {key}")
+        systems[system_id].append(_rate(name, count, duration_s))
+    mended = [DAMAGED_TIME.format(counted(index.mended, "record"))] if index.mended else []
+    info = FileInfo(
+        kind=kind,
+        size=size,
+        records=index.count,
+        first_us=index.first_us,
+        last_us=index.last_us,
+        duration_s=duration_s,
+        vehicles=tuple(
+            _vehicle(senders.vehicle(system_id), rates, tally.vehicles.get(system_id))
+            for system_id, rates in systems.items()
+        ),
+        gaps=tuple(span.gaps),
+        damaged_bytes=index.damaged_bytes,
+        damaged_runs=len(index.damage),
+        unfinished_bytes=index.unfinished,
+        remarks=(*remarks, *mended),
+    )
+    return Summary(info, tally.vehicles)
 
 
-class TableSummary:
-    """Summarise a table, or rows that were read from another format, block by block."""
+def _vehicle(sender: RecordedSender, rates: list[Rate], tally: VehicleTally | None) -> VehicleInfo:
+    mav_type, autopilot = sender.heartbeat or (None, None)
+    found = VehicleInfo(sender.origin >> 8, mav_type, autopilot, None, tuple(rates))
+    if tally is None:
+        return found
+    return replace(
+        found,
+        positions=tally.positions,
+        facts=tally.facts(),
+        version=tally.firmware,
+        settings=tally.settings_checksum,
+    )
 
-    def __init__(self) -> None:
-        self._header: TableHeader | None = None
-        self._notes: list[TableNote] = []
-        self._counts: Counter[str] = Counter()
-        self._damaged_bytes = self._unfinished_bytes = 0
-        self._tally = RowTally()
 
-    def add(self, block: TableBlock, header: TableHeader | None) -> None:
-        """Add the next block of the file."""
-        self._header = header
+def of_rows(
+    blocks: Iterable[TableBlock],
+    header_of: Callable[[], TableHeader | None],
+    size: int,
+    kind: str = TABLE,
+    remarks: Callable[[], Iterable[str]] = list,
+) -> Summary:
+    """Summarise rows in a file of that size; `header_of` is called once all are read."""
+    tally, counts = RowTally(), Counter[str]()
+    notes: list[TableNote] = []
+    for block in blocks:
         for _, comment in block.comments:
             if isinstance(comment, TableNote):
-                self._notes.append(comment)
-            elif isinstance(comment, TableFault) and comment.is_cut:
-                self._unfinished_bytes += comment.size
+                notes.append(comment)
             elif isinstance(comment, TableFault):
-                self._counts["damage"] += 1
-                self._damaged_bytes += comment.size
-        if len(block):
-            self._count_rows(block.cells)
-        self._tally.add(block)
+                what = "unfinished" if comment.is_cut else "damaged"
+                counts[what] += comment.size
+                counts["runs"] += not comment.is_cut
+        counts.update(_counts_of(block.cells))
+        tally.add(block)
+    header, facts = header_of(), tally.facts()
+    vehicle = VehicleInfo(
+        system_id=header.vehicle_id if header else 1,
+        mav_type=None,
+        autopilot=None,
+        positions=tally.positions,
+        rates=tuple(_rate(name, counts[name], facts.duration_s) for name in RATES if counts[name]),
+        facts=facts,
+        version=(header and header.mavgate_version) or None,
+        settings=_checksum(header),
+    )
+    info = FileInfo(
+        kind=kind,
+        size=size,
+        records=counts["row"],
+        first_us=tally.span.first_us,
+        last_us=tally.span.last_us,
+        duration_s=facts.duration_s,
+        vehicles=(vehicle,),
+        gaps=facts.gaps,
+        damaged_bytes=counts["damaged"],
+        damaged_runs=counts["runs"],
+        unfinished_bytes=counts["unfinished"],
+        header=header,
+        notes=tuple(notes),
+        remarks=tuple(remarks()),
+    )
+    return Summary(info, {vehicle.system_id: tally})
 
-    def result(self, size: int) -> Summary:
-        """Return the summary of a file of that size."""
-        span, header = self._tally.span, self._header
-        facts = self._tally.facts()
-        vehicle = VehicleInfo(
-            system_id=header.vehicle_id if header else 1,
-            mav_type=None,
-            autopilot=None,
-            positions=self._tally.positions,
-            rates=tuple(
-                _rate(name, self._counts[name], facts.duration_s)
-                for name in ("imu", "mag", "baro", "gps", "state")
-                if self._counts[name]
-            ),
-            facts=facts,
-            version=(header and header.mavgate_version) or None,
-            settings=_checksum(header),
-        )
-        info = FileInfo(
-            kind="table",
-            size=size,
-            records=self._counts["row"],
-            first_us=span.first_us,
-            last_us=span.last_us,
-            duration_s=facts.duration_s,
-            vehicles=(vehicle,),
-            gaps=facts.gaps,
-            damaged_bytes=self._damaged_bytes,
-            damaged_runs=self._counts["damage"],
-            unfinished_bytes=self._unfinished_bytes,
-            header=header,
-            notes=tuple(self._notes),
-        )
-        return Summary(info, {vehicle.system_id: self._tally})
 
-    def _count_rows(self, cells: FloatArray) -> None:
-        counts = self._counts
-        has_imu, has_mag = has_group(cells, SI), has_group(cells, MAG)
-        counts["row"] += len(cells)
-        counts["imu"] += int((has_imu | has_group(cells, RAW)).sum())
-        counts["mag"] += int((has_imu & has_mag).sum())
-        for name, group in (("baro", BARO), ("gps", GPS), ("state", NAV)):
-            counts[name] += int(has_group(cells, group).sum())
+def _counts_of(cells: FloatArray) -> dict[str, int]:
+    has_imu, has_mag = has_group(cells, SI), has_group(cells, MAG)
+    found = {"row": len(cells), "imu": (has_imu | has_group(cells, RAW)).sum()}
+    found["mag"] = (has_imu & has_mag).sum()
+    found |= {name: has_group(cells, group).sum() for name, group in OTHERS.items()}
+    return {name: int(count) for name, count in found.items()}
 
 
 def _rate(name: str, count: int, duration_s: float) -> Rate:
@@ -241,54 +227,39 @@ def read_summary(
 
     `options` is called for other programs' files only, which are refused without it.
     """
-    file, size = recording.path, recording.path.stat().st_size
+    path, size = recording.path, recording.path.stat().st_size
     if recording.is_mavlink:
         source = recording.mavlink
-        found = _of_messages(source.senders, source.batches(progress), size)
+        batches = source.batches(progress)
+        found = of_messages(source.senders, batches, size, remarks=source.remarks)
         if not found.info.records:
-            raise FlightError(f"{file}: {NO_RECORDING}")
-        return _with(found, recording, (*source.remarks, *found.info.remarks))
-    if recording.kind != TABLE:
-        if options is None:
-            raise FlightError(f"{file}: {NO_RECORDING}")
-        return (_of_log if recording.is_log else _of_rows)(recording, options())
-    table, reader = TableSummary(), TableReader()
-    for block in read_blocks(file, reader, progress):
-        table.add(block, reader.header)
-    return table.result(size)
+            raise FlightError(f"{path}: {NO_RECORDING}")
+        return found
+    if recording.kind == TABLE:
+        reader = TableReader()
+        return of_rows(read_blocks(path, reader, progress), lambda: reader.header, size)
+    if options is None:
+        raise FlightError(f"{path}: {NO_RECORDING}")
+    return (_of_log if recording.is_log else _of_others)(recording, options(), size)
 
 
-def _of_messages(senders: Senders, batches: Iterable[Batch], size: int) -> Summary:
-    summary = TlogSummary(senders)
-    for batch in batches:
-        summary.add(batch)
-    return summary.result(size)
-
-
-def _with(found: Summary, recording: RecordedFile, remarks: Iterable[str]) -> Summary:
-    return replace(found, info=replace(found.info, kind=recording.kind, remarks=tuple(remarks)))
-
-
-def _of_rows(recording: RecordedFile, options: ReadOptions) -> Summary:
+def _of_others(recording: RecordedFile, options: ReadOptions, size: int) -> Summary:
     # This imports all stages, as reading the rows does.
     from gateway.recordings.workshop.joining import shifted
 
-    recorded, table = recording.rows(options), TableSummary()
-    own = recording.is_own
-    zero_us = 0 if own else recorded.header.unix_us_at_zero or 0
-    for block in recorded.blocks:
-        table.add(shifted(block, zero_us), recorded.header)
-    found = table.result(recording.path.stat().st_size)
-    found = replace(found, info=replace(found.info, header=found.info.header if own else None))
-    return _with(found, recording, recorded.remarks)
+    table, own = recording.rows(options), recording.is_own
+    zero_us = 0 if own else table.header.unix_us_at_zero or 0
+    blocks = (shifted(block, zero_us) for block in table.blocks)
+    kind, remarks = recording.kind, table.remarks
+    found = of_rows(blocks, lambda: table.header, size, kind, lambda: remarks)
+    return found if own else replace(found, info=replace(found.info, header=None))
 
 
-def _of_log(recording: RecordedFile, options: ReadOptions) -> Summary:
+def _of_log(recording: RecordedFile, options: ReadOptions, size: int) -> Summary:
     """Summarise an autopilot's log by the MAVLink that is made of it."""
     from gateway.recordings.workshop.convert import FlightToWrite
 
     flight = FlightToWrite([recording], options)
-    batches = flight.chosen()
-    found = _of_messages(flight.senders, batches, recording.path.stat().st_size)
+    found = of_messages(flight.senders, flight.chosen(), size, recording.kind)
     lacks = filter(None, [log.lacks for log in flight.logs])
-    return _with(found, recording, [*flight.remarks, *lacks])
+    return replace(found, info=replace(found.info, remarks=(*flight.remarks, *lacks)))

@@ -5,7 +5,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.rows import RowBuilder, row_to_line
-from gateway.recordings.summary import FileInfo, Rate, TableSummary, TlogSummary
+from gateway.recordings.summary import FileInfo, Rate, of_messages, of_rows
 from gateway.recordings.table import TableHeader, TableNote, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogScanner
 from gateway.wire.recorded_frames import RecordedFrame
@@ -32,17 +32,16 @@ def make_flight(seconds: int, system_id: int, gap_at: int | None = None) -> list
 
 
 def sum_up(data: bytes, chunk: int = 777) -> FileInfo:
-    summary, scanner = TlogSummary(senders_of(data)), TlogScanner()
-    for begin in range(0, len(data), chunk):
-        summary.add(scanner.feed(data[begin : begin + chunk]))
-    summary.add(scanner.feed(b"", final=True))
-    return summary.result(len(data)).info
+    scanner, begins = TlogScanner(), range(0, len(data), chunk)
+    batches = [scanner.feed(data[begin : begin + chunk]) for begin in begins]
+    batches.append(scanner.feed(b"", final=True))
+    return of_messages(senders_of(data), batches, len(data)).info
 
 
 def sum_up_table(data: bytes) -> FileInfo:
-    summary, reader = TableSummary(), TableReader()
-    summary.add(reader.feed_block(data, final=True), reader.header)
-    return summary.result(len(data)).info
+    reader = TableReader()
+    block = reader.feed_block(data, final=True)
+    return of_rows([block], lambda: reader.header, len(data)).info
 
 
 def test_tlog_is_summarised() -> None:
