@@ -170,7 +170,6 @@ class NewestRows:
     """The newest rows of a log, and the instance to read them from."""
 
     def __init__(self, log: AutopilotLog, max_age_us: int = MAX_AGE_US) -> None:
-        self.kind = log.kind
         self.now_us = 0
         self.instance: int | None = None
         """Instance to read; None for the primary one of each topic."""
@@ -207,7 +206,7 @@ class NewestRows:
         return self._primary.get(topic, 0)
 
     def value(self, topic: str, name: str) -> float:
-        """Return a field of the newest row; see `Context`."""
+        """Return a field of the newest row; see `ValueOf`."""
         instance = self.instance
         if instance is None:
             instance = self._primary.get(topic, 0)
@@ -251,7 +250,7 @@ class RecordTranslator:
             first = next((topic for topic in row.of if topic in log.present), None)
             if row.every_s is not None:
                 if not row.of or first is not None:
-                    bound = log.table.bind(row, row.name, log, log.kind)
+                    bound = log.table.bind(row, row.name, log)
                     self._repeated.append((row, bound))
             elif first is not None:
                 self._by_topic.setdefault(first, []).append(row)
@@ -294,28 +293,26 @@ class RecordTranslator:
             bound = self._bound_for(row, entry)
             if bound is not None:
                 self._newest.instance = entry.instance if row.each is not None else None
-                yield bound.packer(*bound.values(self._newest, self._times()))
+                yield self._packed(bound)
         self._newest.instance = None
 
     def _bound_for(self, row: MessageRow, entry: LogRow) -> BoundMessage | None:
         """Return the message for a row; None if the row is not of the primary instance."""
-        if row.each is None:
-            if entry.instance != self._newest.primary(entry.topic):
-                return None
-            name = row.name
-        elif row.each:
+        name = row.name
+        if row.each is None and entry.instance != self._newest.primary(entry.topic):
+            return None
+        if row.each:
             if not 0 <= entry.instance < len(row.each):
                 return None
             name = row.each[entry.instance]
-        else:
-            name = row.name
         key = (row.name, entry.instance)
         if key not in self._bound:
-            self._bound[key] = self._log.table.bind(row, name, self._log, self._log.kind)
+            self._bound[key] = self._log.table.bind(row, name, self._log)
         return self._bound[key]
 
-    def _times(self) -> dict[str, int]:
-        return {"time_boot_ms": self._own_us // 1000, "time_usec": self._own_us}
+    def _packed(self, bound: BoundMessage) -> Any:
+        times = {"time_boot_ms": self._own_us // 1000, "time_usec": self._own_us}
+        return bound.packer(*bound.values(self._newest.value, times))
 
     def _repeat(self, time_us: int) -> Iterator[Any]:
         """Yield the messages that are due at intervals; a gap in the log is not filled."""
@@ -330,7 +327,7 @@ class RecordTranslator:
                 continue
             interval_us = round((row.every_s or 1.0) * US_PER_S)
             self._due_us[number] = max(self._due_us[number] + interval_us, time_us)
-            yield bound.packer(*bound.values(self._newest, self._times()))
+            yield self._packed(bound)
 
     def _event(self, event: Event) -> Iterator[Any]:
         match event:

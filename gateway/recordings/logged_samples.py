@@ -17,7 +17,7 @@ from gateway.recordings.columns import (
     Codec,
 )
 from gateway.recordings.files import FlightError
-from gateway.recordings.message_table import MessageRow, bind_columns
+from gateway.recordings.message_table import MessageRow, bind_columns, first_known
 from gateway.recordings.recorded_clock import FIRST_CIVIL_US
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable, table_of_rows
 from gateway.recordings.rows import Imported, RowBuilder, TableRow
@@ -53,18 +53,15 @@ class _Sample:
         self._times = (f"{row.name}_time_us", f"{row.name}_node_time_us")
         self._reads = [
             (name, name in WHOLE_COLUMNS, reads)
-            for name, reads in bind_columns(row, columns, log, log.kind).items()
+            for name, reads in bind_columns(row, columns, log).items()
         ]
 
     def values(self, newest: NewestRows, time_us: int) -> dict[str, float]:
         """Return the values by column; an unknown one is NaN, or 0 if it is an integer."""
         found: dict[str, float] = self._empty | dict.fromkeys(self._times, time_us)
         for name, is_whole, reads in self._reads:
-            for read in reads:
-                value = read(newest)
-                if math.isfinite(value):
-                    found[name] = round(value) if is_whole else value
-                    break
+            if math.isfinite(value := first_known(reads, newest.value)):
+                found[name] = round(value) if is_whole else value
         return found
 
 

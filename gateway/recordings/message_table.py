@@ -21,7 +21,7 @@ that are fused: they keep the resolution of the log.
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
@@ -74,6 +74,9 @@ LEAST_PA: Final = 2000.0
 """Minimum pressure; smaller values are in hPa, as in `sensor_baro` before PX4 1.14. No aircraft
 flies that high."""
 Values = Mapping[str, Any]
+ValueOf = Callable[[str, str], float]
+"""Returns a field of the newest row of a topic; NaN if there is none, or it is too old."""
+Read = Callable[[ValueOf], float]
 _CALL: Final = re.compile(r"(?:(?P<kind>\w+): )?(?:(?P<function>\w+)\()?(?P<values>[^()]*)\)?")
 _VALUE: Final = re.compile(
     r"(?P<topic>\w+)\.(?P<name>[\w\[\].#]+)(?: (?:\*(?P<factor>[-\d.e]+)|(?P<unit>\S+)))?"
@@ -126,19 +129,11 @@ FUNCTIONS: Final[dict[str, Callable[..., float]]] = {
 """Functions of SI values; `compass`, `course` and `heading` are angles from north in [0, 2π)."""
 
 
-class Context(Protocol):
-    """The newest rows of a log and its facts, as the values of a message require them."""
+class LogFacts(Protocol):
+    """The facts of a log that binding a table requires."""
 
     kind: str
     """Kind of vehicle, as in the table: copter, plane, rover …; empty if it is not known."""
-
-    def value(self, topic: str, name: str) -> float:
-        """Return a field of the newest row of a topic; NaN if there is none, or it is too old."""
-        ...
-
-
-class LogFacts(Protocol):
-    """The facts of a log that binding a table requires."""
 
     @property
     def present(self) -> frozenset[str]:
@@ -148,9 +143,6 @@ class LogFacts(Protocol):
     def unit(self, topic: str, name: str) -> str | None:
         """Return the unit that the log itself states; None if it states none."""
         ...
-
-
-Read = Callable[[Context], float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,9 +193,9 @@ class Value:
         texts = [text for text in found["values"].split(", ") if text]
         return cls(tuple(map(LogField.parse, texts)), function, found["kind"] or "")
 
-    def bind(self, log: LogFacts, kind: str, factor: float) -> Read | None:
+    def bind(self, log: LogFacts, factor: float) -> Read | None:
         """Return a reader with a factor to SI; None if the log cannot contain the value."""
-        if self.kind not in ("", kind):
+        if self.kind not in ("", log.kind):
             return None
         if not self.sources:
             return lambda _: self.number
@@ -214,15 +206,15 @@ class Value:
         if not self.function:
             ((topic, name, scale),) = parts
             scale /= factor if self.sources[0].quantity else 1.0
-            return lambda context: context.value(topic, name) * scale
+            return lambda value_of: value_of(topic, name) * scale
         return _call(self.function, parts, needed, factor)
 
 
 def _call(name: str, parts: Sequence[tuple[str, str, float]], needed: int, factor: float) -> Read:
     function, turn = FUNCTIONS[name], round(TURN / factor) if name in WRAPPED else 0
 
-    def read(context: Context) -> float:
-        values = [context.value(topic, name) * scale for topic, name, scale in parts]
+    def read(value_of: ValueOf) -> float:
+        values = [value_of(topic, name) * scale for topic, name, scale in parts]
         if not all(map(math.isfinite, values[:needed])):
             return NAN
         found = function(*values) / factor
@@ -230,6 +222,16 @@ def _call(name: str, parts: Sequence[tuple[str, str, float]], needed: int, facto
         return found - turn if turn and turn > 1 and round(found) >= turn else found
 
     return read
+
+
+def first_known(reads: Iterable[Read], value_of: ValueOf) -> float:
+    """Return the first value that is known; otherwise the last one, which is not finite."""
+    value = NAN
+    for read in reads:
+        value = read(value_of)
+        if math.isfinite(value):
+            break
+    return value
 
 
 class MessageRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -251,15 +253,11 @@ class BoundMessage:
     reads: tuple[tuple[bool, tuple[Read, ...]], ...]
     """For each element in the order of the definition: whether it is an integer; its readers."""
 
-    def values(self, context: Context, times: Mapping[str, int]) -> list[float]:
+    def values(self, value_of: ValueOf, times: Mapping[str, int]) -> list[float]:
         """Return the values of all elements; an unknown one is NaN, or 0 for an integer."""
         found: list[float] = []
         for is_whole, reads in self.reads:
-            value = NAN if reads else 0.0
-            for read in reads:
-                value = read(context)
-                if math.isfinite(value):
-                    break
+            value = first_known(reads, value_of) if reads else 0.0
             if is_whole:
                 value = round(value) if math.isfinite(value) else 0
             found.append(value)
@@ -334,7 +332,7 @@ class MessageTable:
             found.setdefault(topic, set()).add(name)
         return found
 
-    def bind(self, row: MessageRow, name: str, log: LogFacts, kind: str) -> BoundMessage:
+    def bind(self, row: MessageRow, name: str, log: LogFacts) -> BoundMessage:
         """Bind a message to a log, under a name for an instance."""
         definition: Any = DEFINITIONS[MESSAGE_IDS[name]]
         lengths = dict(zip(definition.ordered_fieldnames, definition.array_lengths, strict=True))
@@ -348,24 +346,24 @@ class MessageTable:
                 timed.append((len(reads), one, UINT32 if types[one] == "uint32_t" else UINT64))
             for number in range(lengths[one] or 1):
                 given = row.fields.get(f"{one}.{number}", ()) + row.fields.get(one, ())
-                reads.append((types[one] != "float", _bound(given, log, kind, factor)))
+                reads.append((types[one] != "float", _bound(given, log, factor)))
         return BoundMessage(name, MessagePacker(definition), tuple(reads), tuple(timed))
 
 
 def bind_columns(
-    row: MessageRow, columns: Sequence[str], log: LogFacts, kind: str
+    row: MessageRow, columns: Sequence[str], log: LogFacts
 ) -> dict[str, tuple[Read, ...]]:
     """Bind a sample to a log: the readers of each of its columns."""
     return {
-        name: _bound(row.fields[name], log, kind, UNITS[unit][1] if unit else 1.0)
+        name: _bound(row.fields[name], log, UNITS[unit][1] if unit else 1.0)
         for name in columns
         for unit in (unit_of(name),)
         if name in row.fields
     }
 
 
-def _bound(given: Sequence[Value], log: LogFacts, kind: str, factor: float) -> tuple[Read, ...]:
-    return tuple(read for value in given if (read := value.bind(log, kind, factor)))
+def _bound(given: Sequence[Value], log: LogFacts, factor: float) -> tuple[Read, ...]:
+    return tuple(read for value in given if (read := value.bind(log, factor)))
 
 
 def read_table(text: bytes) -> MessageTable:
