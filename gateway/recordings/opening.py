@@ -65,21 +65,21 @@ class TlogFile:
                 self._file = os.dup(plain.fileno())
         self.index = TlogIndex(source.timeline)
         self._size = sys.maxsize
-        scanner = TlogScanner()
-        offset = 0
-        data = b" "
-        while data:
-            data = self.read(offset, READ_SIZE)
-            batch = source.timeline.apply(scanner.feed(data, final=not data))
+        for batch in map(source.timeline.apply, TlogScanner().feed_all(self._all(progress))):
             self.index.add(batch)
             if answers is not None:
                 answers.add(batch, self.index.senders)
+        self.remarks = [*source.remarks, *self.index.remarks]
+        """Remarks for the user on its times and its damage."""
+
+    def _all(self, progress: Progress | None) -> Iterator[bytes]:
+        """Read the whole file; records written later are not indexed, and not played."""
+        offset = 0
+        while data := self.read(offset, READ_SIZE):
+            yield data
             offset += len(data)
             if progress is not None:
                 progress(len(data))
-        self.remarks = [*source.remarks, *self.index.remarks]
-        """Remarks for the user on its times and its damage."""
-        # Records written from here on are not indexed, and not played.
         self._size = offset
 
     def read(self, offset: int, size: int) -> bytes:

@@ -196,13 +196,13 @@ class Track:
         return (edit_frame(read, system=system_id, drop_signature=True) or read).data
 
     def _read_from(self, offset: int) -> Iterator[Batch]:
-        scanner, timeline = TlogScanner(offset), self._source.index.timeline
-        size = SEEK_BYTES
-        while data := self._source.read(offset, size):
-            yield timeline.apply(scanner.feed(data))
-            offset += len(data)
-            size = BLOCK_BYTES
-        yield timeline.apply(scanner.feed(b"", final=True))
+        def chunks() -> Iterator[bytes]:
+            at, size = offset, SEEK_BYTES
+            while data := self._source.read(at, size):
+                yield data
+                at, size = at + len(data), BLOCK_BYTES
+
+        return map(self._source.index.timeline.apply, TlogScanner(offset).feed_all(chunks()))
 
 
 class PlayState(StrEnum):

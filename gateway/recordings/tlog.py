@@ -1,5 +1,6 @@
 """The tlog format: bytes to records, and records to bytes."""
 
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 import numpy as np
@@ -82,6 +83,11 @@ class TlogScanner:
             data, offset, starts, sizes, times, origins, message_ids, tuple(damage), mended,
             unfinished,
         )  # fmt: skip
+
+    def feed_all(self, chunks: Iterable[bytes]) -> Iterator[Batch]:
+        """Process the rest of the file."""
+        yield from map(self.feed, chunks)
+        yield self.feed(b"", final=True)
 
     def _mend(self, times: IntArray, following: bytes) -> int:
         """Replace damaged times, which no checksum detects, by that of the previous record."""

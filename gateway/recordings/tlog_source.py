@@ -62,9 +62,7 @@ class TlogSource:
     def batches(self, progress: Progress | None = None, *, strict: bool = False) -> Iterator[Batch]:
         """Read the file batch by batch, at corrected times; see `TlogScanner`."""
         scanner = TlogScanner(strict=strict)
-        for data in self.chunks(progress):
-            yield self.timeline.apply(scanner.feed(data))
-        yield self.timeline.apply(scanner.feed(b"", final=True))
+        return map(self.timeline.apply, scanner.feed_all(self.chunks(progress)))
 
     def _timed(self, data: Iterator[bytes]) -> Iterator[bytes]:
         clock = FrameClock(by_size=self.by_size)

@@ -322,7 +322,5 @@ def by_time(
 
 def batched(records: Iterable[RecordedFrame]) -> Iterator[Batch]:
     """Put records into batches."""
-    scanner, rest = TlogScanner(), iter(records)
-    while piece := b"".join(encode_record(r.time_us, r.frame) for r in islice(rest, PIECE)):
-        yield scanner.feed(piece)
-    yield scanner.feed(b"", final=True)
+    encoded = (encode_record(record.time_us, record.frame) for record in records)
+    return TlogScanner().feed_all(iter(lambda: b"".join(islice(encoded, PIECE)), b""))
