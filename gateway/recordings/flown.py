@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from gateway.recordings.columns import FloatArray
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import Samples, samples_of
 from gateway.recordings.recorded_fusion import aircraft_for
@@ -16,17 +15,12 @@ from gateway.recordings.recording import open_recordings
 from gateway.recordings.workshop.joining import joined_rows
 from gateway.records import BaroSample
 from gateway.simulator.recorded import RecordedFlight
-from gateway.units import DEG_PER_DEGE7, US_PER_S
+from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
 
 log = logging.getLogger(__name__)
 
-COLUMNS: Final = (
-    *("time_s", "ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "baro_alt_m"),
-    *("gps_time_s", "gps_lat", "gps_lon", "gps_alt_m", "gps_vn", "gps_ve", "gps_vd"),
-)
-BARO: Final = COLUMNS.index("baro_alt_m")
-GPS: Final = COLUMNS.index("gps_time_s")
-IMU: Final = slice(1, BARO)
+FIX_COLUMNS: Final = 7
+"""Time, latitude, longitude, altitude, velocity."""
 
 
 def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
@@ -37,37 +31,54 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
     recordings = open_recordings(files)
     table = joined_rows(recordings, options)
     aircraft = aircraft_for(recordings[0], table, options)
-    cells = _cells(samples_of(table.blocks, aircraft.calibration))
+    samples = samples_of(table.blocks, aircraft.calibration)
     for remark in table.remarks:
         log.warning(remark)
     latency_s = aircraft.estimation.reference.gps_latency_s
-    try:
-        return RecordedFlight.from_columns(dict(zip(COLUMNS, cells.T, strict=True)), latency_s)
-    except ValueError as error:
-        raise FlightError(f"{files[0]}: {error}") from error
+    found = _flight_of(samples, latency_s)
+    if (count := len(found.time_s)) < 2:
+        rows = counted(count, "row")
+        raise FlightError(f"{files[0]}: {rows} with acceleration and rate; a flight has more")
+    return found
 
 
-def _cells(samples: Samples) -> FloatArray:
-    """Return samples in the order of `COLUMNS`; records between two samples go with the later one.
+def _flight_of(samples: Samples, latency_s: float) -> RecordedFlight:
+    """Return samples as a flight; records between two samples go with the later one.
 
-    A sample that is not later than all before it is left out.
+    Left out are samples that are not later than all before them, and fixes from before the start,
+    which have no time on the nodes' clocks.
     """
     imu = samples.imu
     newest_us = np.maximum.accumulate(imu.time_us)
     kept = np.flatnonzero(np.diff(newest_us, prepend=newest_us[:1] - 1) > 0)
-    cells = np.full((len(kept), len(COLUMNS)), np.nan)
-    cells[:, 0] = imu.time_us[kept] / US_PER_S
-    cells[:, IMU] = np.column_stack([imu.accel_b_mps2, imu.gyro_b_radps, imu.mag_b_ut])[kept]
+    baro_alt_m, found = np.full(len(kept), np.nan), dict[int, tuple[float, ...]]()
     for before, record in samples.aiding:
         row = int(np.searchsorted(kept, before))
         if row == len(kept):
             break
         if isinstance(record, BaroSample):
-            cells[row, BARO] = record.alt_pressure_m
+            baro_alt_m[row] = record.alt_pressure_m
         elif record.fix_ok:
             position = (record.lat_dege7 * DEG_PER_DEGE7, record.lon_dege7 * DEG_PER_DEGE7)
             # A receiver sends a complete velocity or none; speed and course are horizontal.
             north_mps, east_mps, down_mps = record.vel_n_mps
             velocity = (north_mps, east_mps, 0.0 if math.isnan(down_mps) else down_mps)
-            cells[row, GPS:] = (record.time_us / US_PER_S, *position, record.alt_amsl_m, *velocity)
-    return cells
+            found[row] = (record.time_us / US_PER_S, *position, record.alt_amsl_m, *velocity)
+    is_usable = np.isfinite(imu.accel_b_mps2[kept] + imu.gyro_b_radps[kept]).all(axis=1)
+    kept, baro_alt_m = kept[is_usable], baro_alt_m[is_usable]
+    time_s = imu.time_us[kept] / US_PER_S
+    begin_s = time_s.min(initial=np.inf)
+    fixes = np.array([fix for fix in found.values() if fix[0] >= begin_s]).reshape(-1, FIX_COLUMNS)
+    return RecordedFlight(
+        time_s=time_s - begin_s,
+        accel_b_mps2=imu.accel_b_mps2[kept],
+        gyro_b_radps=imu.gyro_b_radps[kept],
+        mag_b_ut=imu.mag_b_ut[kept],
+        baro_alt_m=baro_alt_m,
+        gps_time_s=np.maximum.accumulate(fixes[:, 0] - begin_s),
+        gps_lat_deg=fixes[:, 1],
+        gps_lon_deg=fixes[:, 2],
+        gps_alt_m=fixes[:, 3],
+        gps_vel_n_mps=fixes[:, 4:],
+        gps_latency_s=latency_s,
+    )

@@ -8,7 +8,7 @@ and face up. Barometer heights are converted to pressures of the standard atmosp
 import dataclasses
 import heapq
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, count
 from operator import attrgetter
@@ -48,7 +48,7 @@ from gateway.simulator.sensors import (
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.simulator.trajectory import FloatArray
-from gateway.units import STANDARD_GRAVITY_MPS2, UT_PER_GAUSS, counted
+from gateway.units import STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
 from gateway.wire.payloads import ACCEL_RANGES_G, HMC5883L_LSB_PER_GAUSS
 
 ROWS: Final = 2048
@@ -62,9 +62,6 @@ PDOP: Final = 1.8
 """PDOP of fixes if the recording has none."""
 UNKNOWN: Final = UINT16_MAX / 100.0
 TAIL_S: Final = 0.5
-
-GPS_COLUMNS: Final = ("gps_time_s", "gps_lat", "gps_lon")
-IMU_COLUMNS: Final = ("time_s", "ax", "ay", "az", "gx", "gy", "gz")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,51 +96,6 @@ class RecordedFlight:
     def rate_hz(self) -> float:
         """Usual sample rate of the IMU."""
         return 1.0 / float(np.median(np.diff(self.time_s)))
-
-    @staticmethod
-    def from_columns(
-        columns: Mapping[str, FloatArray], gps_latency_s: float = 0.2
-    ) -> "RecordedFlight":
-        """Build a flight from the columns of a log, each (N,), where NaN means no new value.
-
-        `IMU_COLUMNS` in s, m/s2 and rad/s are required. Optional: `mx` `my` `mz` in uT,
-        `baro_alt_m`, `GPS_COLUMNS`, `gps_alt_m`, `gps_vn` `gps_ve` `gps_vd`. Raises ValueError if a
-        column is missing, there are fewer than two rows, or time does not increase.
-        """
-        missing = [name for name in IMU_COLUMNS if name not in columns]
-        if missing:
-            raise ValueError(f"columns missing: {', '.join(missing)}")
-        blank = np.full_like(columns["time_s"], np.nan)
-
-        def stack(*names: str) -> FloatArray:
-            return np.column_stack([columns.get(name, blank) for name in names])
-
-        inertial = stack("ax", "ay", "az", "gx", "gy", "gz")
-        usable = np.isfinite(columns["time_s"]) & _complete(inertial)
-        time_s = columns["time_s"][usable]
-        if len(time_s) < 2:
-            rows = counted(len(time_s), "row")
-            raise ValueError(f"{rows} with acceleration and rate; a flight has more")
-        if (np.diff(time_s) <= 0.0).any():
-            at_s = time_s[int(np.argmax(np.diff(time_s) <= 0.0)) + 1]
-            raise ValueError(f"time_s decreases at {at_s} s")
-        begin_s = time_s[0]
-        fixes = _complete(stack(*GPS_COLUMNS))
-        # A fix before the first sample has no time on the nodes' clocks.
-        fixes &= columns.get("gps_time_s", blank) >= begin_s
-        return RecordedFlight(
-            time_s=time_s - begin_s,
-            accel_b_mps2=inertial[usable, :3],
-            gyro_b_radps=inertial[usable, 3:],
-            mag_b_ut=stack("mx", "my", "mz")[usable],
-            baro_alt_m=columns.get("baro_alt_m", blank)[usable],
-            gps_time_s=np.maximum.accumulate(columns.get("gps_time_s", blank)[fixes] - begin_s),
-            gps_lat_deg=columns.get("gps_lat", blank)[fixes],
-            gps_lon_deg=columns.get("gps_lon", blank)[fixes],
-            gps_alt_m=columns.get("gps_alt_m", blank)[fixes],
-            gps_vel_n_mps=stack("gps_vn", "gps_ve", "gps_vd")[fixes],
-            gps_latency_s=gps_latency_s,
-        )
 
 
 def in_rounds(

@@ -1,9 +1,11 @@
 """Any recording becomes a flight that the simulated receiver sends again."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.columns import COLUMNS
@@ -11,6 +13,7 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
 from gateway.recordings.rows import row_to_line
 from gateway.recordings.table import encode_head
+from gateway.records import NAN
 from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.mavlink import packed
 from tests.kit.recordings import START_US, make_records, write_table, write_tlog
@@ -34,6 +37,31 @@ def test_recording_of_two_parts_is_opened_as_one_flight(tmp_path: Path) -> None:
     assert 0 < len(flight.gps_time_s) <= len(fixes)
     assert flight.gps_lat_deg[-1] == pytest.approx(fixes[-1].lat_dege7 * 1e-7)
     assert np.isfinite(flight.baro_alt_m).sum() > 10
+
+
+def test_early_fixes_and_late_or_incomplete_samples_are_left_out(tmp_path: Path) -> None:
+    header, rows = read(flown_table(5))
+    path = tmp_path / "a.csv"
+    whole = open_flown([write_table(path, header, rows)], OPTIONS)
+    fixed = [k for k, row in enumerate(rows) if row.gps is not None and row.gps.fix_ok]
+    early = {"time_us": rows[0].time_us - 1}
+    for number, changes in ((fixed[0], early), (fixed[2], {"fix_ok": False})):
+        rows[number] = replace(rows[number], gps=structs.replace(rows[number].gps, **changes))
+    number, sample = next((k, row.imu) for k, row in enumerate(rows) if k > 60 and row.imu)
+    incomplete = structs.replace(sample, accel_b_mps2=(0.1, NAN, -9.8))
+    rows[number] = replace(rows[number], raw=None, imu=incomplete)
+    rows.insert(number + 5, rows[number + 3])
+    flight = open_flown([write_table(path, header, rows)], OPTIONS)
+    left_out = int(np.searchsorted(whole.time_s, (sample.time_us - rows[0].time_us) / 1e6))
+    np.testing.assert_array_equal(flight.time_s, np.delete(whole.time_s, left_out))
+    np.testing.assert_array_equal(flight.gps_time_s, np.delete(whole.gps_time_s, [0, 2]))
+
+
+def test_single_sample_is_no_flight(tmp_path: Path) -> None:
+    header, rows = read(flown_table(1))
+    sample = next(row for row in rows if row.imu is not None)
+    with pytest.raises(FlightError, match="1 row with acceleration and rate; a flight has more"):
+        open_flown([write_table(tmp_path / "a.csv", header, [sample])], OPTIONS)
 
 
 def test_raw_counts_are_calibrated(tmp_path: Path) -> None:
