@@ -125,11 +125,8 @@ def read_pilot_flight(files: Sequence[Path], options: ReadOptions, name: str) ->
     flight = FlightToWrite(open_recordings(files), options)
     if not flight.has_messages:
         return pilot_flight_of(joined_rows(flight.recordings, options), name)
-    batches = flight.chosen()
     found = MessageTally(flight.senders, with_attitude=True)
-    for batch in batches:
-        found.add(batch)
-    found.flush()
+    found.add_all(flight.chosen())
     known = [found.vehicles[number] for number in sorted(found.vehicles)]
     if options.system_id in found.vehicles:
         known = [found.vehicles[options.system_id]]

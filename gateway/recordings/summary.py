@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
@@ -101,14 +101,17 @@ def of_messages(
     """Summarise MAVLink in a file of that size."""
     index, tally, span = TlogIndex(), MessageTally(senders), TimesSpan()
     counts: Counter[tuple[int, int]] = Counter()
-    for batch in batches:
-        index.add(batch)
-        span.add_all(batch.time_us)
-        keys = (batch.origins >> 8) << 24 | batch.message_ids
-        for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
-            counts[int(key) >> 24, int(key) & 0xFFFFFF] += int(count)
-        tally.add(batch)
-    tally.flush()
+
+    def counting() -> Iterator[Batch]:
+        for batch in batches:
+            index.add(batch)
+            span.add_all(batch.time_us)
+            keys = (batch.origins >> 8) << 24 | batch.message_ids
+            for key, count in zip(*np.unique(keys, return_counts=True), strict=True):
+                counts[int(key) >> 24, int(key) & 0xFFFFFF] += int(count)
+            yield batch
+
+    tally.add_all(counting())
     duration_s = span.length_us / US_PER_S
     systems: defaultdict[int, list[Rate]] = defaultdict(list)
     for (system_id, key), count in sorted(counts.items()):

@@ -213,30 +213,28 @@ class VehicleTally(FlightTally):
 
 
 class MessageTally:
-    """Collect the facts of all vehicles of a recording from its MAVLink, batch by batch."""
+    """Collect the facts of all vehicles of a recording, or of one, from its MAVLink."""
 
-    def __init__(self, senders: Senders, *, with_attitude: bool = False) -> None:
-        self._reader = VehicleReader(senders, FACT_IDS, with_attitude=with_attitude)
+    def __init__(
+        self, senders: Senders, vehicle_id: int | None = None, *, with_attitude: bool = False
+    ) -> None:
+        self._reader = VehicleReader(senders, FACT_IDS, vehicle_id, with_attitude=with_attitude)
         self.vehicles = {
             system: VehicleTally(senders.vehicle(system), with_attitude=with_attitude)
-            for system in senders.systems()
+            for system in (senders.systems() if vehicle_id is None else [vehicle_id])
         }
         """Tallies by system id."""
 
-    def add(self, batch: Batch) -> None:
-        """Add the next batch of the file."""
-        for tally in self.vehicles.values() if len(batch) else ():
-            tally.add_batch(batch)
-        self._update(self._reader.feed_batch(batch))
-
-    def flush(self) -> None:
-        """Add the texts that will not be continued."""
-        self._update(self._reader.flush())
-
-    def _update(self, messages: Iterable[VehicleMessage]) -> None:
-        for message in messages:
+    def add_all(self, batches: Iterable[Batch]) -> None:
+        """Add the batches of the whole file."""
+        for message in self._reader.messages(map(self._added, batches)):
             if (tally := self.vehicles.get(message.system_id)) is not None:
                 tally.update(message)
+
+    def _added(self, batch: Batch) -> Batch:
+        for tally in self.vehicles.values() if len(batch) else ():
+            tally.add_batch(batch)
+        return batch
 
 
 class RowTally(FlightTally):

@@ -11,7 +11,7 @@ from gateway.answers.log_answers import AUTOPILOT_VERSION_ID
 from gateway.printable import printable
 from gateway.recordings.files import FlightError
 from gateway.recordings.flight_facts import FlightFacts
-from gateway.recordings.tallies import FACT_IDS, VehicleTally
+from gateway.recordings.tallies import MessageTally
 from gateway.recordings.workshop.convert import FlightToWrite
 from gateway.recordings.workshop.extracts import RecordedPlan, parameter_text
 from gateway.vehicle.plan import KINDS, Item
@@ -142,14 +142,9 @@ def read_param_file(path: Path) -> Contents:
 
 def read_recording(name: str, flight: FlightToWrite) -> Contents:
     """Read the compared content of a recording; raises FlightError if it has no vehicle."""
-    reader = flight.reader_of_vehicle(FACT_IDS)
-    tally = VehicleTally(reader.vehicle(flight.vehicle_id))
-    for batch in flight.answered():
-        tally.add_batch(batch)
-        for message in reader.feed_batch(batch):
-            tally.update(message)
-    for message in reader.flush():
-        tally.update(message)
+    tallies = MessageTally(flight.senders, flight.vehicle_id)
+    tallies.add_all(flight.answered())
+    tally = tallies.vehicles[flight.vehicle_id]
     found = contents_of(name, flight.plan)
     found.figures |= figures_of(tally.facts())
     found.texts, found.is_flight = {text for _, _, text in tally.texts}, True

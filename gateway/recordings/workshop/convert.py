@@ -221,13 +221,10 @@ class FlightToWrite:
             answers.add(batch, self.senders)
             yield batch
 
-    def reader_of_vehicle(self, wanted: Iterable[int]) -> VehicleReader:
-        """Return a reader of positions, texts and wanted messages of the vehicle."""
-        return VehicleReader(self.senders, wanted, self.vehicle_id, with_attitude=False)
-
     def messages_of_vehicle(self, wanted: Iterable[int]) -> Iterator[VehicleMessage]:
-        """Yield the messages of `reader_of_vehicle` in the records of `answered`."""
-        return self.reader_of_vehicle(wanted).messages(self.answered())
+        """Yield positions, texts and wanted messages of the vehicle, by `answered`."""
+        reader = VehicleReader(self.senders, wanted, self.vehicle_id, with_attitude=False)
+        return reader.messages(self.answered())
 
     def vehicle_messages(
         self, wanted: Iterable[int] = (), system_id: int | None = None
