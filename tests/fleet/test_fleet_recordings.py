@@ -131,33 +131,6 @@ class TestOverTheSession:
         assert offsets == sorted(offsets)
         assert offsets.count(0) == 1, "none from the start"
 
-    async def test_stopped_fetch_continues(
-        self, world: World, folder: Path, tmp_path: Path
-    ) -> None:
-        await opened(world, folder)
-        asked: list[int] = []
-        ask = over(world)
-
-        def recorded(verb: str, params: dict[str, Any], wait_s: float) -> Any:
-            asked.append(params.get("offset", -1))
-            if len(asked) == 5:
-                raise ControlError("stopped")
-            return ask(verb, params, wait_s)
-
-        async def fetch() -> Any:
-            one = RecordingFetch("field-a", tmp_path / "fetched", recorded)
-            return await result_of(world, one.fetch, NAME, SIZE, lambda _: None)
-
-        with pytest.raises(ControlError):
-            await fetch()
-        have = (tmp_path / "fetched" / f".{NAME}.part").stat().st_size
-        assert 0 < have < SIZE
-        del asked[:]
-        asked += [-1] * 5
-        assert await fetch() is True
-        assert min(offset for offset in asked if offset >= 0) == have
-        assert (tmp_path / "fetched" / NAME).read_bytes() == CONTENT
-
     async def test_untrusting_site_offers_no_recordings(self, world: World, folder: Path) -> None:
         world.open_site("field-a", recordings=folder)
         await world.until(world.systems)
@@ -297,6 +270,22 @@ class TestFetch:
         assert not (tmp_path / NAME).exists()
         assert self.fetch(tmp_path, Site())
         assert (tmp_path / NAME).read_bytes() == CONTENT[:10_000]
+
+    def test_stopped_fetch_continues(self, tmp_path: Path) -> None:
+        site = Site()
+
+        def stopping(*asked: Any) -> Any:
+            if len(site.asked) == 3:
+                raise ControlError("stopped")
+            return site(*asked)
+
+        with pytest.raises(ControlError):
+            self.fetch(tmp_path, stopping, SIZE)
+        have = (tmp_path / f".{NAME}.part").stat().st_size
+        assert have == sum(size for _, size in site.asked) < SIZE
+        assert self.fetch(tmp_path, site, SIZE)
+        assert site.asked[3][0] == have
+        assert (tmp_path / NAME).read_bytes() == CONTENT
 
     def test_grown_recording_is_continued(self, tmp_path: Path) -> None:
         site = Site()

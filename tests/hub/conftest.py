@@ -1,5 +1,5 @@
 """Fixtures of the hub's tests."""
 
-from tests.kit.hub import rig
+from tests.kit.hub import loop_errors, rig
 
-__all__ = ["rig"]
+__all__ = ["loop_errors", "rig"]

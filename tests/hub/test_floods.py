@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import itertools
 import socket
 from typing import Any
 
@@ -39,22 +38,6 @@ def taken(hub: Hub) -> int:
     """Return the bytes that were read from untrusted clients, or from all."""
     clients = hub.clients()
     return sum(each.bytes_received for each in [c for c in clients if not c.trusted] or clients)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-async def test_one_wake_up_reads_a_bounded_part_of_a_flood(rig: Any, kind: str) -> None:
-    hub = rig.hub(f"{kind}:127.0.0.1:0")
-    sock = await caller(rig, kind, hub.listening_ports()[0])
-    seen = [taken(hub)]
-    for _ in range(20):
-        send(sock)
-
-    def is_all_read() -> bool:
-        seen.append(taken(hub))
-        return seen[-1] >= seen[0] + 20 * len(NOISE)
-
-    await rig.until(is_all_read)
-    assert max(after - before for before, after in itertools.pairwise(seen)) <= READ_BYTES
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -108,16 +91,13 @@ async def test_client_that_becomes_trusted_is_read_at_once(
 
 
 async def test_untrusted_client_that_leaves_while_it_waits_is_not_read_again(
-    rig: Any, paused: tuple[Hub, socket.socket], loop_time: LoopTime
+    rig: Any, paused: tuple[Hub, socket.socket], loop_time: LoopTime, loop_errors: list[Any]
 ) -> None:
     hub, _ = paused
-    errors: list[Any] = []
-    loop = asyncio.get_running_loop()
-    loop.set_exception_handler(lambda _, context: errors.append(context))
     hub.remove("tcp-listen:127.0.0.1:0")
     assert not hub.clients()
     # The pause is over.
     rig.clock.now_us += 10_000_000
     loop_time.ahead_s = 3600.0
     await rig.quiet()
-    assert errors == []
+    assert loop_errors == []

@@ -85,24 +85,20 @@ async def test_interface_outage_loses_no_frame_of_other_clients(
 
 @pytest.mark.parametrize("kind", ["udp", "tcp"])
 async def test_invalid_name_is_reported_as_unresolved(
-    rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
+    rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch, loop_errors: list[Any]
 ) -> None:
-    errors: list[Any] = []
-    loop = asyncio.get_running_loop()
-    loop.set_exception_handler(lambda _, context: errors.append(context))
-
     async def choke(*_: object, **__: object) -> None:
         raise UnicodeError("label empty or too long")
 
-    monkeypatch.setattr(loop, "getaddrinfo", choke)
+    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", choke)
     hub = rig.hub(f"{kind}:no-such-place.invalid:14550")
     await rig.until(lambda: hub.clients()[0].reason != "")
-    assert (hub.clients()[0].state, errors) == ("resolving", [])
+    assert (hub.clients()[0].state, loop_errors) == ("resolving", [])
 
 
-async def test_truncated_heartbeats_are_accepted_without_error(rig: Any) -> None:
-    errors: list[Any] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
+async def test_truncated_heartbeats_are_accepted_without_error(
+    rig: Any, loop_errors: list[Any]
+) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no")
     caller = rig.station(hub.listening_ports()[0])
     for length in range(10):
@@ -111,7 +107,7 @@ async def test_truncated_heartbeats_are_accepted_without_error(rig: Any) -> None
         crc = mcrf4xx(CRC_EXTRA[0], mcrf4xx(body))
         caller.send(b"\xfd" + body + crc.to_bytes(2, "little"))
     await rig.until(lambda: len(rig.incoming) == 10)
-    assert errors == []
+    assert loop_errors == []
 
 
 async def test_unlimited_new_clients_do_not_flood_the_log(

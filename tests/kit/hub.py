@@ -281,6 +281,14 @@ class Rig:
 
 
 @pytest.fixture
+async def loop_errors() -> list[Any]:
+    """Errors that the event loop has reported."""
+    errors: list[Any] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
+    return errors
+
+
+@pytest.fixture
 async def rig() -> AsyncIterator[Rig]:
     rig = Rig()
     yield rig

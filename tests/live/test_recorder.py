@@ -299,15 +299,6 @@ async def test_save_renames_a_running_recording(make_bench: MakeBench) -> None:
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-async def test_recording_wanted_at_start_misses_no_frame(make_bench: MakeBench) -> None:
-    bench = make_bench()
-    bench.recorder.start()
-    assert bench.recorder.status().state == "recording"
-    bench.send(FRAMES)
-    bench.recorder.close()
-    assert frames_of(bench.recorder.folder) == FRAMES
-
-
 @pytest.mark.parametrize("mode", ["always", "armed"])
 async def test_runs_of_the_hub_are_recorded_in_order_with_frames(
     make_bench: MakeBench, mode: str

@@ -122,41 +122,27 @@ def test_kernel_grants_realtime_priority_to_the_calling_thread_only() -> None:
 S = 1_000_000
 
 
-def call(lag: LoopLag, now_us: int, due_us: int) -> tuple[int, bool]:
-    """Return the duration of a stall, and whether the state has changed."""
-    lag.expect(due_us)
-    was_slow = lag.is_slow
-    return lag.update(now_us), lag.is_slow != was_slow
+TIMES: dict[str, list[tuple[int, int, int, bool]]] = {
+    "short delays are normal": [
+        (n * S // 10, 50_000 if n % 5 == 0 else 1_000, 0, False) for n in range(1000)
+    ],
+    "stall at the start is normal": [(0, 0, 0, False), (2 * S, 2 * S, 2 * S, False)],
+    "stall is reported until a minute without one": [
+        (2 * S, 2 * S, 2 * S, False), (10 * S, 3 * S, 3 * S, True), (15 * S, S, S, True),
+        *((n * S, 0, 0, n < 83) for n in range(17, 120)),
+    ],
+    "many short delays mean that the computer is too slow": [
+        (n * S // 2, 300_000, 0, n >= 10) for n in range(100)
+    ],
+}  # fmt: skip
+"""When a call was due, its delay, the stall that it shows, and whether the loop is slow then."""
 
 
-def test_short_delays_are_normal() -> None:
-    lag = LoopLag()
-    for step in range(1000):
-        due_us = step * S // 10
-        report = call(lag, due_us + (50_000 if step % 5 == 0 else 1_000), due_us)
-        assert report == (0, False)
-    assert not lag.is_slow
-
-
-def test_stall_is_reported_once_until_a_minute_without_one() -> None:
-    lag = LoopLag()
-    call(lag, 0, 0)
-    report = call(lag, 4 * S, 2 * S)
-    assert report == (2 * S, False), "normal at the start"
-    report = call(lag, 13 * S, 10 * S)
-    assert (*report, lag.longest_us) == (3 * S, True, 3 * S)
-    report = call(lag, 16 * S, 15 * S)
-    assert (*report, lag.longest_us) == (1 * S, False, 3 * S)
-    changes = [call(lag, step * S, step * S)[1] for step in range(17, 120)]
-    assert changes.count(True) == 1
-    assert not lag.is_slow
-
-
-def test_many_short_delays_mean_that_the_computer_is_too_slow() -> None:
-    lag = LoopLag()
-    changes = []
-    for step in range(100):
-        due_us = step * S // 2
-        changes.append(call(lag, due_us + 300_000, due_us)[1])
-    assert changes.count(True) == 1
-    assert lag.is_slow
+@pytest.mark.parametrize("name", TIMES)
+def test_stalls_and_many_delays_are_noticed(name: str) -> None:
+    lag, longest_us = LoopLag(), 0
+    for due_us, delay_us, stall_us, is_slow in TIMES[name]:
+        lag.expect(due_us)
+        assert (lag.update(due_us + delay_us), lag.is_slow) == (stall_us, is_slow), due_us
+        longest_us = max(longest_us, delay_us if is_slow else 0)
+    assert lag.longest_us == longest_us
