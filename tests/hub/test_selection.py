@@ -1,8 +1,6 @@
 """A client behind `systems=1` reaches system 1 and no other, with every message of the dialect."""
 
-import asyncio
 import json
-import socket
 from collections.abc import Awaitable, Callable
 from functools import cache
 from typing import Any
@@ -10,6 +8,8 @@ from unittest.mock import MagicMock
 
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
+from wsproto import ConnectionType, WSConnection
+from wsproto.events import BytesMessage, Request
 
 from gateway.hub.hub import Hub
 from gateway.hub.systems import HARMLESS, SystemFilter
@@ -18,7 +18,7 @@ from gateway.wire.mavlink_json import template
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import MavFrame, frame_of, to_mavlink1
 from gateway.wire.vehicle_inputs import acts
-from tests.kit.hub import Rig, Station
+from tests.kit.hub import Rig, Station, receive
 from tests.kit.mavlink import STATION, every_message, packed, sent_by
 from tests.kit.messages import beat
 
@@ -65,8 +65,11 @@ class Bench:
         sock = await self.rig.connect(hub.listening_ports()[0])
         if kind == "tcp":
             return hub, _each(sock.send)
-        await _shake_hands(sock)
-        return hub, _each(lambda data: sock.send(_masked(data)))
+        web = WSConnection(ConnectionType.CLIENT)
+        sock.send(web.send(Request(host="127.0.0.1", target="/")))
+        web.receive_data(await receive(sock))
+        assert [*web.events()]
+        return hub, _each(lambda data: sock.send(web.send(BytesMessage(data=data))))
 
     async def report(self, number: int, state: str) -> None:
         """Send the frames of a vehicle in a state."""
@@ -113,21 +116,6 @@ def _rest(station: Station) -> Send:
             api._answer(json.dumps({"header": header, "message": message}), systems)
 
     return post_all
-
-
-def _masked(data: bytes) -> bytes:
-    """Return a binary WebSocket message; a mask of zeros changes nothing."""
-    size = len(data)
-    length = bytes((0x80 | size,)) if size < 126 else b"\xfe" + size.to_bytes(2, "big")
-    return b"\x82" + length + bytes(4) + data
-
-
-async def _shake_hands(sock: socket.socket) -> None:
-    sock.send(
-        b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-    )
-    await asyncio.get_running_loop().sock_recv(sock, 4096)
 
 
 @pytest.mark.parametrize("state", ["unheard", "heartbeat", "telemetry"])

@@ -1,13 +1,14 @@
 """A `mavgate` command as its users start it: a process of its own, its output in a file."""
 
 import asyncio
+import contextlib
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -37,6 +38,16 @@ def python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
     """Run Python to its end, with options of `subprocess.run`; by default it must succeed."""
     plain = {"capture_output": True, "text": True, "check": True}
     return subprocess.run([sys.executable, *map(str, words)], **plain | options)
+
+
+@contextlib.contextmanager
+def running(*words: object) -> Iterator[subprocess.Popen[bytes]]:
+    """Run another program meanwhile."""
+    with subprocess.Popen([*map(str, words)], stderr=subprocess.DEVNULL) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 class Process:

@@ -19,7 +19,7 @@ from gateway.outputs import mqtt
 from gateway.outputs.mqtt import MAX_WAITING
 from gateway.units import US_PER_S
 from tests.kit.messages import at, beat, gps
-from tests.kit.process import START_LIMIT_S
+from tests.kit.process import START_LIMIT_S, running
 from tests.outputs.conftest import OutputRig
 from tests.ports import free_ports
 
@@ -52,7 +52,7 @@ class Mosquitto:
             # Another user could not read these files; this one need not be root.
             f"user {getpass.getuser()}\n"
         )
-        self.process = subprocess.Popen(["mosquitto", "-c", settings], stderr=subprocess.DEVNULL)
+        self.words = "mosquitto", "-c", settings
 
     async def subscriber(self) -> aiomqtt.Client:
         async with asyncio.timeout(START_LIMIT_S):
@@ -63,7 +63,6 @@ class Mosquitto:
                 try:
                     await client.__aenter__()
                 except aiomqtt.MqttError:
-                    assert self.process.poll() is None, "mosquitto has ended"
                     await asyncio.sleep(0.01)
                     continue
                 await client.subscribe("#")
@@ -73,9 +72,8 @@ class Mosquitto:
 @pytest.fixture
 async def broker(tmp_path: Path, certificate: Path) -> AsyncIterator[Mosquitto]:
     made = Mosquitto(tmp_path, certificate)
-    yield made
-    made.process.kill()
-    made.process.wait()
+    with running(*made.words):
+        yield made
 
 
 async def next_of(client: aiomqtt.Client) -> tuple[str, Any, bool]:

@@ -3,7 +3,6 @@
 import asyncio
 import json
 import shutil
-import subprocess
 from typing import Any
 
 import pytest
@@ -15,7 +14,7 @@ from gateway.units import US_PER_S
 from gateway.vehicle_state.newest import POSITION_OLD_US
 from tests.kit.hub import receive
 from tests.kit.messages import HERE, at, beat, estimator, gps
-from tests.kit.process import START_LIMIT_S
+from tests.kit.process import START_LIMIT_S, running
 from tests.outputs.conftest import OutputRig, connected
 from tests.ports import free_port
 
@@ -158,15 +157,9 @@ async def test_listening_port_serves_several_clients(outputs: OutputRig) -> None
 @pytest.mark.skipif(shutil.which("gpsd") is None, reason="needs gpsd")
 async def test_gpsd_reports_the_position(outputs: OutputRig) -> None:
     (_, source), port = await listening(outputs), free_port()
-    daemon = subprocess.Popen(
-        ["gpsd", "-N", "-n", "-b", "-S", str(port), f"tcp://127.0.0.1:{source}"]
-    )
-    try:
+    with running("gpsd", "-N", "-n", "-b", "-S", port, f"tcp://127.0.0.1:{source}"):
         async with asyncio.timeout(START_LIMIT_S):
             report = await first_fix(outputs, port)
-    finally:
-        daemon.kill()
-        daemon.wait()
     assert (report["lat"], report["lon"]) == pytest.approx(HERE[:2], abs=2e-7)
     assert report["altMSL"] == pytest.approx(488.1)
     assert report["geoidSep"] == pytest.approx(47.5)

@@ -5,8 +5,8 @@ import math
 import os
 import pty
 import shutil
-import subprocess
 import tty
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -17,7 +17,7 @@ from gateway.vehicle_state.antenna import AntennaStation, Pointing, pointing_of
 from gateway.vehicle_state.newest import NewestState
 from gateway.vehicle_state.positions import Position
 from tests.kit.messages import HERE, at, beat, gps, home
-from tests.kit.process import START_LIMIT_S
+from tests.kit.process import START_LIMIT_S, running, until
 from tests.outputs.conftest import OutputRig, connected
 from tests.ports import free_port
 
@@ -124,8 +124,7 @@ class TestHamlib:
 
     async def test_rotctld_turns_the_antenna_to_the_vehicle(self, outputs: OutputRig) -> None:
         port = free_port()
-        daemon = subprocess.Popen(["rotctld", "-m", "1", "-T", "127.0.0.1", "-t", str(port)])
-        try:
+        with running("rotctld", "-m", 1, "-T", "127.0.0.1", "-t", port):
             async with asyncio.timeout(START_LIMIT_S):
                 before = await self.ask(port, "p\n", 2)
                 options = "protocol=rotctld&station=47.3977420,-8.6,488.13"
@@ -134,9 +133,6 @@ class TestHamlib:
                 outputs.turn()
                 while (now := await self.ask(port, "p\n", 2)) == before:
                     await asyncio.sleep(0.01)
-        finally:
-            daemon.kill()
-            daemon.wait()
         # The dummy turns slowly from north; it is on its way to the east and up.
         assert float(now[0]) > float(before[0]) or float(now[1]) > float(before[1])
 
@@ -147,24 +143,19 @@ class TestHamlib:
         os.set_blocking(main, False)
         port = free_port()
         device = os.ttyname(line)
-        daemon = subprocess.Popen(
-            ["rotctld", "-m", model, "-r", device, "-T", "127.0.0.1", "-t", str(port)]
-        )
-        expected, received = command(protocol, Pointing(124.0, 45.0, 1e3)), b""
-        asking = asyncio.get_running_loop().create_task(self.ask(port, "P 124.0 45.0\n", 1))
-        try:
-            async with asyncio.timeout(START_LIMIT_S):
-                while expected not in received:
-                    try:
-                        received += os.read(main, 4096)
-                    except BlockingIOError:
-                        await asyncio.sleep(0.01)
-        finally:
+        expected, received = command(protocol, Pointing(124.0, 45.0, 1e3)), bytearray()
+
+        def is_received() -> bool:
+            with suppress(BlockingIOError):
+                received.extend(os.read(main, 4096))
+            return expected in received
+
+        with running("rotctld", "-m", model, "-r", device, "-T", "127.0.0.1", "-t", port):
+            asking = asyncio.get_running_loop().create_task(self.ask(port, "P 124.0 45.0\n", 1))
+            await until(is_received, 0.01)
             asking.cancel()
             await asyncio.wait([asking])
             # The connection closes in the next turn of the loop.
             await asyncio.sleep(0)
-            daemon.kill()
-            daemon.wait()
-            for end in (main, line):
-                os.close(end)
+        for end in (main, line):
+            os.close(end)
