@@ -1,4 +1,4 @@
-"""Access control of the page: hosts, origins, roles, and size limits.
+"""Access control of the page: hosts, origins, roles, size limits, and headers of responses.
 
 Any page that the operator's browser has open may send requests to this one. Two headers that no
 page can forge distinguish them: `Host`, which must be a name of ours (against DNS rebinding), and
@@ -7,14 +7,15 @@ page can forge distinguish them: `Host`, which must be a name of ours (against D
 
 import asyncio
 import re
-from collections.abc import Callable
+import secrets
+from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager, nullcontext, suppress
 from http import HTTPStatus
 from typing import Final
 from urllib.parse import parse_qs
 from weakref import WeakValueDictionary
 
-from starlette.datastructures import Headers
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect, Request, cookie_parser
@@ -27,7 +28,6 @@ from gateway.panel.admission import Holder, address_group
 from gateway.panel.connections import Client
 from gateway.panel.logins import BusyError, Logins
 from gateway.panel.panel_settings import PanelSettings
-from gateway.panel.response_headers import with_headers
 
 COOKIE: Final = "mavgate_panel"
 ROLE: Final = "mavgate.role"
@@ -55,6 +55,26 @@ PIECE: Final = 1 << 16
 """Bytes of an answer that are handed to the connection at once."""
 WRITE_S: Final = 30.0
 """Timeout of sending a piece, since a slow client occupies memory."""
+NO_SCRIPT_POLICY: Final = (
+    "default-src 'none'; style-src 'self'; img-src 'self'; form-action 'self'; base-uri 'none'; "
+    "frame-ancestors 'none'"
+)
+"""Content-Security-Policy of every response without its own one (see `ScriptNonces`)."""
+HEADERS: Final = {
+    "x-frame-options": "DENY",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(), geolocation=(), microphone=(), usb=(), serial=()",
+}
+POLICY: Final = (
+    "default-src 'none'; script-src 'self' 'nonce-{nonce}' 'unsafe-eval'; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+    "connect-src 'self'; worker-src 'self' blob:; manifest-src 'self'; form-action 'self'; "
+    "base-uri 'none'; object-src 'none'; frame-ancestors 'none'"
+)
+SCRIPT: Final = re.compile(rb"<script(?=[\s>])")
 
 LOGIN_PAGE: Final = """<!doctype html><html lang="en"><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1"><title>mavgate</title>
@@ -381,3 +401,54 @@ def _token(headers: Headers) -> str:
         if (token := cookie_parser(value).get(COOKIE)) is not None:
             return token
     return ""
+
+
+def with_headers(send: Send, added: Mapping[str, str] = HEADERS) -> Send:
+    """Return a `send` that adds headers to a response, by default those for security."""
+
+    async def with_added(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            headers.update(added)
+            headers.setdefault("content-security-policy", NO_SCRIPT_POLICY)
+        await send(message)
+
+    return with_added
+
+
+class ScriptNonces:
+    """ASGI middleware that gives the scripts of an HTML page a nonce."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, with the policy."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        nonce = secrets.token_urlsafe(16)
+        begin: Message | None = None
+        body = b""
+
+        async def with_added(message: Message) -> None:
+            nonlocal begin, body
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                if headers.get("content-type", "").startswith("text/html"):
+                    begin = message
+                    return
+            if begin is None:
+                await send(message)
+                return
+            body += message.get("body", b"")
+            if message.get("more_body"):
+                return
+            body = SCRIPT.sub(b'<script nonce="' + nonce.encode() + b'"', body)
+            headers = MutableHeaders(scope=begin)
+            headers["content-length"] = str(len(body))
+            headers["content-security-policy"] = POLICY.format(nonce=nonce)
+            await send(begin)
+            await send({"type": "http.response.body", "body": body})
+
+        await self.app(scope, receive, with_added)

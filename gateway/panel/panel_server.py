@@ -25,7 +25,7 @@ from starlette.staticfiles import StaticFiles
 from gateway.clock import GatewayClock
 from gateway.hub.stats import LogRateLimiter
 from gateway.live.terminal import on_end_signals, on_parent_gone
-from gateway.panel.access import HOLDER, ROLE, AccessControl
+from gateway.panel.access import HOLDER, ROLE, AccessControl, ScriptNonces
 from gateway.panel.connections import ConnectionLimits, LimitedProtocol, LimitedServer
 from gateway.panel.dialogues import Dialogues
 from gateway.panel.logins import Logins
@@ -37,7 +37,6 @@ from gateway.panel.pointing_api import pointing_router
 from gateway.panel.push_api import push_router
 from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.recording_transfer import add_recording_files
-from gateway.panel.response_headers import ScriptNonces
 from gateway.panel.rest_api import RestApi
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.telemetry_feed import PATH, TelemetryFeed, add_tracks

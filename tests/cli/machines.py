@@ -23,7 +23,6 @@ import pytest
 
 from gateway.aircraft import Aircraft, AircraftSettings
 from gateway.cli.live import calibrate, doctor, first_start
-from gateway.cli.support import phone
 from gateway.clock import GatewayClock
 from gateway.compiled.entry_point import LibraryError
 from gateway.config import GatewaySettings
@@ -212,7 +211,7 @@ def receiver(folder: Path, kind: str = "", *, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(calibrate, "GatewayClock", FastClock)
     monkeypatch.setattr(calibrate, "PtyPort", fast_port)
     monkeypatch.setattr(first_start, "GPS_WAIT_S", 0.5)
-    monkeypatch.setattr(phone, "own_address", lambda: "192.168.1.20")
+    monkeypatch.setattr(first_start, "_own_address", lambda: "192.168.1.20")
     (folder / "g.toml").write_text(AIRCRAFT)
     if not kind:
         yield

@@ -21,11 +21,18 @@ from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from gateway.panel import access, logins
-from gateway.panel.access import COOKIE, MAX_BODY, MAX_LOGIN_BODY, ROLE, AccessControl
+from gateway.panel.access import (
+    COOKIE,
+    HEADERS,
+    MAX_BODY,
+    MAX_LOGIN_BODY,
+    ROLE,
+    AccessControl,
+    ScriptNonces,
+)
 from gateway.panel.logins import MAX_ATTEMPTS, Logins, hash_password, matches
 from gateway.panel.panel_server import PageErrors, PanelError, tls_files, without_traceback
 from gateway.panel.panel_settings import PanelSettings
-from gateway.panel.response_headers import HEADERS, ScriptNonces
 from tests.conftest import ManualClock
 from tests.panel.web_client import OPERATOR, VIEWER, write_certificate
 
