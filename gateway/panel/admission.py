@@ -42,7 +42,7 @@ LOCAL: Final = Holder(Role.OPERATOR, "", "")
 
 
 @dataclass(slots=True)
-class Places(Generic[Item]):
+class Slots(Generic[Item]):
     """Slots for one kind of items, with their holders; see the rule in the module's docstring."""
 
     of_session: int

@@ -1,7 +1,7 @@
 """Connections to the panel: slots by role, header timeouts, and clients that do not read.
 
 Any client can open connections and send nothing. A connection has no holder until a request on it
-has passed access control; see `Places` for the limits. Each must send a complete request header
+has passed access control; see `Slots` for the limits. Each must send a complete request header
 in time, of a limited size.
 """
 
@@ -17,7 +17,7 @@ import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from gateway.hub.transports.sockets import accept_each
-from gateway.panel.admission import Holder, Places, address_group
+from gateway.panel.admission import Holder, Slots, address_group
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +40,7 @@ class ConnectionLimits:
 
     def __init__(self) -> None:
         self._sockets: dict[Client, socket.socket] = {}
-        self._places: Places[Client] = Places(
+        self._slots: Slots[Client] = Slots(
             CONNECTIONS_OF_SESSION, CONNECTIONS_OF_ADDRESS, CONNECTIONS_OF_ROLE, self.shut
         )
 
@@ -48,19 +48,19 @@ class ConnectionLimits:
         """Add a connection; an older one without a holder may be closed for it."""
         for other in [other for other, each in self._sockets.items() if each.fileno() < 0]:
             del self._sockets[other]
-            self._places.release(other)
+            self._slots.release(other)
         self._sockets[client] = sock
-        self._places.admit(client, Holder(None, "", address_group(client[0])))
+        self._slots.admit(client, Holder(None, "", address_group(client[0])))
 
     def authenticate(self, client: Client, holder: Holder) -> None:
         """Set the holder of a connection on which a request has passed access control."""
-        if client in self._sockets and self._places.holder(client) != holder:
-            self._places.admit(client, holder)
+        if client in self._sockets and self._slots.holder(client) != holder:
+            self._slots.admit(client, holder)
 
     def shut(self, client: Client) -> None:
         """Close a connection, and discard data that waits to be sent."""
         sock = self._sockets.pop(client, None)
-        self._places.release(client)
+        self._slots.release(client)
         with suppress(OSError):
             # The peer may have closed it already.
             if sock is not None:

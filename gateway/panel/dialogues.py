@@ -15,7 +15,7 @@ from gateway.panel.state import parameters
 from gateway.panel.state.calibration import CalibrationRun, CalibrationStep, RunState
 from gateway.panel.state.commands import command_long
 from gateway.panel.state.fleet import FleetState
-from gateway.panel.uplink import BackgroundTask
+from gateway.panel.uplink import LoopTask
 
 POLL_S: Final = 0.05
 SAMPLES_US: Final = 20_000
@@ -119,7 +119,7 @@ class Dialogue:
             self._read(following)
 
 
-class Dialogues(BackgroundTask):
+class Dialogues(LoopTask):
     """The dialogues with all aircraft."""
 
     def __init__(

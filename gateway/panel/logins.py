@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.hub.endpoint import is_loopback
-from gateway.panel.admission import Holder, Places, Role, address_group
+from gateway.panel.admission import Holder, Role, Slots, address_group
 
 COST: Final = 1 << 15
 """scrypt's N, with r = 8 and p = 1: 32 MB and some 0.1 s for each login."""
@@ -91,7 +91,7 @@ class Logins:
     on_close: Callable[[str], object] = lambda _: None
     """Called with the token of a session that has ended, for any reason."""
     _sessions: dict[str, tuple[Role, float]] = field(default_factory=dict)
-    _places: Places[str] = field(init=False)
+    _slots: Slots[str] = field(init=False)
     _attempts: dict[str, deque[float]] = field(default_factory=dict)
     _hashing: FairTurns = field(default_factory=FairTurns)
     _known: dict[str, None] = field(default_factory=dict)
@@ -99,7 +99,7 @@ class Logins:
 
     def __post_init__(self) -> None:
         """Create the slots of the sessions."""
-        self._places = Places(
+        self._slots = Slots(
             SESSIONS_OF_ROLE, SESSIONS_OF_ADDRESS, SESSIONS_OF_ROLE, self.close_session
         )
 
@@ -156,13 +156,13 @@ class Logins:
     def open_session(self, role: Role, host: str) -> str:
         """Open a session and return its token; an older one of the role may be ended for it."""
         token = secrets.token_urlsafe(32)
-        self._places.admit(token, Holder(role, token, address_group(host)))
+        self._slots.admit(token, Holder(role, token, address_group(host)))
         self._sessions[token] = (role, time.monotonic() + SESSION_S)
         return token
 
     def close_session(self, token: str) -> None:
         """End a session."""
-        self._places.release(token)
+        self._slots.release(token)
         if self._sessions.pop(token, None) is not None:
             self.on_close(token)
 

@@ -12,7 +12,7 @@ from urllib.parse import parse_qs
 from nicegui import Client, core
 
 from gateway.panel.access import HOLDER
-from gateway.panel.admission import Holder, Places
+from gateway.panel.admission import Holder, Slots
 
 PENDING_OF_SESSION: Final = 8
 """Maximum pages of a session that are loading: a browser may restore some tabs at once."""
@@ -29,7 +29,7 @@ class OpenPages:
     def __init__(self) -> None:
         self._pages: dict[str, tuple[Client, Holder]] = {}
         """Pages and their holders by the id of the page."""
-        self._pending: Places[str] = Places(
+        self._pending: Slots[str] = Slots(
             PENDING_OF_SESSION, PENDING_OF_ADDRESS, PENDING_OF_ROLE, self._delete
         )
 

@@ -26,7 +26,7 @@ from starlette.background import BackgroundTask
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
 from gateway.live.terminal import own_command
-from gateway.panel.admission import LOCAL, Holder, Places, Role
+from gateway.panel.admission import LOCAL, Holder, Role, Slots
 from gateway.recordings.index import Recording, find_recording
 
 log = logging.getLogger(__name__)
@@ -110,9 +110,7 @@ class RecordingJobs:
     def __init__(self) -> None:
         self._exports: dict[Hashable, _Export] = {}
         """Exports by role, recording and kind, oldest first."""
-        self._places: Places[Hashable] = Places(
-            EXPORTS_OF_SESSION, EXPORTS_OF_ROLE, EXPORTS_OF_ROLE
-        )
+        self._slots: Slots[Hashable] = Slots(EXPORTS_OF_SESSION, EXPORTS_OF_ROLE, EXPORTS_OF_ROLE)
         self._folder: Path | None = None
         self._exporting: dict[Role | None, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._indexing: asyncio.Task[None] | None = None
@@ -142,7 +140,7 @@ class RecordingJobs:
         key = (holder.role, order, recording.size, recording.modified_s)
         export = self._exports.get(key)
         if export is None:
-            if not self._places.admit(key, holder):
+            if not self._slots.admit(key, holder):
                 raise ExportError("other exports are being made; try again in a while")
             export = self._exports[key] = _Export(holder.role)
             export.task = asyncio.create_task(self._export(key, export, order))
@@ -201,7 +199,7 @@ class RecordingJobs:
             self._exports.pop(key, None)
             raise
         finally:
-            self._places.release(key)
+            self._slots.release(key)
         export.token, export.size = token, target.stat().st_size
         self._make_room(export)
         asyncio.get_running_loop().call_later(KEPT_S, self._delete, key, export)

@@ -72,7 +72,7 @@ class ControlClient:
         )
 
 
-class BackgroundTask:
+class LoopTask:
     """A coroutine, `_run`, that runs from `start` to `close`."""
 
     _task: asyncio.Task[None] | None = None
@@ -90,7 +90,7 @@ class BackgroundTask:
         raise NotImplementedError
 
 
-class GatewayWatch(BackgroundTask):
+class GatewayWatch(LoopTask):
     """The newest answers of the gateway on this machine."""
 
     def __init__(self, control: ControlClient, fleet: FleetState) -> None:
@@ -136,7 +136,7 @@ class CommandFailedError(Exception):
     """A command was refused or not answered; the text gives the reason."""
 
 
-class Uplink(BackgroundTask):
+class Uplink(LoopTask):
     """Frames in, requests out."""
 
     def __init__(

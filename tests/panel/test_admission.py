@@ -1,4 +1,4 @@
-"""Places by role, session and address; logins, pages and answers that share them."""
+"""Slots by role, session and address; logins, pages and answers that share them."""
 
 import asyncio
 import itertools
@@ -9,7 +9,7 @@ import pytest
 from nicegui import core
 
 from gateway.panel.access import HOLDER
-from gateway.panel.admission import Holder, Places, Role
+from gateway.panel.admission import Holder, Role, Slots
 from gateway.panel.logins import SESSIONS_OF_ROLE, BusyError, FairTurns, Logins, hash_password
 from gateway.panel.open_pages import PENDING_OF_SESSION, OpenPages
 
@@ -47,14 +47,14 @@ def test_newcomer_takes_a_place_of_its_kind(
     before: list[Holder], newcomer: Holder, evicted: list[int]
 ) -> None:
     gone: list[int] = []
-    places: Places[int] = Places(2, 3, 5, gone.append)
-    waiting: Places[int] = Places(2, 3, 5)
+    slots: Slots[int] = Slots(2, 3, 5, gone.append)
+    waiting: Slots[int] = Slots(2, 3, 5)
     for number, each in enumerate(before):
-        assert places.admit(number, each)
+        assert slots.admit(number, each)
         waiting.admit(number, each)
-    assert places.admit(99, newcomer)
+    assert slots.admit(99, newcomer)
     assert gone == evicted
-    held = {each for each in (*range(len(before)), 99) if places.holder(each)}
+    held = {each for each in (*range(len(before)), 99) if slots.holder(each)}
     assert held == {*range(len(before)), 99} - {*evicted}
     assert waiting.admit(99, newcomer) == (not evicted)
 
