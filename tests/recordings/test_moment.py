@@ -21,6 +21,7 @@ DAY_US = 86_400_000_000
         ("1970-01-02", Moment(time_us=DAY_US)),
         ("1970-01-02T02:00:00+02:00", Moment(time_us=DAY_US)),
     ],
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_moment_is_parsed_in_every_notation(text: str, moment: Moment) -> None:
     assert parse_moment(text) == moment

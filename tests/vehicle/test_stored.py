@@ -40,7 +40,11 @@ def random_plan(seed: int) -> StoredPlan:
     return StoredPlan(mission=tuple(items))
 
 
-@pytest.mark.parametrize("plan", [StoredPlan(), FULL, *map(random_plan, range(2))])
+@pytest.mark.parametrize(
+    "plan",
+    [StoredPlan(), FULL, *map(random_plan, range(2))],
+    ids=["empty", "full", "long", "other"],
+)
 def test_decoded_plan_equals_the_encoded_one(plan: StoredPlan) -> None:
     # NaN is not equal to itself.
     assert repr(decode_plan(encode_plan(plan))) == repr(plan)

@@ -281,6 +281,12 @@ ZERO = pytest.approx((0.0, 0.0), abs=1e-5)
 INT_ZERO = pytest.approx((0, 0), abs=64)
 
 
+def named(value: Any) -> str:
+    """Name a message in the id of a case."""
+    name = value.get_type() if hasattr(value, "get_type") else str(value)
+    return f"{name} {value.command}" if hasattr(value, "command") else name
+
+
 def long(command: int, *params: float) -> Any:
     return mavlink.MAVLink_command_long_message(1, 1, command, 0, *params)
 
@@ -319,6 +325,7 @@ def integer(command: int, frame: int, *params: float) -> Any:
         (mavlink.MAVLink_safety_allowed_area_message(1, 47.3, 8.5, 0, 50, 60, 99),
          "p1x p1y", (pytest.approx(47.3), 8.5)),
     ],
+    ids=named,
 )  # fmt: skip
 def test_coordinates_of_commands_are_moved_by_their_meaning(
     message: Any, names: str, expected: Any
