@@ -16,7 +16,7 @@ from gateway.recordings.recorded_table import header_for
 from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.mavlink import STATION, Sender, read_back
 from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, write_table, write_tlog
-from tests.recordings.flights import OPTIONS, flown_table, fly, make_flight, read
+from tests.recordings.flights import OPTIONS, fly, make_flight, read
 
 pytestmark = pytest.mark.io
 
@@ -66,15 +66,6 @@ def test_other_recordings_get_separate_vehicles(tmp_path: Path) -> None:
     # Flights of other days begin together.
     assert [track.first_us for flight in flights for track in flight.tracks] == [START_US] * 3
     assert [flight.shift_us for flight in flights] == [0, -200 * STEP_US, 0]
-
-
-def test_parts_of_a_table_are_fused_as_one(tmp_path: Path) -> None:
-    header, rows = read(flown_table(10))
-    first = write_table(tmp_path / "a_01_v1.csv", header, rows[:200])
-    second = write_table(tmp_path / "a_02_v1.csv", header, rows[200:])
-    (flight,) = laid_out([first, second])
-    (track,) = flight.tracks
-    assert track.last_us == rows[-1].time_us
 
 
 def test_fused_flight_answers_with_the_settings_of_its_fusion(

@@ -99,9 +99,6 @@ def test_level_and_nose_up_poses_give_the_mounting(seed: int, pitch_deg: float) 
     raised_s = mounting.T @ np.array([G * np.sin(pitch), 0.0, -G * np.cos(pitch)])
     found = solver.solve_mounting(tuple(level_s), tuple(raised_s))
     np.testing.assert_allclose(found, mounting, atol=1e-9)
-
-
-def test_face_up_board_is_the_default_mounting() -> None:
     np.testing.assert_allclose(solver.solve_mounting((0, 0, G), (5.0, 0, 8.0)), FACE_UP, atol=1e-12)
 
 

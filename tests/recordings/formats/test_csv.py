@@ -42,19 +42,16 @@ def test_line_with_all_columns_is_read() -> None:
     assert row.raw is row.state is None
 
 
-def test_missing_velocity_is_computed_from_speed_and_course() -> None:
-    _, rows = read("1.5,0,0,-9.8,0,0,0,,,,,1.45,47.1,8.5,430,,,,,5,120")
+def test_blank_cells_give_no_records_and_the_velocity_is_that_of_speed_and_course() -> None:
+    _, rows = read(
+        "1.5,0,0,-9.8,0,0,0,,,,,1.45,47.1,8.5,430,,,,,5,120",
+        "1.5,0.1,0.2,-9.8,0.01,0.02,0.03,,,,,,,,,,,,",
+    )
     north, east, down = rows[0].gps.vel_n_mps
     assert (north, east) == pytest.approx((-2.5, 4.330127), abs=1e-6)
     assert math.isnan(down)
-
-
-def test_blank_cells_give_no_records() -> None:
-    _, rows = read("1.5,0.1,0.2,-9.8,0.01,0.02,0.03,,,,,,,,,,,,")
-    (row,) = rows
-    assert row.imu.mag_b_ut is None
-    assert row.imu.flags is ImuFlags(0)
-    assert row.baro is row.gps is None
+    assert (rows[1].imu.mag_b_ut, rows[1].imu.flags) == (None, ImuFlags(0))
+    assert rows[1].baro is rows[1].gps is None
 
 
 PLAIN = "1.5,0,0,-9.8,0,0,0,20,5,-40,500,1.45,47.1,8.5,430,1,2,3,hi,5,120"

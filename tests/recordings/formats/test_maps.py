@@ -50,7 +50,7 @@ KML = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/e
 GPX = {"g": "http://www.topografix.com/GPX/1/1", "a": "urn:mavgate:attitude:1"}
 
 
-def test_kml_contains_every_vehicle_with_times_and_attitude() -> None:
+def test_kml_contains_every_vehicle_with_times_attitude_and_markers() -> None:
     root = ET.fromstring("".join(to_kml("flight", VEHICLES)))
     assert [e.text for e in root.findall(".//k:Folder/k:name", KML)] == [
         "wood & <field>", "system 7",
@@ -70,10 +70,6 @@ def test_kml_contains_every_vehicle_with_times_and_attitude() -> None:
     used = [e.text for e in root.findall(".//k:styleUrl", KML)]
     assert len(set(used)) == 2
     assert {(style or "#")[1:] for style in used} <= styles
-
-
-def test_kml_contains_home_marks_and_events() -> None:
-    root = ET.fromstring("".join(to_kml("flight", VEHICLES)))
     found = [
         (p.findtext("k:description", namespaces=KML), p.findtext("k:name", namespaces=KML),
          p.findtext("k:Point/k:coordinates", namespaces=KML))

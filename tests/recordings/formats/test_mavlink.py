@@ -81,11 +81,8 @@ def test_highres_imu_is_read_in_si_units() -> None:
     assert imu.mag_b_ut == pytest.approx((20.0, 5.0, -40.0))
     assert imu.temperature_degc == pytest.approx(21.5)
     assert imu.flags is ImuFlags.MAG_NEW
-
-
-def test_magnetometer_without_a_new_sample_is_left_out() -> None:
     (imu,) = of_kind(ImuCalibrated, [(0, highres(0, updated=0b111111))])
-    assert imu.mag_b_ut is None
+    assert imu.mag_b_ut is None, "no new sample"
 
 
 def test_raw_and_scaled_imu_are_read_in_thousandths() -> None:

@@ -17,6 +17,11 @@ from tests.conftest import ManualClock
 from tests.kit.ground_station import FtpClient, GroundStation, load_parameters
 
 GENERAL = b"/general.json"
+KEYS = {
+    "name", "type", "shortDesc", "longDesc", "units", "default", "decimalPlaces", "min", "max",
+    "increment", "rebootRequired", "group", "category", "volatile", "values", "bitmask",
+}  # fmt: skip
+"""Of the schema of metadata of parameters."""
 
 
 @pytest.fixture
@@ -46,6 +51,11 @@ def test_metadata_is_announced_and_describes_every_parameter(ftp: FtpClient, los
     ftp.station.loses = lambda *_: False
     parameters = {p["name"]: p for p in json.loads(lzma.decompress(described))["parameters"]}
     assert set(parameters) == set(load_parameters(ftp.station))
+    for parameter in parameters.values():
+        assert set(parameter) <= KEYS
+        assert parameter["type"] == ("Int32" if "values" in parameter else parameter["type"])
+        assert len(parameter["name"]) <= 16
+        assert all(len(each["description"]) <= 100 for each in parameter.get("values", ()))
     cutoff = parameters["TUNING_CUTOFF"]
     assert (cutoff["min"], cutoff["max"], cutoff["units"]) == (0.1, 500, "Hz")
     assert (cutoff["default"], cutoff["decimalPlaces"]) == (10.0, 4)
@@ -66,19 +76,6 @@ def test_vehicles_announce_files_of_different_names(clock: ManualClock) -> None:
         uris.append(announced.payload[8:108].rstrip(b"\0"))
         uris += [kind["uri"] for kind in json.loads(ftp.read(uris[-1]))["metadataTypes"]]
     assert len(set(uris)) == 4
-
-
-def test_metadata_has_only_keys_of_the_schema(ftp: FtpClient) -> None:
-    allowed = {
-        "name", "type", "shortDesc", "longDesc", "units", "default", "decimalPlaces", "min", "max",
-        "increment", "rebootRequired", "group", "category", "volatile", "values", "bitmask",
-    }  # fmt: skip
-    for parameter in json.loads(lzma.decompress(ftp.read(b"parameter.json.xz")))["parameters"]:
-        assert set(parameter) <= allowed
-        assert parameter["type"] == ("Int32" if "values" in parameter else parameter["type"])
-        assert len(parameter["name"]) <= 16
-        assert len(parameter["shortDesc"]) <= 100
-        assert all(len(value["description"]) <= 100 for value in parameter.get("values", ()))
 
 
 def test_parameter_metadata_of_the_gateway_is_small() -> None:
