@@ -30,7 +30,7 @@ import msgspec
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import cores
-from gateway.analysis.simulated import ideal_calibration, received
+from gateway.analysis.simulated import received
 from gateway.analysis.sweep import parse_axis
 from gateway.batch.catalogue import CATALOGUE_NAME, find_flights, geojson_of, index_folder
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
@@ -39,6 +39,7 @@ from gateway.batch.tasks import EvaluateTask, FlightTask, ResultFolder, SweepTas
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, encode_head
+from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S
@@ -214,7 +215,7 @@ def _name(number: int) -> str:
 def simulated_rows(seed: int, duration_s: float) -> tuple[TableHeader, str]:
     """Return the header and the rows of a table of the simulated flight."""
     settings = SimulatorSettings(seed=seed)
-    calibration = ideal_calibration(SimulatedAircraft(settings).errors)
+    calibration = NodeCalibration(**SimulatedAircraft(settings).errors)
     rows = "".join(map(line_of, received(settings, duration_s)))
     return header_for(AircraftSettings(calibration=calibration), 1), rows
 

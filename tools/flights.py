@@ -2,7 +2,7 @@
 
 import math
 import re
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -193,7 +193,7 @@ def simulated_flight(seed: int, *, calibrated: bool) -> Flight:
     The magnetometer is always calibrated, the inertial sensors if `calibrated`.
     """
     flown = fly(SimulatorSettings(seed=seed))
-    ideal = asdict(flown.errors)
+    ideal = flown.errors
     known = ideal if calibrated else {k: v for k, v in ideal.items() if k.startswith("mag")}
     chain = SensorChain(NodeCalibration(**known))
     settings = ReferenceSettings(gps_latency_s=flown.settings.gps_latency_s)

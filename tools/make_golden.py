@@ -44,7 +44,7 @@ def write_log(path: Path) -> None:
     errors = flown.errors
     chain = SensorChain(
         NodeCalibration(
-            mag_hard_iron_ut=errors.mag_hard_iron_ut, mag_soft_iron=errors.mag_soft_iron
+            mag_hard_iron_ut=errors["mag_hard_iron_ut"], mag_soft_iron=errors["mag_soft_iron"]
         ),
     )
     text = io.StringIO()

@@ -21,11 +21,9 @@ from gateway.simulator.sensors import (
     BaroSamples,
     DeviceClock,
     ImuSamples,
-    IntArray,
-    SensorErrors,
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.simulator.trajectory import FLIGHT_S, FloatArray, Trajectory
+from gateway.simulator.trajectory import FLIGHT_S, Trajectory
 from gateway.units import DEGE7_PER_DEG
 from gateway.wire.payloads import ACCEL_RANGES_G, GYRO_RANGES_DPS, MAG_LSB_PER_GAUSS
 
@@ -39,8 +37,8 @@ class SimulatedFlight:
     settings: SimulatorSettings
     vehicle_id: int
     trajectory: Trajectory
-    """`trajectory.truth_at(times)` is exact at any time, and gives `imu.truth` and `baro.truth`."""
-    errors: SensorErrors
+    """`trajectory.truth_at(times)` is exact at any time."""
+    errors: dict[str, Any]
     """Sensor errors, with the fields of a node's calibration."""
     imu: ImuSamples
     baro: BaroSamples
@@ -61,11 +59,7 @@ class SimulatedFlight:
 
     def _imu_records(self) -> Iterator[ImuRaw]:
         node, imu = NodeId(self.vehicle_id, IMU_NODE), self.imu
-        columns = (
-            _to_us(imu.time_s), imu.node_time_us, imu.accel_raw, imu.gyro_raw, imu.mag_raw,
-            imu.temperature_raw, imu.flags,
-        )  # fmt: skip
-        for time_us, node_us, accel, gyro, mag, temperature, flags in _rows(*columns):
+        for time_us, node_us, accel, gyro, mag, temperature, flags in _rows(imu):
             yield ImuRaw(
                 time_us=time_us,
                 node=node,
@@ -82,8 +76,7 @@ class SimulatedFlight:
 
     def _baro_records(self) -> Iterator[BaroRaw]:
         node, baro = NodeId(self.vehicle_id, IMU_NODE), self.baro
-        columns = (_to_us(baro.time_s), baro.node_time_us, baro.pressure_pa, baro.temperature_degc)
-        for time_us, node_us, pressure_pa, temperature_degc in _rows(*columns):
+        for time_us, node_us, pressure_pa, temperature_degc in _rows(baro):
             yield BaroRaw(time_us, node, node_us, pressure_pa, temperature_degc)
 
     def _gps_records(self) -> Iterator[GpsFix]:
@@ -133,9 +126,7 @@ def _time_of(record: SampleRecord) -> int:
     return record.time_us
 
 
-def _to_us(time_s: FloatArray) -> IntArray:
-    return np.rint(time_s * 1e6).astype(np.int64)
-
-
-def _rows(*columns: FloatArray | IntArray) -> Iterator[tuple[Any, ...]]:
+def _rows(samples: ImuSamples | BaroSamples) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of samples, with the time in µs."""
+    columns = (np.rint(samples.time_s * 1e6).astype(np.int64), *samples[1:])
     return zip(*(column.tolist() for column in columns), strict=True)

@@ -44,7 +44,7 @@ class FlightWorld:
         fast = msgspec.structs.replace(settings, imu_rate_hz=SAMPLE_HZ, clock_skew_ppm=0.0)
         self.aircraft = SimulatedAircraft(fast, start_unix_us=start_unix_us)
         self.start_s = start_s
-        self._geoid_separation_m = settings.geoid_separation_m
+        self._start_unix_us, self._geoid_separation_m = start_unix_us, settings.geoid_separation_m
         self.world = World(self.moment, self.solution, start_unix_us + round(start_s * 1e6))
         self._taken_s = self._gps_taken_s = 0.0
         self._moments: list[Moment] = []
@@ -88,7 +88,8 @@ class FlightWorld:
 
     def _take_gps(self, until_s: float) -> None:
         gps = self.aircraft.gps.take(until_s)
-        for k, valid_s in enumerate(gps.valid_time_s.tolist()):
+        for k, unix_us in enumerate(gps.unix_us.tolist()):
+            valid_s = (unix_us - self._start_unix_us) * 1e-6
             self._solutions[round(valid_s * GPS_RATE_HZ)] = Solution(
                 lat_deg=float(gps.lat_deg[k]),
                 lon_deg=float(gps.lon_deg[k]),

@@ -18,7 +18,6 @@ from gateway.records import BaroRaw, GpsFix, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
-from gateway.simulator.sensors import SensorErrors
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S, Trajectory
 from gateway.units import US_PER_S
@@ -44,7 +43,7 @@ def simulated_flight(
     rows = [row for record in received(settings, duration_s) for row in builder.add(record)]
     flight = flight_of_blocks(
         [block_of([*rows, *builder.flush()])],
-        ideal_calibration(aircraft.errors),
+        NodeCalibration(**aircraft.errors),
         with_reference(fusion or FusionSettings(), gps_latency_s=settings.gps_latency_s),
         name="simulated flight",
         description=SIMULATED_DESCRIPTION,
@@ -59,11 +58,6 @@ def received(settings: SimulatorSettings, duration_s: float) -> Iterator[ImuRaw 
         for record in link.feed(frame.data, round(frame.time_s * US_PER_S)):
             if isinstance(record, ImuRaw | BaroRaw | GpsFix):
                 yield record
-
-
-def ideal_calibration(errors: SensorErrors) -> NodeCalibration:
-    """Return the calibration that corrects the simulated sensors' constant errors."""
-    return msgspec.convert(errors, NodeCalibration, from_attributes=True)
 
 
 def _truth_of(trajectory: Trajectory, flight: Flight) -> Reference:

@@ -1,6 +1,6 @@
 """A simulated aircraft: its motion and the samplers of its sensors."""
 
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
@@ -10,7 +10,6 @@ from gateway.simulator.sensors import (
     Chance,
     DeviceClock,
     ImuSampler,
-    SensorErrors,
     errors_of,
     generator,
 )
@@ -52,6 +51,6 @@ class SimulatedAircraft:
         self.gps_clock = DeviceClock(GPS_BOOT_US, -settings.clock_skew_ppm)
 
     @property
-    def errors(self) -> SensorErrors:
-        """Constant errors of this aircraft's sensors, as their ideal calibration."""
+    def errors(self) -> dict[str, Any]:
+        """Constant errors of this aircraft's sensors; see `errors_of`."""
         return errors_of(self.imu.inertial, self.imu.magnetometer)

@@ -60,8 +60,6 @@ class GpsSamples:
 
     time_s: FloatArray
     """Time of arrival at the node: true time since the start."""
-    valid_time_s: FloatArray
-    """Time of validity of the fix, which is earlier than `time_s` by the latency."""
     itow_ms: IntArray
     unix_us: IntArray
     """UTC of the fix, µs since 1970."""
@@ -123,7 +121,6 @@ class GpsSampler:
         ground_mps = np.maximum(np.hypot(vel_n_mps[:, 0], vel_n_mps[:, 1]), 1e-3)
         return GpsSamples(
             time_s=valid_s + np.maximum(s.gps_latency_s + jitter_s, MIN_LATENCY_S),
-            valid_time_s=valid_s,
             itow_ms=itow_ms_of(unix_us),
             unix_us=unix_us,
             time_valid=valid_s >= s.gps_first_fix_s - TIME_KNOWN_EARLIER_S,

@@ -1,10 +1,10 @@
 """The two radio nodes of an aircraft: convert samples to payloads, each with its time."""
 
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from itertools import count
+from itertools import chain, count
 from operator import attrgetter
 from typing import Final
 
@@ -13,7 +13,15 @@ import numpy as np
 from gateway.records import GpsFixType, ImuFlags, NodeId
 from gateway.simulator.flight import GPS_NODE, IMU_NODE, SimulatedAircraft
 from gateway.simulator.gps import GPS_RATE_HZ, GpsSamples
-from gateway.simulator.sensors import ACCEL_RANGE, GYRO_RANGE, MAG_GAIN, DeviceClock, IntArray
+from gateway.simulator.sensors import (
+    ACCEL_RANGE,
+    GYRO_RANGE,
+    MAG_GAIN,
+    BaroSamples,
+    DeviceClock,
+    ImuSamples,
+    IntArray,
+)
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FloatArray
 from gateway.units import DEGE7_PER_DEG
@@ -130,14 +138,15 @@ def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[
 
     Samples are computed in small batches, on demand.
     """
+    imu_s, baro_s = (SAMPLES_AT_ONCE / hz for hz in (settings.imu_rate_hz, settings.baro_rate_hz))
     imu = Node(
         NodeId(aircraft.vehicle_id, IMU_NODE),
         aircraft.imu.clock,
         IMU_SENSORS,
         settings.imu_rate_hz,
         heapq.merge(
-            _imu_samples(aircraft, settings.imu_rate_hz),
-            _baro_samples(aircraft, settings.baro_rate_hz),
+            _in_batches(aircraft, imu_s, lambda until_s: pack_imu(aircraft.imu.take(until_s))),
+            _in_batches(aircraft, baro_s, lambda until_s: pack_baro(aircraft.baro.take(until_s))),
             key=attrgetter("time_s"),
         ),
         settings.imu_restart_s,
@@ -147,69 +156,44 @@ def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[
         aircraft.gps_clock,
         GPS_SENSORS,
         GPS_RATE_HZ,
-        _gps_samples(aircraft, settings.geoid_separation_m),
+        _in_batches(
+            aircraft,
+            FIXES_AT_ONCE / GPS_RATE_HZ,
+            lambda until_s: gps_payloads(
+                aircraft.gps.take(until_s), aircraft.gps_clock, settings.geoid_separation_m
+            ),
+        ),
     )
     return imu, gps
 
 
-def _imu_samples(aircraft: SimulatedAircraft, rate_hz: int) -> Iterator[Sent]:
-    for until_s in _ends_of_pieces(aircraft, SAMPLES_AT_ONCE / rate_hz):
-        imu = aircraft.imu.take(until_s)
-        columns = (imu.time_s, imu.node_time_us, imu.accel_raw, imu.gyro_raw, imu.mag_raw)
-        yield from pack_imu(
-            (*columns, imu.temperature_raw, imu.flags), (ACCEL_RANGE, GYRO_RANGE, MAG_GAIN)
-        )
-
-
-def _baro_samples(aircraft: SimulatedAircraft, rate_hz: int) -> Iterator[Sent]:
-    for until_s in _ends_of_pieces(aircraft, SAMPLES_AT_ONCE / rate_hz):
-        baro = aircraft.baro.take(until_s)
-        yield from pack_baro(
-            (baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc)
-        )
-
-
-def _gps_samples(aircraft: SimulatedAircraft, geoid_separation_m: float) -> Iterator[Sent]:
-    for until_s in _ends_of_pieces(aircraft, FIXES_AT_ONCE / GPS_RATE_HZ):
-        gps = aircraft.gps.take(until_s)
-        yield from gps_payloads(gps, aircraft.gps_clock, geoid_separation_m)
-
-
-def _ends_of_pieces(aircraft: SimulatedAircraft, length_s: float) -> Iterator[float]:
-    """Yield the end of each batch of samples; different for each aircraft."""
+def _in_batches(
+    aircraft: SimulatedAircraft, length_s: float, take: Callable[[float], Iterator[Sent]]
+) -> Iterator[Sent]:
+    """Yield the payloads of one batch after the other; batches of other aircraft end at others."""
     first_s = length_s * (1.0 - aircraft.vehicle_id % PHASES / PHASES)
-    return (first_s + k * length_s for k in count())
+    return chain.from_iterable(take(first_s + k * length_s) for k in count())
 
 
 def pack_imu(
-    columns: Sequence[FloatArray | IntArray], ranges: tuple[int, int, int]
+    samples: ImuSamples, ranges: tuple[int, int, int] = (ACCEL_RANGE, GYRO_RANGE, MAG_GAIN)
 ) -> Iterator[Sent]:
     """Pack IMU samples.
 
-    Columns: true time of sampling in s and node time in µs, each (N,); accelerometer, gyroscope and
-    magnetometer counts, each (N, 3); temperature counts and flags, each (N,). Ranges: the codes for
-    the accelerometer's and gyroscope's ranges and for the magnetometer's gain.
+    Ranges: the codes for the ranges of accelerometer and gyroscope, and for the magnetometer's
+    gain.
     """
-    accel_range, gyro_range, mag_gain = ranges
     for time_s, node_us, accel, gyro, mag, temperature, flags in zip(
-        *(column.tolist() for column in columns), strict=True
+        *(column.tolist() for column in samples), strict=True
     ):
-        payload = ImuPayload(
-            accel=tuple(accel),
-            gyro=tuple(gyro),
-            mag=tuple(mag),
-            temperature=temperature,
-            flags=ImuFlags(flags),
-            accel_range=accel_range,
-            gyro_range=gyro_range,
-            mag_gain=mag_gain,
-        )
+        vectors = (tuple(accel), tuple(gyro), tuple(mag))
+        payload = ImuPayload(*vectors, temperature, ImuFlags(flags), *ranges)
         yield Sent(time_s + IMU_READING_S, node_us, payload)
 
 
-def pack_baro(columns: Sequence[FloatArray | IntArray]) -> Iterator[Sent]:
-    """Pack barometer samples: true time in s, node time in µs, pressure in Pa, deg C."""
-    for time_s, node_us, pressure_pa, degc in zip(*(c.tolist() for c in columns), strict=True):
+def pack_baro(samples: BaroSamples) -> Iterator[Sent]:
+    """Pack barometer samples."""
+    for time_s, node_us, pressure_pa, degc in zip(*(c.tolist() for c in samples), strict=True):
         payload = BaroPayload(round(pressure_pa * 100.0), round(degc * 10.0))
         yield Sent(time_s + BARO_READING_S, node_us, payload)
 

@@ -37,8 +37,10 @@ from gateway.simulator.sensors import (
     IMU_BOOT_US,
     INT16_MAX,
     MAG_LIMIT,
+    BaroSamples,
     BoolArray,
     DeviceClock,
+    ImuSamples,
     IntArray,
     inertial_counts,
     mag_counts,
@@ -175,7 +177,7 @@ def _imu_payloads(flight: RecordedFlight, clock: DeviceClock, *, endless: bool) 
             accel, gyro, clipped = inertial_counts(*vectors, accel_range, gyro_range)
             flags = absent | clipped | mag_new[rows] * int(ImuFlags.MAG_NEW)
             columns = (time_s, _on_clock(clock, time_s), accel, gyro, mag_raw[rows])
-            yield from pack_imu((*columns, temperature[: len(time_s)], flags), ranges)
+            yield from pack_imu(ImuSamples(*columns, temperature[: len(time_s)], flags), ranges)
 
 
 def _ranges(flight: RecordedFlight) -> tuple[int, int, int]:
@@ -208,7 +210,7 @@ def _baro_payloads(flight: RecordedFlight, clock: DeviceClock) -> Iterator[Sent]
     time_s = flight.time_s[new]
     pressure_pa = pressure_at(flight.baro_alt_m[new], SEA_LEVEL_PA)
     degc = np.full(len(time_s), TEMPERATURE_DEGC)
-    return pack_baro((time_s, _on_clock(clock, time_s), pressure_pa, degc))
+    return pack_baro(BaroSamples(time_s, _on_clock(clock, time_s), pressure_pa, degc))
 
 
 def _gps_samples(flight: RecordedFlight, start_unix_us: int) -> GpsSamples:
@@ -222,7 +224,6 @@ def _gps_samples(flight: RecordedFlight, start_unix_us: int) -> GpsSamples:
     speed_acc_mps = np.where(has_velocity, SPEED_ACC_MPS, UNKNOWN)
     return GpsSamples(
         time_s=flight.gps_time_s,
-        valid_time_s=valid_s,
         itow_ms=itow_ms_of(unix_us),
         unix_us=unix_us,
         time_valid=np.ones(size, dtype=np.bool_),

@@ -5,7 +5,7 @@ noise has its own generator and keeps its state, so that both give bit-identical
 
 Sensor axes are those of the chips on a level board: x forward, y left, z up. A body vector (FRD) is
 converted by `FACE_UP * v_b`, and so is the inverse. An inertial or magnetic sensor measures
-`matrix @ v_s + bias` plus noise; `SensorErrors` is the calibration that corrects this.
+`matrix @ v_s + bias` plus noise; `errors_of` is the calibration that corrects this.
 
 References
 ----------
@@ -19,13 +19,14 @@ import math
 from dataclasses import dataclass
 from enum import IntEnum
 from itertools import accumulate
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gateway.geometry.atmosphere import SEA_LEVEL_PA, pressure_at_height
 from gateway.geometry.geomagnetism import magnetic_field
+from gateway.geometry.rotation import Matrix3
 from gateway.records import ImuFlags, Vec3
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import CRUISE_MPS, FloatArray, SensorMotion, Truth, rotate_inverse
@@ -35,7 +36,6 @@ from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 AXES: Final = 3
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-Matrix3 = tuple[Vec3, Vec3, Vec3]
 FACE_UP: Final = np.array([1.0, -1.0, -1.0])
 ACCEL_RANGE: Final = 2
 """Range code: +-8 g."""
@@ -117,17 +117,6 @@ def wander(
 def walk(rng: np.random.Generator, sigma_per_sqrt_s: float, interval_s: float) -> Noise:
     """Return a random walk that starts at zero."""
     return Noise(rng, sigma_per_sqrt_s * math.sqrt(interval_s), 1.0)
-
-
-@dataclass(frozen=True, slots=True)
-class SensorErrors:
-    """Calibration that corrects the constant errors: `v_b = FACE_UP * (matrix @ (s - bias))`."""
-
-    accel_bias_mps2: Vec3
-    accel_matrix: Matrix3
-    gyro_bias_radps: Vec3
-    mag_hard_iron_ut: Vec3
-    mag_soft_iron: Matrix3
 
 
 class Mpu6050:
@@ -212,15 +201,18 @@ class Bmp180:
         return np.rint(pressure_pa), np.round(warm_degc(truth.time_s), 1)
 
 
-def errors_of(imu: Mpu6050, mag: Hmc5883l) -> SensorErrors:
-    """Return the ideal calibration of two sensors."""
-    return SensorErrors(
-        accel_bias_mps2=_vec3(imu.accel_bias_mps2),
-        accel_matrix=_inverse(imu.accel_matrix),
-        gyro_bias_radps=_vec3(imu.gyro_bias_radps),
-        mag_hard_iron_ut=_vec3(mag.hard_iron_ut),
-        mag_soft_iron=_inverse(mag.soft_iron),
-    )
+def errors_of(imu: Mpu6050, mag: Hmc5883l) -> dict[str, Any]:
+    """Return the constant errors of two sensors as the fields of their ideal `NodeCalibration`.
+
+    It is `v_b = FACE_UP * (matrix @ (s - bias))`.
+    """
+    return {
+        "accel_bias_mps2": _vec3(imu.accel_bias_mps2),
+        "accel_matrix": _inverse(imu.accel_matrix),
+        "gyro_bias_radps": _vec3(imu.gyro_bias_radps),
+        "mag_hard_iron_ut": _vec3(mag.hard_iron_ut),
+        "mag_soft_iron": _inverse(mag.soft_iron),
+    }
 
 
 def pressure_at(alt_m: FloatArray, sea_level_pa: float) -> FloatArray:
@@ -333,8 +325,7 @@ class Ticks:
         return node_us, self._clock.true_s(node_us)
 
 
-@dataclass(frozen=True, slots=True)
-class ImuSamples:
+class ImuSamples(NamedTuple):
     """N samples of MPU6050 and HMC5883L; raw arrays are counts in sensor axes."""
 
     time_s: FloatArray
@@ -346,14 +337,9 @@ class ImuSamples:
     gyro_raw: IntArray
     mag_raw: IntArray
     """The newest magnetometer reading, held until the next one."""
-    mag_new: BoolArray
-    mag_time_s: FloatArray
-    """True time of the newest magnetometer reading."""
     temperature_raw: IntArray
     flags: IntArray
     """The `ImuFlags` of each sample."""
-    truth: Truth
-    """True state of the aircraft at `time_s`."""
 
 
 class ImuSampler:
@@ -383,30 +369,18 @@ class ImuSampler:
         if len(node_us):
             self._mag_tick = int(mag_ticks[-1])
             self._mag_raw = mag_raw[-1:]
-        return ImuSamples(
-            time_s=time_s,
-            node_time_us=node_us,
-            accel_raw=accel_raw,
-            gyro_raw=gyro_raw,
-            mag_raw=mag_raw,
-            mag_new=mag_new,
-            mag_time_s=mag_time_s,
-            temperature_raw=temperature_counts(warm_degc(time_s)),
-            flags=clipped | mag_new * int(ImuFlags.MAG_NEW),
-            truth=truth,
-        )
+        temperature_raw = temperature_counts(warm_degc(time_s))
+        flags = clipped | mag_new * int(ImuFlags.MAG_NEW)
+        return ImuSamples(time_s, node_us, accel_raw, gyro_raw, mag_raw, temperature_raw, flags)
 
 
-@dataclass(frozen=True, slots=True)
-class BaroSamples:
+class BaroSamples(NamedTuple):
     """N samples of the BMP180, shapes (N,)."""
 
     time_s: FloatArray
     node_time_us: IntArray
     pressure_pa: FloatArray
     temperature_degc: FloatArray
-    truth: Truth
-    """True state of the aircraft at `time_s`."""
 
 
 class BaroSampler:
@@ -423,6 +397,6 @@ class BaroSampler:
     def take(self, until_s: float) -> BaroSamples:
         """Return all samples before a true time that were not returned yet."""
         node_us, time_s = self._ticks.take(until_s)
-        truth = self._trajectory.truth_at(time_s)
-        pressure_pa, temperature_degc = self.barometer.sample(truth)
-        return BaroSamples(time_s, node_us, pressure_pa, temperature_degc, truth)
+        return BaroSamples(
+            time_s, node_us, *self.barometer.sample(self._trajectory.truth_at(time_s))
+        )

@@ -17,6 +17,7 @@ from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.simulator.trajectory import FLIGHT_S, Truth
 from gateway.units import DEG_PER_DEGE7, DEGE7_PER_DEG, STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.wire.framing import xor_of
 from gateway.wire.link import Link
 
 RADIO: Final = 0xEA
@@ -212,10 +213,7 @@ def nmea_of(fix: GpsFix) -> str:
         f"GPGGA,{time},{lat},{lon},{quality},{fix.satellites:02d},0.8,{height}",
         f"GPRMC,{time},{state},{lat},{lon},{knots:.3f},{course:.2f},{date},,,A",
     ):
-        check = 0
-        for byte in body.encode():
-            check ^= byte
-        found += f"${body}*{check:02X}\r\n"
+        found += f"${body}*{xor_of(body.encode()):02X}\r\n"
     return found
 
 

@@ -20,7 +20,6 @@ from gateway.analysis.flight import (
 )
 from gateway.analysis.metrics import position_error_m, rms
 from gateway.analysis.reporting.compose import make_report
-from gateway.analysis.simulated import ideal_calibration
 from gateway.analysis.sweep import with_value
 from gateway.geometry.geodesy import displacement_m
 from gateway.pipeline import Pipeline, PipelineSettings
@@ -106,7 +105,7 @@ def rows(*, raw: bool) -> list[TableRow]:
 @cache
 def _rows() -> tuple[TableRow, ...]:
     estimation = short_case().fusion.estimation
-    calibration = ideal_calibration(SIMULATED.errors)
+    calibration = NodeCalibration(**SIMULATED.errors)
     settings = AircraftSettings(estimation=estimation, calibration=calibration)
     lines, _ = record(Pipeline(PipelineSettings(settings)), [*SIMULATED.records()])
     return tuple(line for line in lines if isinstance(line, TableRow))
@@ -114,8 +113,8 @@ def _rows() -> tuple[TableRow, ...]:
 
 @pytest.mark.parametrize("raw", [True, False])
 def test_recorded_rows_give_samples_and_states_of_simulated_flight(raw: bool) -> None:
-    flight = recorded(raw=raw, calibration=ideal_calibration(SIMULATED.errors))
-    chain = SensorChain(ideal_calibration(SIMULATED.errors))
+    flight = recorded(raw=raw, calibration=NodeCalibration(**SIMULATED.errors))
+    chain = SensorChain(NodeCalibration(**SIMULATED.errors))
     samples = [chain.imu(record) for record in SIMULATED.records() if isinstance(record, ImuRaw)]
     assert flight.imu.accel_b_mps2.tolist() == [list(s.accel_b_mps2) for s in samples]
     assert np.isfinite(flight.imu.mag_b_ut[:, 0]).tolist() == [

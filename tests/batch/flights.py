@@ -9,11 +9,11 @@ import numpy as np
 from msgspec.structs import replace
 
 from gateway.aircraft import AircraftSettings
-from gateway.analysis.simulated import ideal_calibration
 from gateway.recordings.recorded_table import header_for
 from gateway.recordings.rows import TableRow, row_to_line
 from gateway.recordings.table import encode_head
 from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
+from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tools.simulated_flight import SimulatedFlight, fly
 
@@ -47,7 +47,7 @@ def write_flight(
     `noise_m` is added to every fix, seeded by aircraft and day; every `lost`-th IMU sample is lost.
     """
     rng = np.random.default_rng([vehicle, day])
-    aircraft = AircraftSettings(calibration=ideal_calibration(simulated().errors))
+    aircraft = AircraftSettings(calibration=NodeCalibration(**simulated().errors))
     header = msgspec.structs.replace(
         header_for(aircraft, vehicle), unix_us_at_zero=DAY_0_US + day * DAY_US
     )

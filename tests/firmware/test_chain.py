@@ -68,8 +68,7 @@ def fly(programs: Path, parts: Parts, disturb: Disturb) -> Flown:
     flight = FlightWorld(SimulatorSettings(), start_s=START_S)
     setup = Setup(seed=7, loss=0.1, world=flight.world, build=programs, parts=parts)
     tracker = Tracker(setup, noise=False)
-    errors = flight.aircraft.errors
-    calibration = msgspec.convert(errors, NodeCalibration, from_attributes=True)
+    calibration = NodeCalibration(**flight.aircraft.errors)
     aircraft = msgspec.structs.replace(GatewaySettings().default_aircraft, calibration=calibration)
     pipeline = Pipeline(PipelineSettings(aircraft))
     parser = mavlink.MAVLink(None)

@@ -36,11 +36,11 @@ class TestMpu6050:
         errors = sensors.errors_of(imu, sensors.Hmc5883l(SETTINGS, rng))
         accel, gyro, _ = imu.sample(still(2000))
         accel_s = accel * (8 * 9.80665 / 32768)
-        corrected = (accel_s - errors.accel_bias_mps2) @ np.transpose(errors.accel_matrix)
+        corrected = (accel_s - errors["accel_bias_mps2"]) @ np.transpose(errors["accel_matrix"])
         accel_b = corrected * sensors.FACE_UP
         np.testing.assert_allclose(accel_b.mean(axis=0), [0.0, 0.0, -9.80665], atol=0.01)
         gyro_s = np.radians(gyro / 32.8)
-        np.testing.assert_allclose(gyro_s.mean(axis=0), errors.gyro_bias_radps, atol=3e-3)
+        np.testing.assert_allclose(gyro_s.mean(axis=0), errors["gyro_bias_radps"], atol=3e-3)
 
     def test_noise_has_the_density_of_the_data_sheet(self, rng: np.random.Generator) -> None:
         accel, gyro, _ = sensors.Mpu6050(SETTINGS, rng).sample(still(3000))
@@ -68,7 +68,7 @@ class TestHmc5883l:
         attitudes = Rotation.random(2000, rng=rng)
         counts = mag.sample(attitudes.as_quat(scalar_first=True))
         measured_ut = counts * (100.0 / 1090)
-        field_b = (measured_ut - errors.mag_hard_iron_ut) @ np.transpose(errors.mag_soft_iron)
+        field_b = (measured_ut - errors["mag_hard_iron_ut"]) @ np.transpose(errors["mag_soft_iron"])
         off = field_b * sensors.FACE_UP - attitudes.inv().apply(mag.field_n_ut)
         assert np.abs(off.mean(axis=0)).max() < 0.05
         assert 0.2 < off.std() < 0.35

@@ -15,7 +15,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final, Literal, cast
 
-import msgspec
 import typer
 from msgspec.structs import replace
 
@@ -161,7 +160,7 @@ def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings
     found = {}
     for index in range(settings.simulator.vehicles):
         simulated = SimulatedAircraft(settings.simulator, index)
-        calibration = msgspec.convert(simulated.errors, NodeCalibration, from_attributes=True)
+        calibration = NodeCalibration(**simulated.errors)
         found[simulated.vehicle_id] = replace(settings.default_aircraft, calibration=calibration)
     return found
 

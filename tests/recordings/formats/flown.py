@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gateway.analysis.simulated import ideal_calibration
 from gateway.geometry.quaternion import to_euler
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
+from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tools.simulated_flight import SimulatedFlight, fly
@@ -34,7 +34,7 @@ def simulated() -> SimulatedFlight:
 def records() -> tuple[Record, ...]:
     """Calibrate the samples as the sensors' drivers of an autopilot do."""
     flight = simulated()
-    chain = SensorChain(ideal_calibration(flight.errors))
+    chain = SensorChain(NodeCalibration(**flight.errors))
     found: list[Record] = []
     for record in flight.records():
         if isinstance(record, BaroRaw | GpsFix):
