@@ -177,15 +177,15 @@ class GpsFix(msgspec.Struct, frozen=True, gc=False):
     lat_dege7: int
     lon_dege7: int
     alt_amsl_m: float
-    vel_n_mps: Vec3
-    alt_ellipsoid_m: float
+    vel_n_mps: Vec3 = UNKNOWN_VEC3
+    alt_ellipsoid_m: float = NAN
     """NaN until a quality payload has contained the geoid separation."""
-    h_acc_m: float
-    v_acc_m: float
-    speed_acc_mps: float
-    course_acc_deg: float
-    pdop: float
-    utc_us: int | None
+    h_acc_m: float = NAN
+    v_acc_m: float = NAN
+    speed_acc_mps: float = NAN
+    course_acc_deg: float = NAN
+    pdop: float = NAN
+    utc_us: int | None = None
     """Unix time of the fix; None while the receiver reports date or time as invalid."""
 
 
@@ -401,18 +401,18 @@ class NodeLink(msgspec.Struct, frozen=True, gc=False):
     """Counts of the gateway for one node since the gateway's start."""
 
     node: NodeId
-    pipe: int
-    received: int
-    lost: int
+    pipe: int = 0
+    received: int = 0
+    lost: int = 0
     """Gaps in the node's sequence numbers, minus late payloads."""
-    duplicates: int
-    reordered: int
-    restarts: int
-    rate_hz: float
+    duplicates: int = 0
+    reordered: int = 0
+    restarts: int = 0
+    rate_hz: float = 0.0
     """Payloads per second, measured over the last second."""
-    last_time_us: int
+    last_time_us: int = 0
     """Time of arrival of the newest payload on the gateway clock."""
-    clock_skew_ppm: float
+    clock_skew_ppm: float = 0.0
     """Clock rate of the node relative to the gateway's; positive if it is faster."""
     signal: RadioSignal | None = None
     """Signal of the newest payload; None from a radio that does not measure it."""

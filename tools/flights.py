@@ -259,11 +259,7 @@ def _fix_of(time_us: int, row: list[float]) -> GpsFix:
         lon_dege7=round(row[2] * DEGE7_PER_DEG),
         alt_amsl_m=row[3],
         vel_n_mps=(row[4], row[5], row[6]),
-        alt_ellipsoid_m=math.nan,
         h_acc_m=row[7],
         v_acc_m=row[8],
         speed_acc_mps=row[9],
-        course_acc_deg=math.nan,
-        pdop=math.nan,
-        utc_us=None,
     )

@@ -17,15 +17,12 @@ from gateway.sources.csv_lines import CsvLines, read_column_map
 from gateway.sources.nmea import NmeaReader
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import MAX_VEHICLE, SourceUrl
-from gateway.sources.source import SourceRecord, unusable
+from gateway.sources.source import SourceRecord, TextLines, unusable
 from gateway.units import PA_PER_HPA, RAD_PER_DEG, STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
 from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
 
 MAX_LINE: Final = 4096
-PACKETS: Final = ("udp", "receiver")
-"""Transports that preserve message boundaries."""
-
 VECTORS: Final = {
     "accel_mps2": ("accel", 1.0),
     "accel_g": ("accel", STANDARD_GRAVITY_MPS2),
@@ -61,43 +58,12 @@ REPORTED: Final = frozenset(
 )
 
 
-class LineSplitter:
-    """Split the bytes of a transport into lines of a maximum length.
-
-    A datagram or packet ends its last line, with or without a line feed.
-    """
-
-    def __init__(self, transport: str, max_line: int = MAX_LINE) -> None:
-        self._max = max_line
-        self._end = b"\n" if transport in PACKETS else b""
-        self._rest = b""
-
-    def feed(self, data: bytes) -> list[str | Fault]:
-        """Process any chunk, and return the lines that it completes."""
-        *lines, rest = (self._rest + data + self._end).split(b"\n")
-        found: list[str | Fault] = [
-            line.decode("utf-8", "replace").strip()
-            if len(line) <= self._max
-            else Fault("too long", len(line), f"a line is longer than {self._max} bytes")
-            for line in lines
-        ]
-        if len(rest) > self._max:
-            found.append(Fault("too long", len(rest), f"no line ends within {self._max} bytes"))
-            rest = b""
-        self._rest = rest
-        return found
-
-    def reset(self) -> None:
-        """Discard an incomplete line."""
-        self._rest = b""
-
-
-class LinesDecoder:
+class LinesDecoder(TextLines):
     """Decode lines of all three kinds."""
 
     def __init__(self, url: SourceUrl, node: NodeId) -> None:
+        super().__init__(url.transport, MAX_LINE)
         self._node = node
-        self._splitter = LineSplitter(url.transport)
         self._nmea = NmeaReader(node)
         column_map = url.options.get("columns")
         self._csv = None
@@ -107,21 +73,8 @@ class LinesDecoder:
         self._clocks: dict[int, SampleClock] = {}
         self._has_own_id = "id" in url.options
 
-    def reset(self) -> None:
-        """Discard an incomplete line."""
-        self._splitter.reset()
-
-    def feed(self, data: bytes, arrival_us: int) -> list[SourceRecord | Fault]:
-        """Decode every line that a chunk completes."""
-        found: list[SourceRecord | Fault] = []
-        for line in self._splitter.feed(data):
-            if isinstance(line, Fault):
-                found.append(line)
-            elif line:
-                found += self._line(line, arrival_us)
-        return found
-
-    def _line(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:
+    def line(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:
+        """Return the records and faults in a line of any kind."""
         if line[0] == "{":
             return self._json(line, arrival_us)
         if line[0] in "$!":

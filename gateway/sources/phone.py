@@ -27,10 +27,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from gateway.records import NAN, BaroRaw, BatteryReport, NodeId, Vec3, VehicleReport
-from gateway.sources.lines import LineSplitter, is_number
+from gateway.sources.lines import is_number
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import SourceUrl
-from gateway.sources.source import SourceRecord, unusable
+from gateway.sources.source import SourceRecord, TextLines, unusable
 from gateway.units import US_PER_S
 from gateway.wire.framing import Fault
 from gateway.wire.timesync import WRAP_MASK
@@ -93,12 +93,12 @@ STREAMED: Final = {
 USUAL_SENSORS: Final = "accelerometer,gyroscope,magnetometer,gps"
 
 
-class PhoneDecoder:
+class PhoneDecoder(TextLines):
     """Decode the sensor readings of one phone."""
 
     def __init__(self, url: SourceUrl, node: NodeId) -> None:
+        super().__init__(url.transport, MAX_LINE)
         self._node = node
-        self._splitter = LineSplitter(url.transport, MAX_LINE)
         self._sensors = url.options.get("sensors", USUAL_SENSORS).lower().split(",")
         try:
             self._geoid_m = float(url.options.get("geoid_m", "0"))
@@ -114,10 +114,6 @@ class PhoneDecoder:
         self._polled_s: dict[str, str] = {}
         """Newest time by quantity, as phyphox wrote it."""
 
-    def reset(self) -> None:
-        """Discard an incomplete line."""
-        self._splitter.reset()
-
     def request(self) -> str:
         """Return path and query of a phyphox request for all values newer than its last answer."""
         found = []
@@ -128,19 +124,13 @@ class PhoneDecoder:
             found += [f"{name}={since}|{time}" if since else f"{name}=" for name in values]
         return "/get?" + "&".join(found)
 
-    def feed(self, data: bytes, arrival_us: int) -> list[SourceRecord | Fault]:
-        """Decode every line that a chunk completes."""
-        found: list[SourceRecord | Fault] = []
-        for line in self._splitter.feed(data):
-            if isinstance(line, Fault):
-                found.append(line)
-            elif line:
-                try:
-                    found += self._records(self._readings(line), arrival_us)
-                except UNREADABLE as error:
-                    why = str(error) if isinstance(error, ValueError) else "is not from a known app"
-                    found.append(unusable("phone", line, why))
-        return found
+    def line(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:
+        """Return the records and faults in a line of any of the apps."""
+        try:
+            return self._records(self._readings(line), arrival_us)
+        except UNREADABLE as error:
+            why = str(error) if isinstance(error, ValueError) else "is not from a known app"
+            return [unusable("phone", line, why)]
 
     def _readings(self, line: str) -> list[Reading]:
         """Read a line of any of the apps; raises an exception of `UNREADABLE`."""

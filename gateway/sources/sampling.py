@@ -6,7 +6,7 @@ tenth of the noise of usual sensors: 0.6 mm/s2, 0.008 deg/s and 0.01 uT.
 """
 
 import math
-from typing import Final
+from typing import Any, Final
 
 from gateway.records import NAN, GpsFix, GpsFixType, ImuFlags, ImuRaw, Int3, NodeId, Vec3
 from gateway.units import DEGE7_PER_DEG, US_PER_S
@@ -109,16 +109,14 @@ def fix_at(
     lon_deg: float,
     alt_amsl_m: float = NAN,
     *,
-    vel_n_mps: Vec3 = (NAN, NAN, NAN),
     satellites: int = 0,
     fix_type: GpsFixType | None = None,
-    h_acc_m: float = NAN,
-    v_acc_m: float = NAN,
-    speed_acc_mps: float = NAN,
-    utc_us: int | None = None,
-    pdop: float = NAN,
+    **values: Any,
 ) -> GpsFix | None:
-    """Make a fix from the values of a source; None if the coordinates are out of range."""
+    """Make a fix from the values of a source, with others of its fields by their names.
+
+    None if the coordinates are out of range.
+    """
     if not (-90.0 <= lat_deg <= 90.0 and -180.0 <= lon_deg <= 180.0):
         return None
     if fix_type is None:
@@ -135,14 +133,7 @@ def fix_at(
         lat_dege7=round(lat_deg * DEGE7_PER_DEG),
         lon_dege7=round(lon_deg * DEGE7_PER_DEG),
         alt_amsl_m=alt_amsl_m,
-        vel_n_mps=vel_n_mps,
-        alt_ellipsoid_m=NAN,
-        h_acc_m=h_acc_m,
-        v_acc_m=v_acc_m,
-        speed_acc_mps=speed_acc_mps,
-        course_acc_deg=NAN,
-        pdop=pdop,
-        utc_us=utc_us,
+        **values,
     )
 
 

@@ -46,6 +46,8 @@ MAX_KINDS: Final = 32
 MAX_DETAIL: Final = 200
 SHOWN: Final = 60
 """Characters of an unusable line that are quoted."""
+PACKETS: Final = ("udp", "receiver")
+"""Transports that preserve message boundaries."""
 FIRST_UTC_US: Final = round(datetime(FIRST_YEAR, 1, 1, tzinfo=UTC).timestamp()) * US_PER_S
 
 
@@ -126,6 +128,42 @@ class CheckedFrames(ABC):
     @abstractmethod
     def read(self, frame: bytes, arrival_us: int) -> list[Any]:
         """Return the records and faults in a frame."""
+
+
+class TextLines(ABC):
+    """Base of decoders for lines of text of a maximum length.
+
+    A datagram or packet ends its last line, with or without a line feed.
+    """
+
+    def __init__(self, transport: str, max_line: int) -> None:
+        self._max = max_line
+        self._end = b"\n" if transport in PACKETS else b""
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard an incomplete line."""
+        self._rest = b""
+
+    def feed(self, data: bytes, arrival_us: int) -> list[SourceRecord | Fault]:
+        """Decode every line that a chunk completes."""
+        found: list[SourceRecord | Fault] = []
+        *lines, rest = (self._rest + data + self._end).split(b"\n")
+        for line in lines:
+            if len(line) > self._max:
+                why = f"a line is longer than {self._max} bytes"
+                found.append(Fault("too long", len(line), why))
+            elif text := line.decode("utf-8", "replace").strip():
+                found += self.line(text, arrival_us)
+        if len(rest) > self._max:
+            found.append(Fault("too long", len(rest), f"no line ends within {self._max} bytes"))
+            rest = b""
+        self._rest = rest
+        return found
+
+    @abstractmethod
+    def line(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:
+        """Return the records and faults in a line, which is not empty."""
 
 
 @runtime_checkable
@@ -238,15 +276,9 @@ class SourceInput:
         return [
             NodeLink(
                 node=key,
-                pipe=0,
                 received=node.received,
-                lost=0,
-                duplicates=0,
-                reordered=0,
-                restarts=0,
                 rate_hz=node.rate_hz(now_us),
                 last_time_us=node.last_us,
-                clock_skew_ppm=0.0,
                 signal=node.signal,
             )
             for key, node in self._nodes.items()
