@@ -6,7 +6,6 @@ with it, while the memory is a plain structured scalar whose fields numba compil
 """
 
 import zlib
-from collections.abc import Hashable
 from functools import cache
 from typing import Any, TypeVar, cast, get_args, get_type_hints
 
@@ -29,11 +28,6 @@ def layout(declaration: type) -> np.dtype[np.void]:
 
     The annotations are `float`, `int` or `Annotated[FloatArray, shape]`.
     """
-    return _layout(cast(Hashable, declaration))
-
-
-@cache
-def _layout(declaration: Hashable) -> np.dtype[np.void]:
     fields: list[tuple[str, str, tuple[int, ...]]] = []
     for name, hint in get_type_hints(declaration, include_extras=True).items():
         if hint is float:

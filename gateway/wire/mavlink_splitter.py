@@ -94,9 +94,8 @@ class MavlinkSplitter:
         Frames are unchanged. Never raises on data.
         """
         data = self._rest + data
-        events, end, unfinished = _split(data)
+        events, unfinished = _split(data)
         self._rest = data[unfinished:]
-        _report(events, data, end, unfinished)
         return events
 
     def take(self) -> bytes:
@@ -127,8 +126,7 @@ class DatagramSplitter:
         if now_us - since_us > KEPT_US:
             late, rest = [SplitFault(SplitFaultKind.CRC, len(rest))], b""
         data = rest + data
-        events, end, unfinished = _split(data, seeks_on=True)
-        _report(events, data, end, unfinished)
+        events, unfinished = _split(data, seeks_on=True)
         if unfinished < len(data):
             if len(self._rests) >= KEPT_PEERS:
                 del self._rests[next(iter(self._rests))]
@@ -145,9 +143,7 @@ class DatagramSplitter:
 
 def split_datagram(data: bytes) -> list[Event]:
     """Split one datagram into frames and runs of dropped bytes, without state."""
-    events, end, _ = _split(data, seeks_on=True)
-    _report(events, data, end, len(data))
-    return events
+    return _split(data, seeks_on=True, keeps=False)[0]
 
 
 def read_datagram(data: bytes) -> MavFrame | None:
@@ -226,11 +222,11 @@ def to_mavlink1(frame: bytes) -> bytes | None:
     return bytes((START_V1,)) + content + crc.to_bytes(2, "little")
 
 
-def _split(data: bytes, *, seeks_on: bool = False) -> tuple[list[Event], int, int]:
-    """Return frames and the faults before them, the end of the last, and the begin of a partial.
+def _split(data: bytes, *, seeks_on: bool = False, keeps: bool = True) -> tuple[list[Event], int]:
+    """Return frames and faults, and the begin of an unfinished frame, or the end of the data.
 
-    The begin is the end of the data if no frame is unfinished. With `seeks_on`, the bytes after it
-    are searched for frames too.
+    With `seeks_on`, the bytes after an unfinished frame are searched for frames too. It is a fault
+    unless the caller keeps it.
     """
     events: list[Event] = []
     position = end = false_starts = 0
@@ -250,7 +246,8 @@ def _split(data: bytes, *, seeks_on: bool = False) -> tuple[list[Event], int, in
         false_starts += 1
         following = _STARTS.search(data, position + 1)
         position = following.start() if following and false_starts < MAX_FALSE_STARTS else len(data)
-    return events, end, unfinished
+    _report(events, data, end, unfinished if keeps else len(data))
+    return events, unfinished
 
 
 def _report(events: list[Event], data: bytes, begin: int, end: int) -> None:

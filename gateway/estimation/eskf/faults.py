@@ -31,8 +31,6 @@ from gateway.units import STANDARD_GRAVITY_MPS2
 GYRO_LIMIT_RADPS: Final = 40.0
 ACCEL_LIMIT_MPS2: Final = 400.0
 """Limits beyond the largest ranges of such sensors, which are 2000 deg/s and 32 g."""
-START_SHARES: Final = (0.5, 2.0)
-"""Limits of the first force, in multiples of gravity, for an initial level."""
 STUCK_S: Final = 1.0
 HOLD_S: Final = 0.2
 USUAL_S: Final = 0.5
@@ -68,12 +66,9 @@ WANDER_RADPS: Final = 0.05
 
 
 @compiled
-def is_start(s: State, gyro: Vec3, accel: Vec3) -> bool:
-    """Return whether the filter may start with a sample, and set the fault if not."""
-    force = math.sqrt(quat.norm_sq(accel)) / STANDARD_GRAVITY_MPS2
-    sound = quat.is_below(gyro, GYRO_LIMIT_RADPS) and quat.is_below(accel, ACCEL_LIMIT_MPS2)
-    s.fault = 0 if sound and START_SHARES[0] < force < START_SHARES[1] else 1
-    return s.fault == 0
+def is_within_limits(gyro: Vec3, accel: Vec3) -> bool:
+    """Return whether rate and force are finite and possible."""
+    return quat.is_below(gyro, GYRO_LIMIT_RADPS) and quat.is_below(accel, ACCEL_LIMIT_MPS2)
 
 
 @compiled
@@ -149,18 +144,15 @@ def check_sensors(
 
 
 @compiled
-def substitute_gyro(s: State) -> Vec3:
-    """Return the rate for a sample without a valid one."""
-    return as_vec(s.imu_held[0:3]) if s.missing_s[0] < HOLD_S else as_vec(s.gyro_bias_b)
-
-
-@compiled
-def substitute_accel(s: State) -> Vec3:
-    """Return the force for a sample without a valid one."""
-    if s.missing_s[1] < HOLD_S:
-        return as_vec(s.imu_held[3:6])
-    gravity = quat.rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, STANDARD_GRAVITY_MPS2))
-    return quat.difference(as_vec(s.accel_bias_b), gravity)
+def substitutes(s: State) -> tuple[Vec3, Vec3]:
+    """Return rate and force for a sample without valid ones."""
+    gyro, accel = as_vec(s.gyro_bias_b), as_vec(s.imu_held[3:6])
+    if s.missing_s[0] < HOLD_S:
+        gyro = as_vec(s.imu_held[0:3])
+    if s.missing_s[1] >= HOLD_S:
+        gravity = quat.rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, STANDARD_GRAVITY_MPS2))
+        accel = quat.difference(as_vec(s.accel_bias_b), gravity)
+    return gyro, accel
 
 
 @compiled

@@ -33,10 +33,12 @@ from gateway.estimation.eskf.state import (
 from gateway.estimation.record import FloatArray, as_quat, as_vec, layout, write_quat, write_vec
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.geometry.geodesy import offset_deg
-from gateway.geometry.quaternion import is_below, norm_sq
+from gateway.geometry.quaternion import norm_sq
 from gateway.records import NAN, UNKNOWN_VEC3, Vec3
-from gateway.units import RAD_PER_DEG
+from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
+START_SHARES: Final = (0.5, 2.0)
+"""Limits of the first force, in multiples of gravity, for an initial level."""
 UNAIDED_SCALE: Final = 0.01
 """Gyroscope scale error before the first fix: a third of an MPU6050's tolerance."""
 MAX_ALTITUDE_M: Final = 30_000.0
@@ -124,8 +126,7 @@ def update_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
 @compiled
 def end_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, since_s: float) -> None:
     """Bridge a gap at the first valid sample after it."""
-    sound = is_below(gyro, faults.GYRO_LIMIT_RADPS) and is_below(accel, faults.ACCEL_LIMIT_MPS2)
-    if not sound or norm_sq(gyro) + norm_sq(accel) == 0.0:
+    if not faults.is_within_limits(gyro, accel) or norm_sq(gyro) + norm_sq(accel) == 0.0:
         s.fault = 1
         return
     faults.bridge_gap(s, p, gyro, accel, since_s)
@@ -156,11 +157,15 @@ def advance(
 @compiled
 def begin(s: State, p: Gains, time_us: int, gyro: Vec3, accel: Vec3) -> None:
     """Start at the first valid sample; gravity gives the level within the first second."""
-    if not faults.is_start(s, gyro, accel):
+    force = math.sqrt(norm_sq(accel)) / STANDARD_GRAVITY_MPS2
+    sound = faults.is_within_limits(gyro, accel)
+    s.fault = 0 if sound and START_SHARES[0] < force < START_SHARES[1] else 1
+    if s.fault == 1:
         return
     s.started, s.base_us, s.time_us, s.time_s, s.imu_s = 1, time_us, time_us, 0.0, 0.0
-    rest.begin_means(s, gyro, accel)
     for k in range(3):
+        s.imu_mean[k] = s.gyro_mean[k] = gyro[k]
+        s.imu_mean[3 + k] = accel[k]
         s.imu_held[k], s.imu_held[3 + k] = gyro[k], accel[k]
         s.force_lp_i[0, k] = s.force_lp_i[1, k] = accel[k]
     write_vec(s.rate_b, gyro)
@@ -203,10 +208,8 @@ def move(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, dt: float)
         mean_gyro, mean_accel = faults.interpolate(s, s.imu_before, gyro, accel, dt)
         predict.add_vibration(s, p, gyro, accel, dt)
         gyro, accel = mean_gyro, mean_accel
-    if not sound_gyro:
-        gyro = faults.substitute_gyro(s)
-    if not sound_accel:
-        accel = faults.substitute_accel(s)
+    held_gyro, held_accel = faults.substitutes(s)
+    gyro, accel = gyro if sound_gyro else held_gyro, accel if sound_accel else held_accel
     predict.integrate(s, p, gyro, accel, dt)
     if clipped != 0.0:
         # The part above the range may be as large as the clipped reading.

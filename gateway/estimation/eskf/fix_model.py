@@ -55,36 +55,30 @@ RECEIVER_LAG_S: Final = 0.2
 
 
 @compiled
+def since_then(s: State, lag: float) -> tuple[Vec3, Vec3]:
+    """Return the acceleration in NED integrated once and twice over the lag, which ends now."""
+    now, then = s.integrals, s.then
+    before = as_vec(then[GAINED : GAINED + 3])
+    gained = difference(as_vec(now[GAINED : GAINED + 3]), before)
+    moved = difference(as_vec(now[MOVED : MOVED + 3]), as_vec(then[MOVED : MOVED + 3]))
+    return gained, difference(moved, scaled(before, lag))
+
+
+@compiled
 def past_state(s: State, lag: float) -> tuple[Vec3, Vec3]:
     """Return position and velocity `lag` seconds ago, from the present ones and `then`."""
-    now, then = s.integrals, s.then
-    vel = difference(
-        as_vec(s.vel_n),
-        difference(as_vec(now[GAINED : GAINED + 3]), as_vec(then[GAINED : GAINED + 3])),
-    )
-    pos = (
-        s.pos_n[0] - vel[0] * lag - (now[MOVED] - then[MOVED] - then[GAINED] * lag),
-        s.pos_n[1] - vel[1] * lag - (now[MOVED + 1] - then[MOVED + 1] - then[GAINED + 1] * lag),
-        s.pos_n[2] - vel[2] * lag - (now[MOVED + 2] - then[MOVED + 2] - then[GAINED + 2] * lag),
-    )
-    return pos, vel
+    gained, moved = since_then(s, lag)
+    vel = difference(as_vec(s.vel_n), gained)
+    return difference(difference(as_vec(s.pos_n), scaled(vel, lag)), moved), vel
 
 
 @compiled
 def lag_integrals(s: State, lag: float) -> tuple[Vec3, Vec3]:
     """Return `S` and `D`: the specific force in NED integrated once and twice over the lag."""
-    now, then, g = s.integrals, s.then, STANDARD_GRAVITY_MPS2
-    once = (
-        now[GAINED] - then[GAINED],
-        now[GAINED + 1] - then[GAINED + 1],
-        now[GAINED + 2] - then[GAINED + 2] - g * lag,
-    )
-    twice = (
-        now[MOVED] - then[MOVED] - then[GAINED] * lag,
-        now[MOVED + 1] - then[MOVED + 1] - then[GAINED + 1] * lag,
-        now[MOVED + 2] - then[MOVED + 2] - then[GAINED + 2] * lag - 0.5 * g * lag * lag,
-    )
-    return once, twice
+    gained, moved = since_then(s, lag)
+    g = STANDARD_GRAVITY_MPS2
+    once = (gained[0], gained[1], gained[2] - g * lag)
+    return once, (moved[0], moved[1], moved[2] - 0.5 * g * lag * lag)
 
 
 @compiled
@@ -142,9 +136,7 @@ def mean_acceleration(s: State, lag: float) -> Vec3:
     span = s.time_s - look_back(s, s.time_s - max(lag, LEAST_LAG_S))
     if span <= 0.0:
         return (0.0, 0.0, 0.0)
-    gained = difference(
-        as_vec(s.integrals[GAINED : GAINED + 3]), as_vec(s.then[GAINED : GAINED + 3])
-    )
+    gained, _ = since_then(s, span)
     return (gained[0] / span, gained[1] / span, gained[2] / span)
 
 

@@ -44,14 +44,6 @@ def is_moving(s: State, p: Gains) -> bool:
 
 
 @compiled
-def begin_means(s: State, gyro: Vec3, accel: Vec3) -> None:
-    """Start the means at a first sample."""
-    for k in range(3):
-        s.imu_mean[k] = s.gyro_mean[k] = gyro[k]
-        s.imu_mean[3 + k] = accel[k]
-
-
-@compiled
 def detect_rest(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     """Update the means, and decide whether the aircraft is at rest."""
     share = min(1.0, dt / MEAN_S)
