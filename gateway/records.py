@@ -19,6 +19,7 @@ Int3 = tuple[int, int, int]
 Quat = tuple[float, float, float, float]
 
 NAN = float("nan")
+UNKNOWN_QUAT: Quat = (NAN, NAN, NAN, NAN)
 UNKNOWN_VEC3: Vec3 = (NAN, NAN, NAN)
 
 RECORDED_ONLY = -1

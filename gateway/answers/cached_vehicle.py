@@ -17,7 +17,7 @@ from gateway.records import Incoming, Outgoing
 from gateway.vehicle.plan import ACCEPTED
 from gateway.vehicle.recorded_vehicle import PARAM_VALUE, RecordedVehicle
 from gateway.vehicle.service import Request
-from gateway.vehicle.services.commands import read_command, requested_message
+from gateway.vehicle.services.commands import read_command
 from gateway.vehicle.services.ftp import FtpService, Opcode, decode_packet, full_path
 from gateway.vehicle.services.parameter_service import BY_NAME
 
@@ -93,7 +93,7 @@ class CachedVehicle(RecordedVehicle):
             case "MISSION_ACK" if message.type == ACCEPTED:
                 return self._downloads.pop(_download(request), False)
             case "COMMAND_LONG" | "COMMAND_INT":
-                wanted = requested_message(read_command(request))
+                wanted = read_command(request).wanted
                 return wanted is not None and self._held.has_message(wanted.message_id)
             case "FILE_TRANSFER_PROTOCOL":
                 return self._files.holds(request)

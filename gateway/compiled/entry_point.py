@@ -169,7 +169,6 @@ def code_digest(source: bytes) -> str:
 
 
 def _is_text(statement: ast.AST) -> bool:
-    """Return whether a statement is only a string."""
     value = statement.value if isinstance(statement, ast.Expr) else None
     return isinstance(value, ast.Constant) and isinstance(value.value, str)
 

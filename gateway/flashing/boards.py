@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Annotated, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal, get_args
 
 import msgspec
 import serial
@@ -48,6 +48,14 @@ SX1276: Final = (
     "lora_power_dbm",
     "lora_sync_word",
 )
+CODED: Final[dict[str, tuple[Any, ...]]] = {
+    "radio": RADIOS,
+    "radio_power_dbm": POWERS_DBM,
+    "accel_range_g": ACCEL_RANGES_G,
+    "gyro_range_dps": GYRO_RANGES_DPS,
+    **dict.fromkeys(("imu_raw", "soft_restart", "lora_foreign"), (False, True)),
+}
+"""Settings of which the block contains the position among these values."""
 _NODE: Final = ("vehicle_id", "node_id", "radio_pipe", "soft_restart")
 IMU_SEND_HZ: Final[dict[Radio, tuple[int, int]]] = {"nrf24": (60, 250), "sx1276": (4, 20)}
 """Minimum and maximum number of IMU samples per second, by radio."""
@@ -190,12 +198,7 @@ def _decode(block: bytes, offset: int) -> SettingsBlock:
         raise FlashError(f"{text}: use a newer one")
     found = dict(zip(BoardSettings.__struct_fields__, values[6:], strict=True))
     try:
-        found["radio"] = RADIOS[found["radio"]]
-        found["radio_power_dbm"] = POWERS_DBM[found["radio_power_dbm"]]
-        found["accel_range_g"] = round(ACCEL_RANGES_G[found["accel_range_g"]])
-        found["gyro_range_dps"] = round(GYRO_RANGES_DPS[found["gyro_range_dps"]])
-        for name in ("imu_raw", "soft_restart", "lora_foreign"):
-            found[name] = bool(found[name])
+        found |= {name: values[found[name]] for name, values in CODED.items()}
         settings = msgspec.convert(found, BoardSettings)
         kind = Program(program)
     except (IndexError, ValueError) as error:
@@ -247,10 +250,7 @@ def with_settings(image: IntelHex, settings: BoardSettings) -> bytes:
     """Return an image with other settings, as an Intel HEX file."""
     block = block_of(image)
     found = msgspec.to_builtins(settings)
-    found["radio_power_dbm"] = POWERS_DBM.index(settings.radio_power_dbm)
-    found["accel_range_g"] = ACCEL_RANGES_G.index(settings.accel_range_g)
-    found["gyro_range_dps"] = GYRO_RANGES_DPS.index(settings.gyro_range_dps)
-    found["radio"] = RADIOS.index(settings.radio)
+    found |= {name: values.index(found[name]) for name, values in CODED.items()}
     head = (VERSION, block.program, block.clock_mhz, *block.firmware_version)
     content = _LAYOUT.pack(MAGIC, *head, *found.values())
     image.puts(block.offset, content + _CRC.pack(crc16(content)))

@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from gateway.records import Vec3
 
 Matrix3 = tuple[Vec3, Vec3, Vec3]
@@ -41,23 +43,14 @@ def euler_deg_from_matrix(matrix: Matrix3) -> Vec3:
     return (math.degrees(roll), math.degrees(pitch), math.degrees(yaw))
 
 
-def determinant(matrix: Matrix3) -> float:
-    """Return the determinant; negative if the rows are left-handed."""
-    (a, b, c), (d, e, f), (g, h, i) = matrix
-    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-
-
 def is_rotation(matrix: Matrix3) -> bool:
     """Return whether the rows are orthonormal and right-handed.
 
     The tolerance is a thousandth in every product of two rows, which may be rounded by a user.
     """
-    products = (
-        (sum(a * b for a, b in zip(matrix[m], matrix[n], strict=True)), float(m == n))
-        for m in range(3)
-        for n in range(m, 3)
-    )
-    return determinant(matrix) > 0.0 and all(abs(p - wanted) <= 1e-3 for p, wanted in products)
+    rows = np.array(matrix)
+    is_orthonormal = np.abs(rows @ rows.T - np.eye(3)).max() <= 1e-3
+    return bool(is_orthonormal and np.linalg.det(rows) > 0.0)
 
 
 def _cos_sin(angle_deg: float) -> tuple[float, float]:

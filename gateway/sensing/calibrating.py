@@ -365,7 +365,6 @@ def _is_still(samples: NodeSamples, window: slice) -> bool:
 
 
 def _runs(windows: list[slice]) -> list[list[slice]]:
-    """Join successive windows."""
     runs: list[list[slice]] = []
     for window in windows:
         if runs and runs[-1][-1].stop == window.start:

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.geometry.rotation import Matrix3, determinant, is_rotation
+from gateway.geometry.rotation import Matrix3, is_rotation
 from gateway.records import ImuFlags, ImuRaw, Int3, Vec3
 from gateway.settings import Settings, setting
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
@@ -122,7 +122,7 @@ class NodeCalibration(Settings, frozen=True):
             if not is_rotation(getattr(self, name)):
                 raise ValueError(f"{name} must be a rotation: orthogonal rows of length one")
         for name in ("accel_matrix", "mag_soft_iron"):
-            if abs(determinant(getattr(self, name))) < _FLAT:
+            if abs(np.linalg.det(getattr(self, name))) < _FLAT:
                 raise ValueError(f"{name} must have an inverse: no row made of the others")
 
 

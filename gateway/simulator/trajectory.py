@@ -167,24 +167,9 @@ class Trajectory:
         """Return the true state at times from the start, (N,); beyond `FLIGHT_S` it repeats."""
         t = np.asarray(time_s, dtype=np.float64)
         phase = t % FLIGHT_S
-        pos, accel, angles = self._pos(phase), self._accel(phase), self._angles(phase)
-        q_nb = from_euler_array(angles)
-        force_n = accel - (0.0, 0.0, STANDARD_GRAVITY_MPS2)
-        home = self._settings
-        ellipsoid_m = home.home_alt_m + home.geoid_separation_m
-        meridian_m, parallel_m = radii_m(home.home_lat_deg, ellipsoid_m)
-        return Truth(
-            time_s=t,
-            lat_deg=home.home_lat_deg + np.degrees(pos[:, 0] / meridian_m),
-            lon_deg=home.home_lon_deg + np.degrees(pos[:, 1] / parallel_m),
-            alt_amsl_m=home.home_alt_m - pos[:, 2],
-            pos_n_m=pos,
-            vel_n_mps=self._vel(phase),
-            q_nb=q_nb,
-            rate_b_radps=body_rates(angles, self._angle_rates(phase)),
-            accel_b_mps2=rotate_inverse(q_nb, force_n),
-            airspeed_mps=self._airspeed(phase),
-        )
+        motion = (self._pos(phase), self._vel(phase), self._accel(phase))
+        turning = (self._angles(phase), self._angle_rates(phase))
+        return _truth(self._settings, t, motion, turning, self._airspeed(phase))
 
     def attitude_at(self, time_s: FloatArray) -> FloatArray:
         """Return `q_nb` alone, shape (N, 4), at times as in `truth_at`."""
@@ -273,6 +258,32 @@ class _Commands:
         )
 
 
+def _truth(
+    home: SimulatorSettings,
+    time_s: FloatArray,
+    motion: tuple[FloatArray, FloatArray, FloatArray],
+    turning: tuple[FloatArray, FloatArray],
+    airspeed_mps: FloatArray,
+) -> Truth:
+    """Return the state from position, velocity and acceleration, and from the angles and rates."""
+    pos, vel, accel = motion
+    q_nb = from_euler_array(turning[0])
+    ellipsoid_m = home.home_alt_m + home.geoid_separation_m
+    meridian_m, parallel_m = radii_m(home.home_lat_deg, ellipsoid_m)
+    return Truth(
+        time_s=time_s,
+        lat_deg=home.home_lat_deg + np.degrees(pos[:, 0] / meridian_m),
+        lon_deg=home.home_lon_deg + np.degrees(pos[:, 1] / parallel_m),
+        alt_amsl_m=home.home_alt_m - pos[:, 2],
+        pos_n_m=pos,
+        vel_n_mps=vel,
+        q_nb=q_nb,
+        rate_b_radps=body_rates(*turning),
+        accel_b_mps2=rotate_inverse(q_nb, accel - (0.0, 0.0, STANDARD_GRAVITY_MPS2)),
+        airspeed_mps=airspeed_mps,
+    )
+
+
 def rotate_inverse(q_nb: FloatArray, v_n: FloatArray) -> FloatArray:
     """Rotate vectors from NED, (N, 3) or (3,), to the body frame of attitudes, shape (N, 4)."""
     return np.asarray(Rotation.from_quat(q_nb, scalar_first=True).apply(v_n, inverse=True))
@@ -358,21 +369,8 @@ class Workbench:
         """Return the true state at any times, as `Trajectory.truth_at`."""
         t = np.asarray(time_s, dtype=np.float64)
         self._sampled_s = max(self._sampled_s, float(t.max(initial=0.0)))
-        angles, rates = self._angles(t)
-        q_nb = from_euler_array(angles)
-        home, still = self._settings, np.zeros((len(t), 3))
-        return Truth(
-            time_s=t,
-            lat_deg=np.full(len(t), home.home_lat_deg),
-            lon_deg=np.full(len(t), home.home_lon_deg),
-            alt_amsl_m=np.full(len(t), home.home_alt_m),
-            pos_n_m=still,
-            vel_n_mps=still,
-            q_nb=q_nb,
-            rate_b_radps=body_rates(angles, rates),
-            accel_b_mps2=rotate_inverse(q_nb, np.array([0.0, 0.0, -STANDARD_GRAVITY_MPS2])),
-            airspeed_mps=np.zeros(len(t)),
-        )
+        still = np.zeros((len(t), 3))
+        return _truth(self._settings, t, (still, still, still), self._angles(t), still[:, 0])
 
     def attitude_at(self, time_s: FloatArray) -> FloatArray:
         """Return `q_nb` alone, shape (N, 4)."""

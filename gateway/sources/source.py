@@ -12,7 +12,7 @@ civil time is that of this machine.
 """
 
 from abc import ABC, abstractmethod
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -36,11 +36,10 @@ from gateway.sources.recorded_bytes import TunnelWriter
 from gateway.sources.settings import SourceUrl
 from gateway.units import US_PER_S
 from gateway.wire.framing import Fault
+from gateway.wire.link import Arrivals
 
 SourceRecord = ImuRaw | BaroRaw | GpsFix | VehicleReport
 
-MAX_ARRIVALS: Final = 2048
-"""Arrival times stored to compute the rate; more than any source sends in a second."""
 MAX_KINDS: Final = 32
 """Maximum number of kinds of faults that are counted by name."""
 MAX_DETAIL: Final = 200
@@ -182,11 +181,7 @@ class _Node:
     last_us: int
     received: int = 0
     signal: RadioSignal | None = None
-    arrivals_us: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_ARRIVALS))
-
-    def rate_hz(self, now_us: int) -> float:
-        """Return the number of records in the last second."""
-        return float(sum(us > now_us - US_PER_S for us in self.arrivals_us))
+    arrivals: Arrivals = field(default_factory=Arrivals)
 
 
 class SourceInput:
@@ -217,7 +212,7 @@ class SourceInput:
             node = self._nodes.setdefault(event.node, _Node(now_us))
             node.received += 1
             node.last_us = now_us
-            node.arrivals_us.append(now_us)
+            node.arrivals.times_us.append(now_us)
             if isinstance(event, VehicleReport) and event.signal is not None:
                 node.signal = event.signal
             elif signal is not None:
@@ -268,7 +263,7 @@ class SourceInput:
             tuple(sorted(self._faults.items())),
             self._newest_fault,
             max((node.last_us for node in self._nodes.values()), default=None),
-            sum(node.rate_hz(now_us) for node in self._nodes.values()),
+            sum(node.arrivals.rate_hz(now_us) for node in self._nodes.values()),
         )
 
     def links(self, now_us: int) -> list[NodeLink]:
@@ -277,7 +272,7 @@ class SourceInput:
             NodeLink(
                 node=key,
                 received=node.received,
-                rate_hz=node.rate_hz(now_us),
+                rate_hz=node.arrivals.rate_hz(now_us),
                 last_time_us=node.last_us,
                 signal=node.signal,
             )

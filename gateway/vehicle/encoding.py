@@ -7,6 +7,7 @@ read as unknown.
 
 import math
 import struct
+from functools import partial
 from operator import itemgetter
 from typing import Any, Final
 
@@ -14,7 +15,7 @@ import msgspec
 from fastcrc.crc16 import mcrf4xx
 
 from gateway.records import EVERYBODY, START_V2, MavFrame, Outgoing
-from gateway.wire.mavlink_messages import TARGET_OFFSETS
+from gateway.wire.mavlink_messages import INTEGER_LIMITS, TARGET_OFFSETS
 
 INT16_MAX: Final = 2**15 - 1
 INT32_MAX: Final = 2**31 - 1
@@ -28,11 +29,6 @@ _pack_head: Final = struct.Struct("<BBBBB5s").pack
 """Head of a frame: start, length, two flag bytes, sequence, and the key (system, component and
 message)."""
 _KEY: Final = struct.Struct("<BBHB")
-_INTEGER_LIMITS: Final = {
-    f"{sign}int{bits}_t": (0, 2**bits - 1) if sign else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
-    for sign in ("u", "")
-    for bits in (8, 16, 32, 64)
-}
 
 
 def whole(value: float, low: int, high: int, unknown: int) -> int:
@@ -56,19 +52,11 @@ def uint16(value: float, unknown: int = UINT16_MAX) -> int:
     return whole(value, 0, UINT16_MAX - (unknown == UINT16_MAX), unknown)
 
 
-def int16(value: float) -> int:
-    """Fit a signed 16-bit field, which has no value for unknown; it gets 0."""
-    return whole(value, -INT16_MAX - 1, INT16_MAX, 0)
-
-
-def int32(value: float) -> int:
-    """Fit a signed 32-bit field, which has no value for unknown; it gets 0."""
-    return whole(value, -INT32_MAX - 1, INT32_MAX, 0)
-
-
-def uint32(value: float) -> int:
-    """Fit an unsigned 32-bit field; as an extension field its 0 means unknown."""
-    return whole(value, 0, UINT32_MAX, 0)
+int16 = partial(whole, low=-INT16_MAX - 1, high=INT16_MAX, unknown=0)
+int32 = partial(whole, low=-INT32_MAX - 1, high=INT32_MAX, unknown=0)
+"""Fit signed fields, which have no value for unknown; it is sent as 0."""
+uint32 = partial(whole, low=0, high=UINT32_MAX, unknown=0)
+"""Fit an unsigned 32-bit field; as an extension field its 0 means unknown."""
 
 
 def compass_cdeg(angle_rad: float) -> int:
@@ -195,8 +183,8 @@ def _saturate(message: Any) -> None:
 
 
 def _fit(value: float, kind: str) -> float:
-    if kind in _INTEGER_LIMITS:
-        low, high = _INTEGER_LIMITS[kind]
+    if kind in INTEGER_LIMITS:
+        low, high = INTEGER_LIMITS[kind]
         return 0 if math.isnan(value) else int(max(low, min(high, value)))
     if math.isfinite(value) and kind == "float":
         return max(-FLOAT32_MAX, min(FLOAT32_MAX, value))

@@ -46,7 +46,6 @@ from gateway.vehicle.services.commands import (
     CommandService,
     QueryService,
     read_command,
-    requested_message,
 )
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.missions import MissionService
@@ -89,8 +88,6 @@ class Answers(Protocol):
 
 
 class _Parameters(ReadOnlyParameters[bytes]):
-    """The recorded values."""
-
     def __init__(self, answers: Answers) -> None:
         super().__init__()
         self._answers = answers
@@ -133,7 +130,7 @@ class _Commands(Service):
     def changes_state(self, request: Request) -> bool:
         command = read_command(request)
         is_query = command.number in (SET_INTERVAL, GET_INTERVAL)
-        return not is_query and requested_message(command) is None
+        return not is_query and command.wanted is None
 
     def refuse(self, request: Request, result: int) -> list[Answer]:
         return [read_command(request).ack(result)]
@@ -142,7 +139,7 @@ class _Commands(Service):
         command = read_command(request)
         if command.number == SET_INTERVAL:
             return self._thin(command)
-        wanted = requested_message(command)
+        wanted = command.wanted
         return [command.ack(UNSUPPORTED)] if wanted is None else self._send(command, wanted)
 
     def _send(self, command: Command, wanted: MessageRequest) -> list[Answer]:
@@ -246,7 +243,6 @@ class RecordedVehicle:
         return [request.reply(each.message) for each in found if isinstance(each, Reply)]
 
     def _recorded(self, message_id: int, _now_us: int) -> Any:
-        """Return a recorded message; None if there is none."""
         frames = self._answers.frames(message_id)
         return _MAVLINK.decode(bytearray(frames[0])) if frames else None
 

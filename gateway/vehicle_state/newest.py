@@ -13,7 +13,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import from_euler
-from gateway.records import NAN, UNKNOWN_VEC3, Quat, Vec3
+from gateway.records import NAN, UNKNOWN_QUAT, UNKNOWN_VEC3, Quat, Vec3
 from gateway.units import DEG_PER_CDEG, FIX_2D, M_PER_CM, M_PER_MM, MV_PER_V, US_PER_S
 from gateway.vehicle_state.positions import (
     RANKS,
@@ -43,7 +43,6 @@ QUALITY_OLD_US: Final = 15 * US_PER_S
 """Maximum age of an estimator's report that applies to the present position."""
 ATTITUDE_FRESH_US: Final = US_PER_S
 """Maximum age of a quaternion that is preferred to the angles."""
-UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
 MAX_MODES: Final = 256
 """Maximum number of modes of one vehicle; their number in AVAILABLE_MODES is one byte."""
 UNKNOWN_SATELLITES: Final = 255

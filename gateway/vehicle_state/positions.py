@@ -114,19 +114,12 @@ class LocalFrame:
     lon_deg: float
     alt_m: float
 
-    def north_m(self, lat_deg: FloatArray) -> FloatArray:
-        """Convert latitudes to metres north."""
-        meridian, _ = radii_m(self.lat_deg, self.alt_m)
-        return np.asarray(np.radians(lat_deg - self.lat_deg) * meridian)
-
-    def east_m(self, lon_deg: FloatArray) -> FloatArray:
-        """Convert longitudes to metres east, in the shorter direction."""
-        _, parallel = radii_m(self.lat_deg, self.alt_m)
-        return np.asarray(np.radians(wrap_180(lon_deg - self.lon_deg)) * parallel)
-
     def local_m(self, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArray:
-        """Convert positions to metres, shape (N, 2): north and east."""
-        return np.column_stack([self.north_m(lat_deg), self.east_m(lon_deg)])
+        """Convert positions to metres, shape (N, 2): north, and east in the shorter direction."""
+        meridian, parallel = radii_m(self.lat_deg, self.alt_m)
+        north_m = np.radians(lat_deg - self.lat_deg) * meridian
+        east_m = np.radians(wrap_180(lon_deg - self.lon_deg)) * parallel
+        return np.column_stack([north_m, east_m])
 
 
 def is_located(lat_dege7: Any, lon_dege7: Any) -> Any:

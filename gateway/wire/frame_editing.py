@@ -119,7 +119,6 @@ def _packed(message_id: int, name: str, value: Any) -> tuple[int, bytes]:
 
 @cache
 def _field(message_id: int, name: str) -> tuple[int, np.dtype[Any], tuple[int, ...]]:
-    """Return offset, type and shape of a field."""
     layout = layout_of(message_id)
     if layout.fields is None or name not in layout.fields:
         raise ValueError(f"{MESSAGE_NAMES[message_id]} has no field {name}")

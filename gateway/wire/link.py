@@ -43,11 +43,10 @@ SLOWED: Final = 64
 """Divisor of the elapsed time: the maximum by which a sample's interval may be shortened."""
 MOST_AHEAD_US: Final = 50_000
 """A larger correction of the clock estimate is applied at once."""
-RATE_SPAN_US: Final = US_PER_S
 MAX_PACKETS: Final = 64
 """Maximum waiting packets: more than in a chunk of the line, or than a slow radio sends in 1 s."""
 MAX_ARRIVALS: Final = 2048
-"""Twice the payloads that a node sends in `RATE_SPAN_US` at the radio's maximum rate."""
+"""Twice the payloads that a node sends in a second at the radio's maximum rate."""
 
 
 class Arrival(Enum):
@@ -108,10 +107,20 @@ class SequenceCounter:
         return Arrival.NEW
 
 
+class Arrivals:
+    """Times of the newest payloads or records of one sender."""
+
+    def __init__(self) -> None:
+        self.times_us: deque[int] = deque(maxlen=MAX_ARRIVALS)
+
+    def rate_hz(self, now_us: int) -> float:
+        """Return their number in the last second."""
+        recent = takewhile(lambda us: us > now_us - US_PER_S, reversed(self.times_us))
+        return float(sum(1 for _ in recent))
+
+
 @dataclass(slots=True)
 class _Node:
-    """State of the link to one node."""
-
     clock: ClockTracker = field(default_factory=ClockTracker)
     restarts: int = 0
     """Restarts of its clock that were processed."""
@@ -123,7 +132,7 @@ class _Node:
     """Newest time on the node's clock; None before the first payload after its start."""
     quality: payloads.GpsQualityPayload | None = None
     faults: Counter[str] = field(default_factory=Counter)
-    arrivals_us: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_ARRIVALS))
+    arrivals: Arrivals = field(default_factory=Arrivals)
 
     def begin_run(self) -> None:
         """Begin a new sequence if the clock has restarted and was not only halted."""
@@ -244,7 +253,7 @@ def _receive(
         node.faults["sequence"] += 0 < (stamp_us - last_us) % WRAP_US < WRAP_US // 2
         return None
     node.pipe, node.signal = frame.pipe, frame.signal
-    node.arrivals_us.append(arrival_us)
+    node.arrivals.times_us.append(arrival_us)
     node.last_time_us = time_us = _never_back(node, stamp_us, time_us)
     node.last_stamp_us = stamp_us
     if not isinstance(payload, payloads.ImuPayload):
@@ -287,17 +296,13 @@ def _to_record(
     | payloads.NodeStatusPayload,
     node: _Node,
 ) -> RawRecord | None:
+    stamps = (node.last_time_us, header.node, header.node_time_us)
     match payload:
         case payloads.BaroPayload():
-            return BaroRaw(
-                time_us=node.last_time_us,
-                node=header.node,
-                node_time_us=header.node_time_us,
-                pressure_pa=payload.pressure_centipa * 1e-2,
-                temperature_degc=payload.temperature_ddegc * 1e-1,
-            )
+            pressure_pa, degc = payload.pressure_centipa * 1e-2, payload.temperature_ddegc * 1e-1
+            return BaroRaw(*stamps, pressure_pa, degc)
         case payloads.GpsFixPayload():
-            return _gps_fix(header, payload, node)
+            return _gps_fix(stamps, payload, node.quality)
         case payloads.GpsQualityPayload():
             node.quality = payload
             node.faults["gps_date"] += payload.utc is not None and payload.utc.year < FIRST_YEAR
@@ -306,14 +311,16 @@ def _to_record(
             # The fields have the same names, except for the chips.
             fields = msgspec.structs.asdict(payload)
             chips = chip_names(fields.pop("chips"), payload.sensors_present)
-            stamps = (node.last_time_us, header.node, header.node_time_us)
             return NodeStatus(*stamps, chips=chips, **fields)
 
 
-def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) -> GpsFix:
+def _gps_fix(
+    stamps: tuple[int, NodeId, int],
+    fix: payloads.GpsFixPayload,
+    quality: payloads.GpsQualityPayload | None,
+) -> GpsFix:
     north, east, down = fix.vel_n_cmps
     alt_amsl_m = fix.alt_amsl_mm * M_PER_MM
-    quality = node.quality
     separation_m = NAN if quality is None else quality.geoid_separation_cm * M_PER_CM
     # The accuracy of another epoch is not that of this fix; the geoid height stays valid.
     if quality is None or quality.itow_ms != fix.itow_ms:
@@ -322,9 +329,7 @@ def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) 
     if quality.utc is not None and quality.utc.year >= FIRST_YEAR:
         utc_us = round(quality.utc.timestamp() * US_PER_S)
     return GpsFix(
-        time_us=node.last_time_us,
-        node=header.node,
-        node_time_us=header.node_time_us,
+        *stamps,
         itow_ms=fix.itow_ms,
         fix_type=fix.fix_type,
         fix_ok=fix.fix_ok,
@@ -350,8 +355,6 @@ def _unless_saturated(value: float, scale: float) -> float:
 
 def _node_link(node_id: NodeId, node: _Node, now_us: int) -> NodeLink:
     counter = node.sequence
-    newest_first = reversed(node.arrivals_us)
-    recent = sum(1 for _ in takewhile(lambda us: us > now_us - RATE_SPAN_US, newest_first))
     return NodeLink(
         node=node_id,
         pipe=node.pipe,
@@ -360,8 +363,8 @@ def _node_link(node_id: NodeId, node: _Node, now_us: int) -> NodeLink:
         duplicates=counter.duplicates,
         reordered=counter.reordered,
         restarts=node.clock.restarts,
-        rate_hz=recent * US_PER_S / RATE_SPAN_US,
-        last_time_us=node.arrivals_us[-1],
+        rate_hz=node.arrivals.rate_hz(now_us),
+        last_time_us=node.arrivals.times_us[-1],
         clock_skew_ppm=node.clock.skew_ppm,
         signal=node.signal,
     )

@@ -27,6 +27,7 @@ import msgspec
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import counted
+from gateway.wire.mavlink_messages import INTEGER_LIMITS
 
 CLASSES: Final = {kind.msgname: kind for kind in mavlink.mavlink_map.values()}
 NUL: Final = "\0"
@@ -34,11 +35,6 @@ BITMASK: Final = "bitmask"
 TARGETS: Final = ("target_system", "target_component")
 """Fields that may be missing: 0 addresses all systems or components."""
 RENAMED: Final = {"type": "mavtype"}
-INTEGERS: Final = {
-    **{f"uint{bits}_t": (0, (1 << bits) - 1) for bits in (8, 16, 32, 64)},
-    **{f"int{bits}_t": (-1 << bits - 1, (1 << bits - 1) - 1) for bits in (8, 16, 32, 64)},
-}
-"""Minimum and maximum value by type."""
 MAX_FLOAT: Final = 3.4028234663852886e38
 """Largest finite 32-bit float."""
 MAX_SHOWN: Final = 40
@@ -49,16 +45,12 @@ _Byte = Annotated[int, msgspec.Meta(ge=0, le=255)]
 
 
 class _Header(msgspec.Struct, frozen=True):
-    """Sender of a message."""
-
     system_id: _Byte
     component_id: _Byte
     sequence: _Byte = 0
 
 
 class _Given(msgspec.Struct, frozen=True):
-    """A message to be sent."""
-
     header: _Header
     message: dict[str, Any]
 
@@ -241,7 +233,7 @@ def _bounded(value: Any, form: str) -> int | float:
         if form == "float" and math.isfinite(number) and abs(number) > MAX_FLOAT:
             raise BadMessageError(f"{_short(value)} is too large for a 32-bit float")
         return number
-    least, greatest = INTEGERS[form]
+    least, greatest = INTEGER_LIMITS[form]
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int):

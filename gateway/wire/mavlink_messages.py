@@ -15,6 +15,12 @@ from pymavlink.dialects.v20 import all as dialect
 from gateway.records import MavFrame
 
 _TYPES: Final = {"uint8_t": "B", "uint16_t": "H", "uint32_t": "I", "char": "c"}
+INTEGER_LIMITS: Final = {
+    f"{sign}int{bits}_t": (0, 2**bits - 1) if sign else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+    for sign in ("u", "")
+    for bits in (8, 16, 32, 64)
+}
+"""Minimum and maximum value by type of a field."""
 NO_TARGET: Final = -1
 MAX_ID_V1: Final = 255
 """Largest message id of MAVLink 1."""

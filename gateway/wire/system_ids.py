@@ -97,7 +97,6 @@ def rename_systems(
 
 
 def _renamed_fields(frame: MavFrame, rename: Callable[[int], int]) -> dict[str, Any]:
-    """Return the fields whose values change."""
     message_id = frame.message_id
     layout = layout_of(message_id)
     values = np.frombuffer(frame.payload.ljust(layout.itemsize, b"\0"), layout, 1)[0]

@@ -241,8 +241,8 @@ def draw_path(
 
 def _graticule(axes: Axes, frame: LocalFrame) -> None:
     """Label latitude and longitude on the upper and right side."""
-    per_lat = float(frame.north_m(np.array([frame.lat_deg + 1.0]))[0])
-    per_lon = float(frame.east_m(np.array([frame.lon_deg + 1.0]))[0])
+    corner_deg = np.array([[frame.lat_deg + 1.0], [frame.lon_deg + 1.0]])
+    per_lat, per_lon = frame.local_m(*corner_deg)[0].tolist()
     for add, side, origin, scale, name in (
         (axes.secondary_yaxis, "right", frame.lat_deg, per_lat, "latitude (deg)"),
         (axes.secondary_xaxis, "top", frame.lon_deg, per_lon, "longitude (deg)"),

@@ -116,6 +116,11 @@ class Command:
     frame: int = mavlink.MAV_FRAME_GLOBAL
 
     @property
+    def wanted(self) -> MessageRequest | None:
+        """The message that it requests; None if it is another command."""
+        return read_request(self.number, self.params)
+
+    @property
     def location(self) -> tuple[float, float, float]:
         """Latitude and longitude in deg, and height in m in its frame."""
         is_scaled = self.request.message.get_type() == "COMMAND_INT" and self.frame in GLOBAL_FRAMES
@@ -145,11 +150,6 @@ def read_command(request: Request) -> Command:
     if m.get_type() == "COMMAND_INT":
         return Command(request, m.command, (*first, m.x, m.y, m.z), m.frame)
     return Command(request, m.command, (*first, m.param5, m.param6, m.param7))
-
-
-def requested_message(command: Command) -> MessageRequest | None:
-    """Return the message that a command requests, if it is such a command."""
-    return read_request(command.number, command.params)
 
 
 class IntervalService(Service):
@@ -188,7 +188,6 @@ class IntervalService(Service):
         return answers
 
     def _set(self, command: Command, _now_us: int) -> Outcome:
-        """Apply one client's requested interval."""
         message_id, interval_us = whole(command.params[0]), command.params[1]
         if not math.isfinite(interval_us):
             return DENIED, []
@@ -311,7 +310,7 @@ class CommandService(Service):
         return [command.ack(result), *answers]
 
     def _request_message(self, command: Command, now_us: int) -> Outcome:
-        wanted, request = requested_message(command), command.request
+        wanted, request = command.wanted, command.request
         message_id = -1 if wanted is None else wanted.message_id
         if message_id == mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
             # The second parameter is the message whose interval is requested.

@@ -227,13 +227,11 @@ class FtpService(TransferService):
         return data
 
     def _content(self, request: Request, packet: Packet) -> bytes:
-        """Return the file of the client's session."""
         if not self.has_session(request, packet):
             raise _RefusedError(FtpError.INVALID_SESSION)
         return self._sessions[packet.session].content
 
     def _content_from(self, request: Request, packet: Packet) -> bytes:
-        """Return the rest of the file from the requested offset."""
         rest = self._content(request, packet)[packet.offset :]
         if not rest:
             raise _RefusedError(FtpError.EOF)

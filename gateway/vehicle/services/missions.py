@@ -228,7 +228,6 @@ class MissionService(Service):
         return write_item(items[sequence], sequence, kind, target, is_current, floats)
 
     def _sent(self, kind: int) -> Items:
-        """Return the items that a client gets."""
         return self._empty() if kind == MISSION and not self.items[kind] else self.items[kind]
 
     def _list(self, request: Request, _now_us: int) -> list[Answer]:

@@ -293,7 +293,6 @@ def _axes(field: Field) -> tuple[str, ...]:
 
 
 def _angle_field(field: Field, axis: int) -> Field:
-    """Describe one angle of a rotation."""
     what = field.meaning.partition(". ")[0]
     _, name, limit = ANGLES[axis]
     return replace(
@@ -359,7 +358,6 @@ class Metadata:
 
 
 def _named(path: str, system_id: int) -> str:
-    """Return the path of a vehicle's file."""
     stem, ending = path.split(".", 1)
     return f"{stem}-{system_id}.{ending}"
 

@@ -208,7 +208,6 @@ class Announcements(Announcer):
         return found
 
     def _on_flags(self, texts: FlagTexts, changed: int, flags: int, now_us: int) -> list[Answer]:
-        """Announce the flags that changed."""
         found = []
         for flag, raised, fallen in texts:
             if changed & flag:

@@ -14,19 +14,18 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.geometry.quaternion import from_euler
 from gateway.records import (
     NAN,
+    UNKNOWN_QUAT,
     UNKNOWN_VEC3,
     BatteryReport,
     GpsFix,
     NavFlags,
     NavState,
-    Quat,
     VehicleReport,
 )
 from gateway.units import DEG_PER_DEGE7, MV_PER_V, US_PER_S
 from gateway.vehicle import encoding
 from gateway.vehicle.plan import is_3d
 
-UNKNOWN_QUAT: Final[Quat] = (NAN, NAN, NAN, NAN)
 WITHOUT_IMU_US: Final = 3 * US_PER_S
 """Time without an IMU sample after which a vehicle's position is taken from its fixes."""
 RARE_US: Final = 15 * US_PER_S
