@@ -119,16 +119,6 @@ class MoreNeeded(CalibrationError):  # noqa: N818 - not an error while samples a
 
 
 @dataclass(frozen=True, slots=True)
-class SphereFit:
-    """Bias and matrix that bring vectors onto a sphere: `matrix @ (s - bias)`."""
-
-    bias: Vec3
-    matrix: Matrix3
-    residual: float
-    """RMS error of the radius after the correction, in the unit of the samples."""
-
-
-@dataclass(frozen=True, slots=True)
 class NodeSamples:
     """Samples of one node in SI; in sensor axes and uncorrected, or in body axes."""
 
@@ -175,28 +165,35 @@ def distinct_poses(accel: FloatArray, windows: list[slice]) -> FloatArray:
     return np.array([np.mean(pose, axis=0) for pose in poses]).reshape(-1, 3)
 
 
-def solve_accelerometer(poses: FloatArray) -> SphereFit:
-    """Fit bias and scale so that every pose measures one gravity [1]_."""
+def fit_accelerometer(poses: FloatArray, calibration: NodeCalibration) -> NodeCalibration:
+    """Fit bias and scale so that every pose, shape (n, 3), measures one gravity [1]_."""
     if len(poses) < MIN_POSES:
         found = counted(len(poses), "pose")
         raise MoreNeeded(f"{found} where {MIN_POSES} are needed, one on each side")
     _check_spread(poses, STANDARD_GRAVITY_MPS2, "lay the node on every one of its six sides")
-    fit = _fit_sphere(poses, STANDARD_GRAVITY_MPS2, skew=len(poses) >= POSES_FOR_SKEW)
-    scale_off = float(np.abs(np.linalg.eigvalsh(np.array(fit.matrix)) - 1.0).max())
+    skew = len(poses) >= POSES_FOR_SKEW
+    bias, matrix, residual = _fit_sphere(poses, STANDARD_GRAVITY_MPS2, skew=skew)
+    scale_off = float(np.abs(np.linalg.eigvalsh(np.array(matrix)) - 1.0).max())
     advice = "hold every side still; a sensor that always does this is broken"
-    _check_bound("bias", math.hypot(*fit.bias), MAX_ACCEL_BIAS_MPS2, " m/s2", advice)
+    _check_bound("bias", math.hypot(*bias), MAX_ACCEL_BIAS_MPS2, " m/s2", advice)
     _check_bound("scale error", scale_off, MAX_ACCEL_SCALE_OFF, "", advice)
-    _check_bound("residual", fit.residual, MAX_ACCEL_RESIDUAL_MPS2, " m/s2", advice)
-    return fit
+    _check_bound("residual", residual, MAX_ACCEL_RESIDUAL_MPS2, " m/s2", advice)
+    return msgspec.structs.replace(
+        calibration, accel_bias_mps2=bias, accel_matrix=matrix, accel_residual_mps2=residual
+    )
 
 
-def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> SphereFit:
+def calibrate_magnetometer(
+    field: FloatArray, calibration: NodeCalibration, strength_ut: float | None = None
+) -> NodeCalibration:
     """Fit hard and soft iron so that the field has the same strength in all directions [2]_.
 
     Parameters
     ----------
     field : ndarray, shape (n, 3)
         Field in sensor axes, uT, while the aircraft was turned about all its axes.
+    calibration : NodeCalibration
+        Its other values are kept.
     strength_ut : float, optional
         Strength to scale to; by default the mean of the samples about their centre.
 
@@ -217,12 +214,14 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
     if not FIELD_UT[0] <= radius <= FIELD_UT[1]:
         text = f"the fit gave {radius:.0f} uT, which is not the Earth's field"
         raise CalibrationError(f"{text}: {advice}")
-    fit = _fit_sphere(field, strength_ut or radius, skew=True, start=centre)
-    axes = np.abs(np.linalg.eigvalsh(np.array(fit.matrix)))
-    _check_bound("hard iron", math.hypot(*fit.bias), MAX_HARD_IRON_UT, " uT", advice)
+    bias, matrix, residual = _fit_sphere(field, strength_ut or radius, skew=True, start=centre)
+    axes = np.abs(np.linalg.eigvalsh(np.array(matrix)))
+    _check_bound("hard iron", math.hypot(*bias), MAX_HARD_IRON_UT, " uT", advice)
     _check_bound("soft iron", float(axes.max() / axes.min()), MAX_SOFT_IRON, "", advice)
-    _check_bound("residual", fit.residual, MAX_MAG_RESIDUAL * radius, " uT", advice)
-    return fit
+    _check_bound("residual", residual, MAX_MAG_RESIDUAL * radius, " uT", advice)
+    return msgspec.structs.replace(
+        calibration, mag_hard_iron_ut=bias, mag_soft_iron=matrix, mag_residual_ut=residual
+    )
 
 
 def solve_mounting(level: Vec3, nose_up: Vec3) -> Matrix3:
@@ -240,8 +239,11 @@ def solve_mounting(level: Vec3, nose_up: Vec3) -> Matrix3:
 
 def _fit_sphere(
     points: FloatArray, radius: float, *, skew: bool, start: FloatArray | None = None
-) -> SphereFit:
-    """Fit the radius by least squares (Gauss-Newton); the matrix is symmetric.
+) -> tuple[Vec3, Matrix3, float]:
+    """Fit the radius by least squares (Gauss-Newton).
+
+    Returns bias and symmetric matrix that bring the points onto the sphere, `matrix @ (p - bias)`,
+    and the RMS error of the radius.
 
     With `d = p - c`, `u = A d` and `n = u / |u|` the residual is `|u| - radius`, its derivatives
     are `-A n` by the centre and `n_j d_k + n_k d_j` by an element of the matrix.
@@ -266,7 +268,7 @@ def _fit_sphere(
             break
     lengths = np.linalg.norm((points - x[:3]) @ _symmetric(x[3:]), axis=1)
     residual = float(np.sqrt(np.mean((lengths - radius) ** 2)))
-    return SphereFit(_vec3(x[:3]), _matrix(_symmetric(x[3:])), residual)
+    return _vec3(x[:3]), _matrix(_symmetric(x[3:])), residual
 
 
 def _symmetric(x: FloatArray) -> FloatArray:
@@ -399,26 +401,8 @@ def calibrate_accelerometer(
 ) -> NodeCalibration:
     """Fit the accelerometer to the poses in the samples; each part has one or more poses."""
     poses = _poses_of(samples)
-    fit = solve_accelerometer(distinct_poses(poses, [slice(k, k + 1) for k in range(len(poses))]))
-    return msgspec.structs.replace(
-        calibration,
-        accel_bias_mps2=fit.bias,
-        accel_matrix=fit.matrix,
-        accel_residual_mps2=fit.residual,
-    )
-
-
-def calibrate_magnetometer(
-    field: FloatArray, calibration: NodeCalibration, strength_ut: float | None = None
-) -> NodeCalibration:
-    """Fit hard and soft iron to a field that was measured in all directions, shape (n, 3)."""
-    fit = solve_magnetometer(field, strength_ut)
-    return msgspec.structs.replace(
-        calibration,
-        mag_hard_iron_ut=fit.bias,
-        mag_soft_iron=fit.matrix,
-        mag_residual_ut=fit.residual,
-    )
+    distinct = distinct_poses(poses, [slice(k, k + 1) for k in range(len(poses))])
+    return fit_accelerometer(distinct, calibration)
 
 
 def calibrate_mounting(

@@ -38,10 +38,10 @@ def test_sphere_fit_finds_centre_and_radius(seed: int) -> None:
 def test_six_sides_give_bias_and_scale(seed: int) -> None:
     rng = np.random.default_rng(seed)
     bias, scale = rng.normal(0, 0.3, 3), 1.0 + rng.normal(0, 0.02, 3)
-    fit = solver.solve_accelerometer(SIDES / scale + bias)
-    np.testing.assert_allclose(fit.bias, bias, atol=1e-6)
-    np.testing.assert_allclose(np.diag(fit.matrix), scale, atol=1e-7)
-    assert fit.residual < 1e-6
+    fit = solver.fit_accelerometer(SIDES / scale + bias, NodeCalibration())
+    np.testing.assert_allclose(fit.accel_bias_mps2, bias, atol=1e-6)
+    np.testing.assert_allclose(np.diag(fit.accel_matrix), scale, atol=1e-7)
+    assert fit.accel_residual_mps2 < 1e-6
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -51,15 +51,15 @@ def test_eighteen_poses_determine_bias_and_misalignment(seed: int) -> None:
     matrix = np.eye(3) + 0.5 * (skew + skew.T)
     bias = rng.normal(0, 0.3, 3)
     poses = np.vstack([SIDES, sphere(rng, 12, G)])
-    fit = solver.solve_accelerometer(poses @ np.linalg.inv(matrix).T + bias)
-    np.testing.assert_allclose(fit.matrix, matrix, atol=1e-6)
-    np.testing.assert_allclose(fit.bias, bias, atol=1e-5)
+    fit = solver.fit_accelerometer(poses @ np.linalg.inv(matrix).T + bias, NodeCalibration())
+    np.testing.assert_allclose(fit.accel_matrix, matrix, atol=1e-6)
+    np.testing.assert_allclose(fit.accel_bias_mps2, bias, atol=1e-5)
 
 
 @pytest.mark.parametrize("poses", [SIDES[:5], np.vstack([SIDES[:4], SIDES[:4]])])
 def test_missing_sides_are_refused(poses: np.ndarray) -> None:
     with pytest.raises(solver.CalibrationError, match="side"):
-        solver.solve_accelerometer(poses)
+        solver.fit_accelerometer(poses, NodeCalibration())
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -69,16 +69,16 @@ def test_magnetometer_ellipsoid_gives_hard_and_soft_iron(seed: int) -> None:
     soft = np.eye(3) + 0.5 * (spread + spread.T)
     hard = rng.normal(0, 20.0, 3)
     raw = sphere(rng, 600, 45.0) @ np.linalg.inv(soft).T + hard + rng.normal(0, 0.2, (600, 3))
-    fit = solver.solve_magnetometer(raw, 45.0)
-    np.testing.assert_allclose(fit.bias, hard, atol=0.2)
-    np.testing.assert_allclose(fit.matrix, soft, atol=0.01)
-    assert fit.residual == pytest.approx(0.2, rel=0.2)
+    fit = solver.calibrate_magnetometer(raw, NodeCalibration(), 45.0)
+    np.testing.assert_allclose(fit.mag_hard_iron_ut, hard, atol=0.2)
+    np.testing.assert_allclose(fit.mag_soft_iron, soft, atol=0.01)
+    assert fit.mag_residual_ut == pytest.approx(0.2, rel=0.2)
 
 
 def test_magnetometer_without_known_strength_keeps_the_mean() -> None:
     raw = sphere(np.random.default_rng(1), 300, 50.0) + 10.0
-    fit = solver.solve_magnetometer(raw)
-    strengths = np.linalg.norm((raw - fit.bias) @ np.array(fit.matrix), axis=1)
+    fit = solver.calibrate_magnetometer(raw, NodeCalibration())
+    strengths = np.linalg.norm((raw - fit.mag_hard_iron_ut) @ np.array(fit.mag_soft_iron), axis=1)
     assert strengths.mean() == pytest.approx(50.0, rel=1e-3)
 
 
@@ -87,7 +87,7 @@ def test_magnetometer_that_was_only_turned_flat_is_refused() -> None:
     flat = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), np.full(300, 20.0)])
     for count, why in ((300, "turn the aircraft"), (10, "10 samples"), (1, "1 sample where")):
         with pytest.raises(solver.CalibrationError, match=why):
-            solver.solve_magnetometer(flat[:count])
+            solver.calibrate_magnetometer(flat[:count], NodeCalibration())
 
 
 @pytest.mark.parametrize("pitch_deg", [20.0, 45.0, 90.0])
@@ -119,7 +119,7 @@ def test_nose_that_was_not_raised_is_refused() -> None:
 )
 def test_implausible_accelerometer_error_is_refused(poses: np.ndarray, reason: str) -> None:
     with pytest.raises(solver.CalibrationError, match=f"{reason}.*still"):
-        solver.solve_accelerometer(poses)
+        solver.fit_accelerometer(poses, NodeCalibration())
 
 
 EARTH = sphere(np.random.default_rng(1), 300, 45.0)
@@ -136,13 +136,13 @@ EARTH = sphere(np.random.default_rng(1), 300, 45.0)
 )
 def test_field_outside_the_range_of_the_earth_is_refused(field: np.ndarray, reason: str) -> None:
     with pytest.raises(solver.CalibrationError, match=f"{reason}.*steel"):
-        solver.solve_magnetometer(field)
+        solver.calibrate_magnetometer(field, NodeCalibration())
 
 
 def test_compass_at_rest_is_to_be_turned(rng: np.random.Generator) -> None:
     noise = np.array([22.0, 5.0, 40.0]) + rng.normal(0.0, 0.5, (300, 3))
     with pytest.raises(solver.MoreNeeded, match="turn the aircraft about all its axes"):
-        solver.solve_magnetometer(noise)
+        solver.calibrate_magnetometer(noise, NodeCalibration())
 
 
 ACCEL_BIAS = np.array([0.2, -0.1, 0.3])
