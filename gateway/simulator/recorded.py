@@ -113,22 +113,17 @@ def in_rounds(
 
 
 def replay(
-    settings: SimulatorSettings,
-    flight: RecordedFlight,
-    start_unix_us: int = START_UNIX_US,
-    *,
-    endless: bool = False,
+    settings: SimulatorSettings, flight: RecordedFlight, start_unix_us: int = START_UNIX_US
 ) -> SimulatedReceiver:
     """Create the receiver and one aircraft that replays a recording without a UTC start time.
 
-    If endless, the recording is repeated while the nodes' clocks and sequence numbers continue.
+    The recording is repeated while the nodes' clocks and sequence numbers continue.
     """
     imu_clock = DeviceClock(IMU_BOOT_US, settings.clock_skew_ppm)
-    inertial = _imu_payloads(flight, imu_clock, endless=endless)
+    inertial = _imu_payloads(flight, imu_clock)
     pressures: Iterator[Sent] = iter(())
     if np.isfinite(flight.baro_alt_m).any():
-        rounds = _rounds(flight, endless)
-        pressures = chain.from_iterable(_baro_payloads(f, imu_clock) for f in rounds)
+        pressures = chain.from_iterable(_baro_payloads(f, imu_clock) for f in _rounds(flight))
     samples = heapq.merge(inertial, pressures, key=attrgetter("time_s"))
     node_id = NodeId(settings.vehicle_id, IMU_NODE)
     nodes = [Node(node_id, imu_clock, _imu_sensors(flight), round(flight.rate_hz), samples)]
@@ -138,17 +133,16 @@ def replay(
         spacing_s = float(np.median(gaps_s)) if len(gaps_s) else 1.0
         fixes = chain.from_iterable(
             gps_payloads(_gps_samples(f, start_unix_us), gps_clock, settings.geoid_separation_m)
-            for f in _rounds(flight, endless)
+            for f in _rounds(flight)
         )
         node_id = NodeId(settings.vehicle_id, GPS_NODE)
         nodes.append(Node(node_id, gps_clock, GPS_SENSORS, round(1.0 / spacing_s), fixes))
     return SimulatedReceiver(settings, nodes)
 
 
-def _rounds(flight: RecordedFlight, endless: bool) -> Iterator[RecordedFlight]:
-    """Yield the flight, then repeat it endlessly, each time shifted after the one before."""
-    yield flight
-    for number in count(1) if endless else ():
+def _rounds(flight: RecordedFlight) -> Iterator[RecordedFlight]:
+    """Yield the flight endlessly, each time shifted after the one before."""
+    for number in count():
         begin_s = number * flight.duration_s
         yield dataclasses.replace(
             flight, time_s=flight.time_s + begin_s, gps_time_s=flight.gps_time_s + begin_s
@@ -161,7 +155,7 @@ def _imu_sensors(flight: RecordedFlight) -> int:
     return IMU_SENSORS & ~absent
 
 
-def _imu_payloads(flight: RecordedFlight, clock: DeviceClock, *, endless: bool) -> Iterator[Sent]:
+def _imu_payloads(flight: RecordedFlight, clock: DeviceClock) -> Iterator[Sent]:
     accel_range, gyro_range, mag_gain = ranges = _ranges(flight)
     mag_new = _complete(flight.mag_b_ut)
     absent = 0 if mag_new.any() else int(ImuFlags.MAG_ABSENT)
@@ -169,7 +163,7 @@ def _imu_payloads(flight: RecordedFlight, clock: DeviceClock, *, endless: bool) 
         absent |= ImuFlags.BARO_ABSENT
     mag_raw = _mag_words(flight.mag_b_ut, mag_new, mag_gain)
     temperature = temperature_counts(np.full(ROWS, TEMPERATURE_DEGC))
-    for flown in _rounds(flight, endless):
+    for flown in _rounds(flight):
         for start in range(0, len(flown.time_s), ROWS):
             rows = slice(start, start + ROWS)
             time_s = flown.time_s[rows]

@@ -200,7 +200,7 @@ def test_recording_repeats_without_landing(flight: RecordedFlight) -> None:
     found: list[RawRecord] = []
     rounds: list[tuple[int, int]] = []
     until_s = 2.5 * flight.duration_s
-    frames = replay(QUIET, flight, endless=True).frames()
+    frames = replay(QUIET, flight).frames()
     for frame in in_rounds(frames, flight.duration_s, lambda n: rounds.append((n, len(found)))):
         if frame.time_s > until_s:
             break
@@ -218,5 +218,5 @@ def test_recording_repeats_without_landing(flight: RecordedFlight) -> None:
 
 def test_recording_without_barometer_and_gps_repeats() -> None:
     bare = flight_of(columns(baro_alt_m=None, gps_lat=None))
-    frames = replay(QUIET, bare, endless=True).frames()
+    frames = replay(QUIET, bare).frames()
     assert sum(1 for _, frame in zip(range(3 * ROWS), frames, strict=False)) == 3 * ROWS

@@ -148,7 +148,7 @@ def recorded_line(
     def on_round(number: int) -> None:
         report(f"Recording ended after {flight.duration_s:.0f} s; round {number} begins")
 
-    receiver = replay(settings.simulator, flight, unix_time_us(), endless=True)
+    receiver = replay(settings.simulator, flight, unix_time_us())
     frames = in_rounds(made_ahead(receiver.frames()), flight.duration_s, on_round)
     return frames, {settings.simulator.vehicle_id: aircraft}
 
