@@ -18,10 +18,10 @@ from gateway.records import Quat
 from gateway.vehicle_state.positions import ORIGIN_ID, Position, named_position, position_of
 from gateway.vehicle_state.senders import MODES_ID, RecordedSender, Senders, is_station
 from gateway.vehicle_state.status_texts import STATUSTEXT_ID, JoinedText, TextJoiner, text_of
-from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import DEFINITIONS, HEARTBEAT_ID, ids_of
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 from gateway.wire.recorded_frames import Batch, RecordedFrame, fields_of, fields_of_rows
+from gateway.wire.vehicle_types import mode_name
 
 BOOT_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "timestamp": 1000}
 """Fields with the time since boot, and their unit in µs; a civil time in one is ignored."""

@@ -18,7 +18,7 @@ from typing import Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.sources.settings import SourceUrl
-from gateway.wire.flight_modes import mode_name
+from gateway.wire.vehicle_types import mode_name
 
 FIXED_WING: Final[int] = mavlink.MAV_TYPE_FIXED_WING
 QUADROTOR: Final[int] = mavlink.MAV_TYPE_QUADROTOR

@@ -7,7 +7,6 @@ read as unknown.
 
 import math
 import struct
-from functools import partial
 from operator import itemgetter
 from typing import Any, Final
 
@@ -52,11 +51,19 @@ def uint16(value: float, unknown: int = UINT16_MAX) -> int:
     return whole(value, 0, UINT16_MAX - (unknown == UINT16_MAX), unknown)
 
 
-int16 = partial(whole, low=-INT16_MAX - 1, high=INT16_MAX, unknown=0)
-int32 = partial(whole, low=-INT32_MAX - 1, high=INT32_MAX, unknown=0)
-"""Fit signed fields, which have no value for unknown; it is sent as 0."""
-uint32 = partial(whole, low=0, high=UINT32_MAX, unknown=0)
-"""Fit an unsigned 32-bit field; as an extension field its 0 means unknown."""
+def int16(value: float) -> int:
+    """Fit a signed 16-bit field, which has no value for unknown; it gets 0."""
+    return whole(value, -INT16_MAX - 1, INT16_MAX, 0)
+
+
+def int32(value: float) -> int:
+    """Fit a signed 32-bit field, which has no value for unknown; it gets 0."""
+    return whole(value, -INT32_MAX - 1, INT32_MAX, 0)
+
+
+def uint32(value: float) -> int:
+    """Fit an unsigned 32-bit field; as an extension field its 0 means unknown."""
+    return whole(value, 0, UINT32_MAX, 0)
 
 
 def compass_cdeg(angle_rad: float) -> int:

@@ -24,10 +24,10 @@ from gateway.vehicle_state.positions import (
 )
 from gateway.vehicle_state.senders import AUTOPILOT, FIRST_GROUND_STATION
 from gateway.vehicle_state.status_texts import text_of
-from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAMES, ids_of
 from gateway.wire.mavlink_splitter import MavFrame
 from gateway.wire.recorded_frames import fields_of
+from gateway.wire.vehicle_types import mode_name
 
 Fields = Mapping[str, Any]
 

@@ -37,7 +37,6 @@ def edit_frame(
     *,
     sequence: int | None = None,
     system: int | None = None,
-    component: int | None = None,
     fields: Mapping[str, Any] = NO_FIELDS,
     sign: Sign | None = None,
     drop_signature: bool = False,
@@ -64,8 +63,6 @@ def edit_frame(
         content[at] = sequence
     if system is not None:
         content[at + 1] = system
-    if component is not None:
-        content[at + 2] = component
     if fields:
         _write(content, message_id, fields)
     if is_v2:

@@ -21,10 +21,10 @@ from gateway.recordings.message_table import UNITS
 from gateway.recordings.opening import open_flights
 from gateway.recordings.recording import open_recording
 from gateway.recordings.summary import FileInfo, read_summary
-from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 from gateway.wire.recorded_frames import RecordedFrame, fields_of
+from gateway.wire.vehicle_types import mode_name
 from tests.kit.cli import run
 from tests.kit.recordings import messages_of as vehicle_messages
 from tests.kit.recordings import read_tlog

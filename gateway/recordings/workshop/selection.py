@@ -19,9 +19,9 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.moment import Moment, time_us_of
 from gateway.vehicle_state.newest import HEARTBEAT_TIMEOUT_US
 from gateway.vehicle_state.senders import Senders
-from gateway.wire.flight_modes import mode_name
 from gateway.wire.mavlink_messages import HEARTBEAT_ID, MESSAGE_IDS
 from gateway.wire.recorded_frames import Batch, columns_of
+from gateway.wire.vehicle_types import mode_name
 
 BoolArray = NDArray[np.bool_]
 
