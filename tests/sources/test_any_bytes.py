@@ -28,7 +28,7 @@ def flight(kind: str) -> bytes:
     if kind == "ltm":
         return LTM
     pieces = SOURCE_BYTES[kind](SimulatorSettings(), 1_790_000_000_000_000)
-    return b"".join(piece.data for piece in islice(pieces, 12))
+    return b"".join(piece.data for piece in islice(pieces, 30))
 
 
 def decoded(kind: str, *chunks: bytes) -> list[Any]:
