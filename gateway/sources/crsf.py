@@ -108,21 +108,13 @@ ADDRESSES: Final = frozenset(
     | {0xEC, 0xED, 0xEE, 0xEF}
 )
 """Addresses in the specification."""
-SIZES: Final = {
-    0x02: (15, 15), 0x03: (9, 9), 0x06: (20, 20), 0x07: (2, 4), 0x08: (8, 8), 0x09: (2, 4),
-    0x0A: (2, 2), 0x0C: (4, 58), 0x0D: (3, 41), 0x0E: (3, 59), 0x11: (8, 8), 0x12: (6, 6),
-    0x13: (18, 18), 0x14: (10, 10), 0x16: (22, 22),
-    0x1C: (5, 5), 0x1D: (6, 6), 0x1E: (6, 6), 0x1F: (9, 9), 0x21: (1, 32), 0x29: (16, 60),
-    0x7F: (3, 60), 0x80: (3, 60),
-}  # fmt: skip
-"""Minimum and maximum payload of the types that are read. After an address outside of the
-specification only these are accepted as frames: noise has a valid 8-bit CRC once in 256 times, and
-a wrong length would delay the frames after it."""
+NOT_READ: Final = (0, -1, None)
 OWN_FRAMES: Final = {0x11: True, 0x12: True, 0x13: True, 0x7F: False, 0x80: False}
 """Frames of Betaflight and of ArduPilot: whether the firmware is of Betaflight's group."""
 EVIDENCE: Final = ("device", "frame", "mode", "attitude")
 """Kinds of evidence of the firmware, the best first."""
 Parts = dict[str, Any]
+Reader = Callable[[bytes, int], Any]
 
 
 class CrsfDecoder(CheckedFrames):
@@ -143,26 +135,45 @@ class CrsfDecoder(CheckedFrames):
         self._clock = SampleClock()
         self._mag_ut: Vec3 | None = None
         """Newest magnetic field, until it is used in a sample."""
-        self._readers: dict[int, Callable[[bytes, int], Any]] = {
-            0x02: self._gps,
-            0x03: self._gps_time,
-            0x06: self._gps_extended,
-            0x11: self._pressure,
-            0x12: self._field,
-            0x13: self._inertial,
-            0x1E: self._attitude,
-            0x21: self._flight_mode,
-            0x29: self._device,
-            0x7F: self._ardupilot,
-            0x80: self._ardupilot,
-            **_STATELESS,
-        }
+        self._frames = self._read_frames()
         self._passthrough: dict[int, Callable[[int, int], Parts]] = {
             0x5001: self._status,
             0x5003: _passthrough_battery(0),
             0x5004: self._home,
             0x5007: self._parameter,
             0x5008: _passthrough_battery(1),
+        }
+
+    def _read_frames(self) -> dict[int, tuple[int, int, Reader]]:
+        """Return minimum and maximum payload, and the reader, of each type that is read.
+
+        After an address outside of the specification only these are accepted as frames: noise has a
+        valid 8-bit CRC once in 256 times, and a wrong length would delay the frames after it.
+        """
+        return {
+            0x02: (15, 15, self._gps),
+            0x03: (9, 9, self._gps_time),
+            0x06: (20, 20, self._gps_extended),
+            0x07: (2, 4, _scaled(">h", 0, "climb_mps", M_PER_CM)),
+            0x08: (8, 8, _battery),
+            0x09: (2, 4, _barometer),
+            0x0A: (2, 2, _scaled(">H", 0, "airspeed_mps", KMH10_MPS)),
+            0x0C: (4, 58, _rpm),
+            0x0D: (3, 41, _temperatures),
+            0x0E: (3, 59, _cells),
+            0x11: (8, 8, self._pressure),
+            0x12: (6, 6, self._field),
+            0x13: (18, 18, self._inertial),
+            0x14: (10, 10, _link),
+            0x16: (22, 22, _channels),
+            0x1C: (5, 5, _scaled("B", 2, "link_quality_percent", 1.0)),
+            0x1D: (6, 6, _link_of_transmitter),
+            0x1E: (6, 6, self._attitude),
+            0x1F: (9, 9, _mavlink_fc),
+            0x21: (1, 32, self._flight_mode),
+            0x29: (16, 60, self._device),
+            0x7F: (3, 60, self._ardupilot),
+            0x80: (3, 60, self._ardupilot),
         }
 
     def _begin_identity(self) -> None:
@@ -187,7 +198,7 @@ class CrsfDecoder(CheckedFrames):
     def size_at(self, data: bytes, at: int) -> int:
         """Return the size of a frame that begins here, complete or not; 0 if there is none."""
         length, end = data[at + 1], at + HEAD + data[at + 1]
-        least, most = SIZES.get(data[at + HEAD], (0, -1))
+        least, most, _ = self._frames.get(data[at + HEAD], NOT_READ)
         if data[at] in ADDRESSES:
             least, most = 0, MAX_LENGTH - MIN_LENGTH
         if not least <= length - MIN_LENGTH <= most:
@@ -203,7 +214,7 @@ class CrsfDecoder(CheckedFrames):
         self._last_us = arrival_us
         if kind in OWN_FRAMES:
             self._evidence["frame"] = OWN_FRAMES[kind]
-        read = self._readers.get(kind)
+        *_, read = self._frames.get(kind, NOT_READ)
         if read is None:
             unknown = Fault("unknown type", len(payload), f"type {kind:#x} is not known")
             return [] if kind in UNUSED else [unknown]
@@ -475,20 +486,3 @@ def _channels(payload: bytes, _arrival_us: int) -> Parts:
     bits = int.from_bytes(payload[:22], "little")
     ticks = [bits >> 11 * k & 0x7FF for k in range(16)]
     return {"channels_us": tuple(round((tick - 992) * 5 / 8 + 1500) for tick in ticks)}
-
-
-_STATELESS: Final[dict[int, Callable[[bytes, int], Parts]]] = {
-    0x07: _scaled(">h", 0, "climb_mps", M_PER_CM),
-    0x08: _battery,
-    0x09: _barometer,
-    0x0A: _scaled(">H", 0, "airspeed_mps", KMH10_MPS),
-    0x0C: _rpm,
-    0x0D: _temperatures,
-    0x0E: _cells,
-    0x14: _link,
-    0x16: _channels,
-    0x1C: _scaled("B", 2, "link_quality_percent", 1.0),
-    0x1D: _link_of_transmitter,
-    0x1F: _mavlink_fc,
-}
-"""Readers of frames that do not depend on other frames."""
