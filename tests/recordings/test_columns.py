@@ -53,6 +53,8 @@ def test_records_become_rows_in_their_order_and_lines_with_every_digit(seed: int
     rows, flat = rows_of(records), list[object]()
     for row in rows:
         flat += [record for record in (row.baro, row.gps, row.raw) if record is not None]
+        newest = row.raw or row.gps or row.baro
+        assert newest is None or row.time_us == newest.time_us
     assert flat == [r.imu if isinstance(r, FusedSample) else r for r in records]
     lines = [row_to_line(row) for row in rows]
     assert {len(line.split(",")) for line in lines} == {len(COLUMNS)}

@@ -21,6 +21,8 @@ LTM = b"".join(
     for n in range(30)
 )
 KINDS = st.sampled_from(["ltm", *sorted(SOURCE_BYTES)])
+MOST_LOST = 4
+"""Records of the frames that a damaged one covers or seems to begin."""
 
 
 @cache
@@ -43,7 +45,14 @@ def test_any_chunks_give_the_same_records(kind: str, size: int) -> None:
     assert [*map(repr, decoded(kind, *chunks))] == [*map(repr, decoded(kind, data))]
 
 
-@given(KINDS, st.floats(0.0, 0.999), st.integers(1, 255), st.binary(max_size=40))
+NOISE = st.one_of(
+    st.binary(max_size=40),
+    st.sampled_from([b"$TA", b"\x7e\x98\x10" * 9, b"\xff" * 40, b"$GPGGA,1,2*00\r\n"]),
+)
+"""Any bytes, and those of other protocols."""
+
+
+@given(KINDS, st.floats(0.0, 0.999), st.integers(0, 255), NOISE)
 def test_damage_anywhere_costs_few_records(
     kind: str, where: float, flip: int, noise: bytes
 ) -> None:
@@ -52,4 +61,6 @@ def test_damage_anywhere_costs_few_records(
     data[at] ^= flip
     data[at:at] = noise
     found = [each for each in decoded(kind, bytes(data)) if not isinstance(each, Fault)]
-    assert len(found) >= 0.7 * len(decoded(kind, flight(kind)))
+    lost = len(decoded(kind, flight(kind))) - len(found)
+    # A post of a phone has many records.
+    assert lost <= (0.3 * len(found) if kind == "phone" else MOST_LOST)

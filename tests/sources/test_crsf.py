@@ -15,7 +15,6 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.sources.kinds import make_decoder
 from gateway.sources.settings import parse_source
-from gateway.wire.framing import Fault
 from tests.kit.payloads import ltm
 
 NODE = NodeId(2, 8)
@@ -266,17 +265,6 @@ def test_home_of_ardupilot_is_found_from_distance_and_direction() -> None:
 
 
 FLIGHT = frame(0x1E, ATTITUDE) + frame(0x02, GPS) + frame(0x21, b"ACRO*\0") + frame(0x07, b"\0\1")
-
-
-@pytest.mark.parametrize("noise", [b"$TA", b"\x7e\x98\x10" * 9, b"\xff" * 40, b"$GPGGA,1,2*00\r\n"])
-def test_frames_are_found_between_bytes_of_other_protocols(noise: bytes) -> None:
-    stream = decoder()
-    found = [e for _ in range(10) for e in stream.feed(noise + FLIGHT, 0)]
-    found += stream.feed(bytes(70), 0)
-    records = [each for each in found if not isinstance(each, Fault)]
-    assert len(records) == 40
-    dropped = sum(each.size for each in found if isinstance(each, Fault))
-    assert dropped >= 10 * len(noise)
 
 
 def test_frame_of_a_backpack_is_read_from_its_msp_packet() -> None:
