@@ -259,17 +259,34 @@ class Site:
         return {"data": base64.b64encode(self.content[begin : begin + size]).decode()}
 
 
+REFUSED: dict[str, tuple[Callable[..., Any], str, str]] = {
+    "file changed meanwhile": (Site(digest="0" * 64), NAME, "changed"),
+    "shortened file": (Site(CONTENT[:100]), NAME, "shorter"),
+    "silent site": (lambda *_: {"data": None}, NAME, "continues from here"),
+    **{
+        f"file {name}": (lambda *_: {}, name, "not a file of a recording")
+        for name in ("../flight_01.tlog", "flight.txt", "x/flight_01.tlog")
+    },
+}
+
+
 class TestFetch:
+    @pytest.mark.parametrize("name", REFUSED)
+    def test_fetch_fails_with_the_reason_and_can_be_repeated(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+    ) -> None:
+        site, file, reason = REFUSED[name]
+        monkeypatch.setattr(recording_fetch, "SITE_TIMEOUT_S", -1.0)
+        one = RecordingFetch("site", tmp_path / "to", site, wait=lambda _: None)
+        with pytest.raises(FetchError, match=reason):
+            one.fetch(file, 10_000, lambda _: None)
+        assert not [each for each in tmp_path.rglob("*.*") if each.suffix != ".part"]
+        assert self.fetch(tmp_path / "to", Site())
+        assert (tmp_path / "to" / NAME).read_bytes() == CONTENT[:10_000]
+
     def fetch(self, folder: Path, site: Callable[..., Any], size: int = 10_000) -> bool:
         one = RecordingFetch("site", folder, site, wait=lambda _: None)
         return one.fetch(NAME, size, lambda _: None)
-
-    def test_file_changed_during_the_fetch_is_discarded(self, tmp_path: Path) -> None:
-        with pytest.raises(FetchError, match="changed"):
-            self.fetch(tmp_path, Site(digest="0" * 64))
-        assert not (tmp_path / NAME).exists()
-        assert self.fetch(tmp_path, Site())
-        assert (tmp_path / NAME).read_bytes() == CONTENT[:10_000]
 
     def test_stopped_fetch_continues(self, tmp_path: Path) -> None:
         site = Site()
@@ -307,21 +324,6 @@ class TestFetch:
             fcntl.flock(part, fcntl.LOCK_EX)
             with pytest.raises(FetchError, match="is being fetched by another program"):
                 self.fetch(tmp_path, Site())
-
-    def test_shortened_file_is_an_error(self, tmp_path: Path) -> None:
-        with pytest.raises(FetchError, match="shorter"):
-            self.fetch(tmp_path, Site(CONTENT[:100]))
-
-    def test_silent_site_is_an_error(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(recording_fetch, "SITE_TIMEOUT_S", -1.0)
-        with pytest.raises(FetchError, match="continues from here"):
-            self.fetch(tmp_path, lambda *_: {"data": None})
-
-    @pytest.mark.parametrize("name", ["../flight_01.tlog", "flight.txt", "x/flight_01.tlog"])
-    def test_file_outside_the_folder_is_refused(self, tmp_path: Path, name: str) -> None:
-        one = RecordingFetch("site", tmp_path, lambda *_: {}, wait=lambda _: None)
-        with pytest.raises(FetchError, match="not a file of a recording"):
-            one.fetch(name, 10, lambda _: None)
 
     @pytest.mark.parametrize(
         ("took_s", "waited_s", "kib"),

@@ -19,7 +19,7 @@ from gateway.outputs import mqtt
 from gateway.outputs.mqtt import MAX_WAITING
 from gateway.units import US_PER_S
 from tests.kit.messages import at, beat, gps
-from tests.kit.process import START_LIMIT_S, running
+from tests.kit.process import START_LIMIT_S, running, until
 from tests.outputs.conftest import OutputRig
 from tests.ports import free_ports
 
@@ -55,24 +55,21 @@ class Mosquitto:
         self.words = "mosquitto", "-c", settings
 
     async def subscriber(self) -> aiomqtt.Client:
-        async with asyncio.timeout(START_LIMIT_S):
-            while True:
-                client = aiomqtt.Client(
-                    "127.0.0.1", self.port, username="pilot", password="top secret"
-                )
-                try:
-                    await client.__aenter__()
-                except aiomqtt.MqttError:
-                    await asyncio.sleep(0.01)
-                    continue
-                await client.subscribe("#")
-                return client
+        client = aiomqtt.Client("127.0.0.1", self.port, username="pilot", password="top secret")
+        await client.__aenter__()
+        await client.subscribe("#")
+        return client
+
+    def listens(self) -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", self.port)) == 0
 
 
 @pytest.fixture
 async def broker(tmp_path: Path, certificate: Path) -> AsyncIterator[Mosquitto]:
     made = Mosquitto(tmp_path, certificate)
     with running(*made.words):
+        await until(made.listens, 0.01)
         yield made
 
 
@@ -113,7 +110,6 @@ async def test_messages_of_all_systems_have_topics(
 async def test_presence_is_retained_and_the_last_will_ends_it(
     outputs: OutputRig, broker: Mosquitto
 ) -> None:
-    await (await broker.subscriber()).__aexit__(None, None, None)
     options = f"login={broker.login}&topic=field/7&deny=HEARTBEAT"
     output = await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?{options}")
     client = await broker.subscriber()
@@ -132,7 +128,6 @@ async def test_presence_is_retained_and_the_last_will_ends_it(
 async def test_wrong_password_is_reported(
     outputs: OutputRig, broker: Mosquitto, tmp_path: Path
 ) -> None:
-    await (await broker.subscriber()).__aexit__(None, None, None)
     wrong = tmp_path / "wrong"
     wrong.write_text("pilot:guess")
     await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?login={wrong}")
@@ -143,7 +138,6 @@ async def test_wrong_password_is_reported(
 async def test_messages_are_dropped_while_the_broker_is_slow(
     outputs: OutputRig, broker: Mosquitto
 ) -> None:
-    await (await broker.subscriber()).__aexit__(None, None, None)
     await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?login={broker.login}")
     for system in range(1, 255):
         outputs.hear(beat(), at(), gps(), system=system)
