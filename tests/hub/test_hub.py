@@ -52,54 +52,6 @@ async def test_first_frame_of_a_restarted_program_is_accepted(world: Any) -> Non
     assert world.world.counters().duplicates == 0
 
 
-async def test_copy_passes_a_loop_once_at_most(world: Any) -> None:
-    """A client that echoes from the start is a second path, whose copies are then dropped."""
-    echo = world.station(world.world.listening_ports()[0])
-    frames = [world.autopilot.sender.attitude() for _ in range(5)]
-    world.autopilot.send(frames[0])
-    assert await world.first.receive() == frames[0]
-    world.clock.now_us += 1000
-    echo.send(frames[0])
-    assert [await world.first.receive(), await world.autopilot.receive()] == [frames[0], frames[0]]
-    for count, frame in enumerate(frames[1:], start=1):
-        world.clock.now_us += 1000
-        world.autopilot.send(frame)
-        assert [await world.first.receive(), await echo.receive()] == [frame, frame]
-        echo.send(frame)
-        await world.until(lambda count=count: world.world.counters().duplicates == count)
-    assert world.first.is_empty()
-
-
-async def test_monitor_gets_all_traffic_and_its_own_frames_are_ignored(world: Any) -> None:
-    hub = world.world
-    monitor = world.station()
-    hub.add(f"udp:127.0.0.1:{monitor.port}?monitor=yes&allow=HEARTBEAT")
-    await world.until_open(hub)
-    request = world.first.sender.command(42, 1)
-    world.first.send(request)
-    assert await world.autopilot.receive() == await monitor.receive() == request
-    to_us = world.first.sender.command(1, 1)
-    world.first.send(to_us)
-    assert await monitor.receive() == to_us
-    answer = world.vehicle.ack()
-    hub.send(world.out(answer, hub.clients()[0].client_id))
-    telemetry, beat = world.autopilot.sender.attitude(), world.second.sender.heartbeat()
-    world.autopilot.send(telemetry)
-    world.second.send(beat)
-    got = [await monitor.receive() for _ in range(3)]
-    assert got[0] == answer
-    assert sorted(got[1:]) == sorted([telemetry, beat])
-    count, forwarded = len(world.incoming), hub.counters().forwarded
-    sender = world.sender(77)
-    monitor.send(sender.heartbeat(), sender.command(42, 1), sender.command(1, 1))
-    await world.until(lambda: hub.clients()[-1].received == 3)
-    assert (len(world.incoming), hub.counters().forwarded) == (count, forwarded)
-    await world.quiet()
-    received = [frame_of(data) for data in world.first.received()]
-    assert telemetry in [frame.data for frame in received]
-    assert 77 not in {frame.origin[0] for frame in received}
-
-
 async def test_allow_restricts_round_trip_requests_and_greetings_too(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0?allow=HEARTBEAT", ping_interval_s=1.0)
     rig.publish(hub, rig.vehicle.home(), rig.vehicle.heartbeat())

@@ -260,8 +260,10 @@ CONVERSATIONS: dict[str, list[Any]] = {
         {A: [(255, 0)], B: [], "ours": 1},
     ],
     "copies are dropped, and our own frames that return": [
-        ("", "", ""), (A, heartbeat(), 1, 1), {}, (B, attitude(), 1, 1),
-        {A: [(1, 30)], C: [(1, 30)], "duplicates": 0}, (A, attitude(6), 1, 1), {C: [(1, 30)]},
+        ("", "", ""), (A, heartbeat(), 1, 1), {}, (A, attitude(), 1, 1), {C: [(1, 30)]},
+        # From the start it echoes: that is a second path, whose copies are dropped from then on.
+        (B, attitude(), 1, 1), {A: [(1, 30)], C: [(1, 30)], "duplicates": 0},
+        (A, attitude(6), 1, 1), {B: [(1, 30)], C: [(1, 30)]},
         (B, attitude(6), 1, 1), {A: [], C: [], "duplicates": 1}, (None, heartbeat(), 3, 1),
         (None, attitude(), 3, 1), {}, (C, attitude(), 3, 1),
         {A: [], B: [], "looped": 1, "ours": 0},
@@ -270,6 +272,13 @@ CONVERSATIONS: dict[str, list[Any]] = {
         ("trusted=no", "monitor=yes", ""), (None, heartbeat(), 3, 1), SEAT, {},
         (A, command(3), 200, STATION), {B: [(200, 76)], C: [], "ours": 1, "unroutable": 0},
         (A, command(255, STATION), 200, STATION), {B: [], C: [], "ours": 0, "unroutable": 1},
+    ],
+    "monitor gets all traffic, and its own frames are ignored": [
+        ("", "monitor=yes&allow=HEARTBEAT", ""), (None, heartbeat(), 3, 1),
+        (A, heartbeat(), 1, 1), SEAT, {}, (C, command(1), 255, STATION),
+        {A: [(255, 76)], B: [(255, 76)]}, (C, command(3), 255, STATION), {B: [(255, 76)]},
+        (A, attitude(), 1, 1), {B: [(1, 30)], C: [(1, 30)]}, (B, heartbeat(), 77, 1),
+        (B, command(1), 77, 1), (B, command(3), 77, 1), {A: [], C: [], "ours": 0, "forwarded": 0},
     ],
     "command takes the trusted path despite a forged component": [
         ("trusted=no", "", ""), (B, heartbeat(), 1, 1), (A, heartbeat(), 1, 77),

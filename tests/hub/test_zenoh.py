@@ -205,24 +205,6 @@ class TestSite:
 
 
 class TestTrouble:
-    async def test_site_reconnects_after_a_router_restart(self, site: Site) -> None:
-        hub, far = await site.exchange(extra="udp-listen:127.0.0.1:0")
-        site.router.kill()
-        await site.tick_until(hub, lambda: hub.clients()[0].state == "connecting")
-        dropped = hub.clients()[0].dropped
-        for _ in range(500):
-            site.publish(hub, site.vehicle.raw_imu(), site.vehicle.command(1, 1))
-        assert hub.clients()[0].dropped == dropped + 1000
-        assert hub.clients()[0].queued == 0
-        site.router.start()
-        await site.tick_until(hub, lambda: hub.clients()[0].state == "open")
-        before = len(far.got)
-        await site.until_received(hub, lambda: len(far.got) > before)
-        assert not far.messages(27), "old frames are not delivered as new ones"
-        assert not far.messages(76)
-        numbers = [data[4] for data in far.messages(30)]
-        assert len(set(numbers)) == len(numbers), "no frame twice"
-
     @pytest.mark.parametrize(
         ("locator", "trusted", "warns"),
         [
