@@ -1,18 +1,28 @@
-"""The hub between many endpoints: routing, loops, changes at run time, round trips."""
+"""The hub between many endpoints: routing, loops, changes, round trips, redundant links, faults."""
 
+import asyncio
+import errno
+import itertools
+import logging
 import socket
 from collections import defaultdict
 from typing import Any
 
 import msgspec
 import pytest
+from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v10 import common as v1
 from pymavlink.dialects.v20 import common as dialect
 
+from gateway.hub.hub import CONNECTIONS_IN_FULL
 from gateway.hub.round_trip import PROBE_COMPONENT
+from gateway.hub.stats import WINDOW_US
 from gateway.hub.transports import sockets
-from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
-from tests.kit.hub import no_descriptors
+from tests.kit.hub import FlyingHub, no_descriptors
+from tests.kit.mavlink import STATION, packed
+from tests.ports import free_ports
 
 pytestmark = pytest.mark.io
 
@@ -219,3 +229,205 @@ async def test_frames_of_the_gateway_itself_have_no_gap_at_any_client(rig: Any) 
     for key, found in numbers.items():
         assert len(found) > 20, key
         assert found == [(found[0] + step) % 256 for step in range(len(found))], key
+
+
+async def test_interface_outage_loses_no_frame_of_other_clients(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    near, far = rig.station(), rig.station()
+    hub = await rig.open(*(f"udp:127.0.0.1:{each.port}" for each in (near, far)))
+    rig.publish(hub, sent := rig.vehicle.attitude())
+    client = hub._clients[2]
+
+    def unreachable(_: bytes) -> int:
+        raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+    frames = [sent]
+    with monkeypatch.context() as down:
+        down.setattr(client, "write", unreachable)
+        down.setattr(type(client), "_connect", lambda _: None)
+        for _ in range(100):
+            frames.append(rig.vehicle.attitude())
+            rig.publish(hub, frames[-1])
+        assert (hub.clients()[1].state, hub.clients()[1].dropped) == ("unreachable", 100)
+    rig.tick(hub, 1)
+    await rig.until_open(hub)
+    rig.publish(hub, last := rig.vehicle.attitude())
+    assert [await near.receive() for _ in (*frames, last)] == [*frames, last]
+    assert [await far.receive() for _ in range(2)] == [sent, last]
+
+
+@pytest.mark.parametrize("kind", ["udp", "tcp"])
+async def test_invalid_name_is_reported_as_unresolved(
+    rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch, loop_errors: list[Any]
+) -> None:
+    async def choke(*_: object, **__: object) -> None:
+        raise UnicodeError("label empty or too long")
+
+    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", choke)
+    hub = rig.hub(f"{kind}:no-such-place.invalid:14550")
+    await rig.until(lambda: hub.clients()[0].reason != "")
+    assert (hub.clients()[0].state, loop_errors) == ("resolving", [])
+
+
+async def test_truncated_heartbeats_are_accepted_without_error(
+    rig: Any, loop_errors: list[Any]
+) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no")
+    caller = rig.station(hub.listening_ports()[0])
+    for length in range(10):
+        payload = bytes((0, 0, 0, 0, 6, 8, 0, 4, 3))[:length]
+        body = bytes((len(payload), 0, 0, length, 255, 190, 0, 0, 0)) + payload
+        crc = mcrf4xx(CRC_EXTRA[0], mcrf4xx(body))
+        caller.send(b"\xfd" + body + crc.to_bytes(2, "little"))
+    await rig.until(lambda: len(rig.incoming) == 10)
+    assert loop_errors == []
+
+
+async def test_unlimited_new_clients_do_not_flood_the_log(
+    rig: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, logger="gateway")
+    many = CONNECTIONS_IN_FULL + 10
+    hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=many, idle_timeout_s=3600)
+    for _ in range(many):
+        client = rig.station(hub.listening_ports()[0])
+        client.send(client.sender.heartbeat())
+    await rig.until(lambda: len(hub.clients()) == many)
+    assert len(caplog.messages) == CONNECTIONS_IN_FULL
+    hub.add("udp:127.0.0.1:9")
+    assert caplog.messages[-1].endswith("127.0.0.1:9"), "a configured client is always named"
+    rig.clock.now_us += WINDOW_US
+    rig.tick(hub)
+    assert "10 more connects and disconnects at listening ports" in caplog.messages
+
+
+STEP_US = 20_000
+
+
+class Joined:
+    """Two gateways, each calling the other, and a station at the second."""
+
+    def __init__(self, rig: Any) -> None:
+        self.rig = rig
+        ports = free_ports(2)
+        self.first, self.second = (
+            FlyingHub(
+                rig,
+                system,
+                f"udp-listen:127.0.0.1:{here}",
+                f"udp:127.0.0.1:{there}",
+                ping_interval_s=1.0,
+            )
+            for system, here, there in ((1, *ports), (2, *reversed(ports)))
+        )
+        self.station = rig.station(ports[1])
+        self.received: dict[int, list[bytes]] = {1: [], 2: []}
+
+    async def run(self, seconds: float) -> None:
+        for step in range(round(seconds * 1e6 / STEP_US)):
+            self.rig.clock.now_us += STEP_US
+            self.first.fly()
+            self.second.fly()
+            if step % 12 == 0:
+                self.rig.tick(self.first.hub)
+                self.rig.tick(self.second.hub)
+            if step % 50 == 0:
+                self.station.send(self.station.sender.heartbeat())
+            for _ in range(8):
+                await asyncio.sleep(0)
+            self.listen()
+
+    def listen(self) -> None:
+        for frame in self.station.received():
+            if frame[5] in self.received and frame[6] == 1:
+                self.received[frame[5]].append(frame)
+
+    def gaps(self, system: int) -> int:
+        numbers = [frame[4] for frame in self.received[system]]
+        return sum((b - a) % 256 != 1 for a, b in itertools.pairwise(numbers))
+
+
+async def test_two_gateways_joined_twice_send_frames_and_answers_once_without_a_gap(
+    rig: Any,
+) -> None:
+    joined = Joined(rig)
+    await joined.run(4)
+    joined.received = {1: [], 2: []}
+    await joined.run(8)
+    for _ in range(10):
+        joined.station.send(joined.station.sender.command(1, 1))
+        await joined.run(0.2)
+    acks = [frame for frame in joined.received[1] if message_id_of(frame) == 77]
+    assert len(acks) == 10
+    for system in (1, 2):
+        assert len(joined.received[system]) > 500
+        assert joined.gaps(system) == 0
+
+
+async def test_two_stations_with_one_id_are_both_answered(rig: Any) -> None:
+    gateway = FlyingHub(rig, 1, "udp-listen:127.0.0.1:0")
+    twins = [rig.station(gateway.hub.listening_ports()[0]) for _ in range(2)]
+    gateway.fly()
+    answers = [0, 0]
+    for step in range(10):
+        rig.clock.now_us += 100_000
+        for twin in twins:
+            if step % 10 == 0:
+                twin.send(twin.sender.heartbeat())
+            twin.send(twin.sender.command(1, 1))
+        await rig.quiet()
+        for number, twin in enumerate(twins):
+            ids = [message_id_of(frame) for frame in twin.received()]
+            answers[number] += ids.count(dialect.MAVLINK_MSG_ID_COMMAND_ACK)
+    assert answers[0] >= 10
+    assert answers[1] >= 10
+
+
+V1, V2 = 0xFE, 0xFD
+PROBE_US = 6_000_000
+
+
+def heartbeat(sequence: int) -> bytes:
+    message = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
+    return packed(message, 254, STATION, sequence=sequence, version=1)
+
+
+async def next_attitude(rig: Any, hub: Any, station: Any) -> bytes:
+    """Publish an attitude, and return the frame that the station receives."""
+    rig.publish(hub, rig.vehicle.attitude())
+    while True:
+        frame = await station.receive()
+        if (frame[5] if frame[0] == V1 else frame[7]) == dialect.MAVLINK_MSG_ID_ATTITUDE:
+            return frame
+
+
+async def test_endpoint_of_version_1_gets_only_messages_of_this_version(rig: Any) -> None:
+    station = rig.station()
+    hub = await rig.open(f"udp:127.0.0.1:{station.port}?mavlink=1")
+    odometry = dialect.MAVLink_odometry_message(
+        1, 1, 12, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0] * 21, [0] * 21
+    )
+    rig.publish(hub, packed(odometry))
+    first, second = [await next_attitude(rig, hub, station) for _ in range(2)]
+    assert [first[0], second[0]] == [V1, V1]
+    assert (second[2] - first[2]) % 256 == 1
+    found = v1.MAVLink(None).decode(bytearray(first))
+    assert (found.get_type(), found.get_srcSystem()) == ("ATTITUDE", 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "versions"), [("", (V2, V1, V2, V2, V2)), ("?mavlink=2", (V2, V2, V2, V2, V2))]
+)
+async def test_client_that_only_sends_version_1_gets_it_after_a_probe(
+    rig: Any, options: str, versions: tuple[int, ...]
+) -> None:
+    """Programs that know both versions answer version 2 by version 2 within the probe."""
+    hub = rig.hub(f"udp-listen:127.0.0.1:0{options}")
+    station = rig.station(hub.listening_ports()[0])
+    frames = [heartbeat(0), heartbeat(1), station.sender.heartbeat(), heartbeat(2), heartbeat(3)]
+    for count, (frame, version) in enumerate(zip(frames, versions, strict=True), start=1):
+        station.send(frame)
+        await rig.until(lambda n=count: rig.received == n)
+        assert (await next_attitude(rig, hub, station))[0] == version
+        rig.clock.now_us += PROBE_US

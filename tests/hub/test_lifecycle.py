@@ -24,9 +24,8 @@ from gateway.hub.transports.stream import PROBE_S, USER_TIMEOUT_MS
 from gateway.outputs import extend
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavlinkSplitter
-from tests.hub.test_group import GROUP, member
 from tests.hub.web.conftest import certificate
-from tests.kit.hub import Rig
+from tests.kit.hub import GROUP, Rig, member
 from tests.kit.mavlink import Sender, frames_of
 from tests.kit.messages import at, beat
 from tests.ports import free_port

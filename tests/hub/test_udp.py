@@ -1,4 +1,4 @@
-"""UDP clients, configured or of a port: frames in both directions, timeouts, packing."""
+"""UDP clients, configured, of a port or a group: frames both ways, timeouts, packing."""
 
 import asyncio
 import socket
@@ -11,7 +11,8 @@ from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.forwarding_step import MAX_DATAGRAM
 from gateway.hub.transports.udp import UdpClient
 from tests.conftest import LoopTime
-from tests.kit.hub import receive
+from tests.kit.hub import GROUP, member, receive
+from tests.kit.process import START_LIMIT_S
 
 pytestmark = pytest.mark.io
 
@@ -288,3 +289,22 @@ async def test_frames_that_a_bridge_cuts_over_datagrams_are_forwarded(
     assert [await station.receive() for _ in frames] == frames
     (client,) = (each for each in hub.clients() if each.received)
     assert (client.received, client.bytes_garbage) == (60, 0)
+
+
+async def test_multicast_is_sent_and_received_without_own_frames(rig: Any) -> None:
+    listener = member(rig)
+    port = listener.getsockname()[1]
+    hub = await rig.open(f"udp-multicast:{GROUP}:{port}")
+    frame = rig.vehicle.attitude()
+    rig.publish(hub, frame)
+    async with asyncio.timeout(START_LIMIT_S):
+        data, sender = await asyncio.get_running_loop().sock_recvfrom(listener, 4096)
+    assert data == frame
+    answer, sent = rig.sender(255, 190), []
+    for target in ((GROUP, port), sender):
+        sent.append(answer.heartbeat())
+        listener.sendto(sent[-1], target)
+    await rig.until(lambda: len(rig.incoming) == 2)
+    assert [incoming.frame for incoming in rig.incoming] == sent
+    (client,) = hub.clients()
+    assert (client.received, client.trusted) == (2, False)

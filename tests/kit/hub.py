@@ -6,6 +6,7 @@ import os
 import resource
 import select
 import socket
+import struct
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,32 @@ def no_descriptors() -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+GROUP = "239.255.145.50"
+
+
+def member(rig: "Rig") -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    rig.closing.append(sock.close)
+    sock.setblocking(False)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    sock.bind((GROUP, 0))
+    sock.setsockopt(
+        socket.IPPROTO_IP,
+        socket.IP_ADD_MEMBERSHIP,
+        struct.pack("=4s4s", socket.inet_aton(GROUP), socket.inet_aton(source_address())),
+    )
+    return sock
+
+
+def source_address() -> str:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((GROUP, 1))
+        except OSError:
+            pytest.skip("this machine has no route to multicast groups")
+        return str(probe.getsockname()[0])
 
 
 class Station:
