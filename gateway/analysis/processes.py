@@ -1,6 +1,8 @@
 """The pool of processes for work on many items, and copies of this process.
 
-Processes are forked where possible, and then share all data that this process has computed.
+Processes are forked where possible, and then share all data that this process has computed. They
+exclude its objects from garbage collection: destructors may wait for threads of this process, as
+that of a Zenoh session does, and these do not exist in a forked one.
 """
 
 import gc
@@ -60,7 +62,7 @@ def _begin(stop: Event, parent: int, work: Callable[[Any], Any]) -> None:
     """Leave interrupts to the parent, and exit when it does."""
     global _work
     _work = work
-    _keep_inherited()
+    gc.freeze()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
@@ -109,7 +111,7 @@ def begin_copy(work: Callable[[Any, Connection], None], argument: Any) -> Connec
 def _send(
     work: Callable[[Any, Connection], None], argument: Any, sender: Connection, receiver: Connection
 ) -> None:
-    _keep_inherited()
+    gc.freeze()
     # Closed here, so that the pipe reports when the parent no longer receives.
     receiver.close()
     threading.Thread(target=_end_without_receiver, args=(sender,), daemon=True).start()
@@ -123,15 +125,6 @@ def _end_without_receiver(sender: Connection) -> None:
     hang_up.register(sender, 0)  # only POLLHUP and POLLERR
     hang_up.poll()
     os._exit(0)
-
-
-def _keep_inherited() -> None:
-    """Exclude objects of the parent process from garbage collection, in a forked process.
-
-    Destructors may wait for the parent's threads, as that of a Zenoh session does, and these do not
-    exist in a forked process.
-    """
-    gc.freeze()
 
 
 @contextmanager

@@ -134,8 +134,8 @@ def longest_rest(accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, rate_hz: fl
     window = max(round(rate_hz), 2)
     if len(gyro_b_radps) < window:
         return slice(0, 0)
-    calm = (_spread(gyro_b_radps, window) < REST_GYRO_RADPS) & (
-        _spread(accel_b_mps2, window) < REST_ACCEL_MPS2
+    calm = (spread(gyro_b_radps, window) < REST_GYRO_RADPS) & (
+        spread(accel_b_mps2, window) < REST_ACCEL_MPS2
     )
     edges = np.flatnonzero(np.diff(np.concatenate([[False], calm, [False]]).astype(np.int8)))
     if not len(edges):
@@ -146,8 +146,8 @@ def longest_rest(accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, rate_hz: fl
     return slice(int(begins[best]), int(ends[best]))
 
 
-def _spread(x: FloatArray, window: int) -> FloatArray:
-    """Return the greatest standard deviation of the three axes in each window of samples."""
+def spread(x: FloatArray, window: int) -> FloatArray:
+    """Return the greatest standard deviation of all axes in each window of samples."""
     x = np.nan_to_num(x - np.nanmean(x, axis=0))
     first = np.cumsum(np.vstack([np.zeros(x.shape[1]), x]), axis=0)
     second = np.cumsum(np.vstack([np.zeros(x.shape[1]), x * x]), axis=0)

@@ -82,12 +82,7 @@ def _excerpt(case: Case, axis: int, name: str) -> Picture:
 def liveliest(flight: Flight, axis: int) -> slice:
     """Return the part of `EXCERPT_S` in which a smoothed axis of the acceleration varies most."""
     count = min(max(round(EXCERPT_S * flight.rate_hz), 2), len(flight.time_us))
-    x = np.nan_to_num(flight.imu.accel_b_mps2[:, axis])
-    first = np.concatenate([[0.0], np.cumsum(x)])
-    second = np.concatenate([[0.0], np.cumsum(x * x)])
-    mean = (first[count:] - first[:-count]) / count
-    spread = (second[count:] - second[:-count]) / count - mean * mean
-    begin = int(np.argmax(spread))
+    begin = int(np.argmax(signals.spread(flight.imu.accel_b_mps2[:, [axis]], count)))
     return slice(begin, begin + count)
 
 

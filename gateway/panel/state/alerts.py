@@ -1,6 +1,6 @@
 """Alerts for the operator, from an aircraft's messages and from the gateway's own status."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final
@@ -66,32 +66,28 @@ def alerts_of(vehicle: VehicleState, status: Mapping[str, Any] | None, now_us: i
     return sorted(found, key=lambda alert: -alert.level)
 
 
-def _gps(vehicle: VehicleState, now_us: int) -> list[Alert]:
-    """Return an alert for a GPS that lost its fix; without a first fix it is still searching."""
+def _gps(vehicle: VehicleState, now_us: int) -> Iterator[Alert]:
+    """Yield an alert for a GPS that lost its fix; without a first fix it is still searching."""
     if not vehicle.fixes:
-        return []
+        return
     age_us = vehicle.state.age_us(now_us, "GPS_RAW_INT")
     if age_us > FIX_OLD_US:
-        detail = f"nothing from the GPS for {age_us // US_PER_S:.0f} s"
+        silent_s = age_us // US_PER_S
+        yield Alert(AlertLevel.CRITICAL, "GPS lost", f"nothing from the GPS for {silent_s:.0f} s")
     elif vehicle.state.fields["GPS_RAW_INT"]["fix_type"] < mavlink.GPS_FIX_TYPE_2D_FIX:
-        detail = "the GPS has no fix"
-    else:
-        return []
-    return [Alert(AlertLevel.CRITICAL, "GPS lost", detail)]
+        yield Alert(AlertLevel.CRITICAL, "GPS lost", "the GPS has no fix")
 
 
-def _sensors(vehicle: VehicleState) -> list[Alert]:
-    status = vehicle.state.fields.get("SYS_STATUS")
-    if status is None:
-        return []
+def _sensors(vehicle: VehicleState) -> Iterator[Alert]:
+    if (status := vehicle.state.fields.get("SYS_STATUS")) is None:
+        return
     present, enabled, healthy = (
         status[f"onboard_control_sensors_{word}"] for word in ("present", "enabled", "health")
     )
     unhealthy = present & enabled & ~healthy
     names = [name for bit, name in SENSORS.items() if unhealthy & bit]
-    if not names:
-        return []
-    return [Alert(AlertLevel.WARNING, "Sensors not healthy", ", ".join(names))]
+    if names:
+        yield Alert(AlertLevel.WARNING, "Sensors not healthy", ", ".join(names))
 
 
 def _troubles(vehicle_id: int, status: Mapping[str, Any]) -> Iterable[str] | None:
