@@ -12,10 +12,11 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
 from gateway.panel.state import parameters
-from gateway.panel.state.calibration import CalibrationRun, CalibrationStep, RunState
+from gateway.panel.state.calibration import CalibrationRun, RunState
 from gateway.panel.state.commands import command_long
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.uplink import LoopTask
+from gateway.sensing.calibrating import CalibrationStep
 
 POLL_S: Final = 0.05
 SAMPLES_US: Final = 20_000

@@ -34,7 +34,7 @@ from typing import Any, Final
 
 from nicegui import ui
 
-from gateway.clock import GatewayClock
+from gateway.clock import GatewayClock, unix_time_us
 from gateway.panel.admission import Role
 from gateway.panel.dialogues import Dialogue, Dialogues
 from gateway.panel.logins import Logins
@@ -139,6 +139,11 @@ class ViewContext:
     def now_us(self) -> int:
         """Time of the panel's clock, to which all times here refer."""
         return self.parts.clock()
+
+    @property
+    def zero_unix_us(self) -> int:
+        """Civil time of the zero of that clock, by the present system time."""
+        return unix_time_us() - self.now_us
 
     @property
     def may_change(self) -> bool:

@@ -374,7 +374,7 @@ class LiveChart:
     async def table(self) -> str:
         """Return the visible data as CSV."""
         begin_ms, end_ms = await self.element.span_ms()
-        zero_us = self._zero_unix_us()
+        zero_us = self._context.zero_unix_us
         span = (round(begin_ms * 1000) - zero_us, round(end_ms * 1000) - zero_us)
         series = {name: self._series(name, *span) for name in self.fields}
         return fields_csv(series, {name: self._unit(name)[1] for name in self.fields}, zero_us)
@@ -390,11 +390,8 @@ class LiveChart:
         self._is_ready = True
         self.reload()
 
-    def _zero_unix_us(self) -> int:
-        return unix_time_us() - self._context.now_us
-
     def _new_points(self) -> list[Points]:
-        zero_us, found = self._zero_unix_us(), []
+        zero_us, found = self._context.zero_unix_us, []
         for name in self.fields:
             time_us, values = self._series(name, self._sent_us.get(name, -1))
             if len(time_us):

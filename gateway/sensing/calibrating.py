@@ -20,6 +20,7 @@ References
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Final
 
 import msgspec
@@ -108,6 +109,16 @@ _PARTS: Final = (
     ("mag_mounting", "mag_soft_iron", "mag_hard_iron_ut", "mag_residual_ut"),
 )
 """Names of rotation, matrix, bias and residual of each sensor."""
+
+
+class CalibrationStep(StrEnum):
+    """The calibrations, in the recommended order."""
+
+    MOUNTING = "mounting"
+    GYRO = "gyro"
+    ACCEL = "accel"
+    LEVEL = "level"
+    MAG = "mag"
 
 
 class CalibrationError(ValueError):

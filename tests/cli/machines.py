@@ -32,7 +32,7 @@ from gateway.live.control_verbs import introduction_verb, recorder_verbs
 from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import Port, SerialPort
 from gateway.records import LinkReport, LoggedRequest, NodeId, NodeLink, NodeStatus
-from gateway.sensing.calibrating import NodeSamples
+from gateway.sensing.calibrating import CalibrationStep, NodeSamples
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.status import AircraftStatus, RelativeLocation, Snapshot
@@ -219,7 +219,7 @@ def receiver(folder: Path, kind: str = "", *, monkeypatch: pytest.MonkeyPatch) -
     if kind == "failing":
         monkeypatch.setattr(first_start, "calibrate_each", lambda *_: None)
     else:
-        monkeypatch.setattr(first_start, "STEPS", (calibrate.Step.GYRO,))
+        monkeypatch.setattr(first_start, "STEPS", (CalibrationStep.GYRO,))
     with calibrate.simulated_receiver(SimulatorSettings(vehicle_id=3)) as (path, _):
         (folder / "port").symlink_to(path)
         yield

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from enum import StrEnum
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -40,6 +39,7 @@ from gateway.recordings.recording import open_recording
 from gateway.records import ImuRaw, LinkReport, NodeStatus, RawRecord
 from gateway.sensing import calibrating
 from gateway.sensing.calibrating import CalibrationError, NodeSamples, node_samples
+from gateway.sensing.calibrating import CalibrationStep as Step
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.units import RAD_PER_DEG, US_PER_S
@@ -80,16 +80,6 @@ SIDES: Final = (
 
 Capture = Callable[[float, bool], NodeSamples]
 """Waits for samples over some seconds, or also until the compass was turned to most sides."""
-
-
-class Step(StrEnum):
-    """The kinds of calibration."""
-
-    MOUNTING = "mounting"
-    GYRO = "gyro"
-    ACCEL = "accel"
-    LEVEL = "level"
-    MAG = "mag"
 
 
 STEPS: Final = (Step.GYRO, Step.ACCEL, Step.LEVEL, Step.MAG)

@@ -14,8 +14,9 @@ from scipy.spatial import ConvexHull
 
 from gateway.panel.state.commands import command_long, result_text
 from gateway.records import NAN
-from gateway.sensing.calibrating import fit_sphere
+from gateway.sensing.calibrating import CalibrationStep, fit_sphere
 from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S, UT_PER_GAUSS
+from gateway.vehicle.services.calibrator import SIDES
 
 FloatArray = NDArray[np.float64]
 
@@ -33,8 +34,6 @@ WINDOW: Final = 25
 """Samples for one of the six sides: half a second at the requested rate."""
 MAX_SAMPLES: Final = 3000
 MIN_FIT: Final = 30
-SIDES: Final = ("down", "up", "left", "right", "front", "back")
-"""Lower side of the aircraft, as in the `[cal]` texts; down is level."""
 SIDE_NAMES: Final = {
     "down": "level",
     "up": "upside down",
@@ -43,6 +42,7 @@ SIDE_NAMES: Final = {
     "front": "nose down",
     "back": "tail down",
 }
+"""Names by the lower side of the aircraft, as in the `[cal]` texts; down is level."""
 ORIENTATIONS: Final = {
     f"{face}, arrow to {way}": (roll_deg, 0.0, yaw_deg)
     for face, roll_deg in (("face up", 180.0), ("face down", 0.0))
@@ -52,8 +52,6 @@ ORIENTATIONS: Final = {
 }  # fmt: skip
 """Roll, pitch and yaw from the sensor's axes to the body's, deg, by the orientation of the board
 in the aircraft; its x arrow is printed next to the chips."""
-_POSES: Final = (("back", "front"), ("left", "right"), ("up", "down"))
-"""Lower sides by axis of body FRD: with the reaction to gravity along the axis, and against it."""
 SIDE_SHARE: Final = 0.85
 _STARTED: Final = re.compile(r"^\[cal\] calibration started: \d+ (\w+)")
 _PROGRESS: Final = re.compile(r"^\[cal\] progress <(\d+)>")
@@ -62,6 +60,12 @@ _DONE: Final = re.compile(r"^\[cal\] calibration done")
 _FAILED: Final = re.compile(r"^\[cal\] calibration failed: (.+)")
 _CANCELLED: Final = re.compile(r"^\[cal\] calibration cancelled")
 CALIBRATE: Final = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
+PARAMS: Final[dict[CalibrationStep, tuple[float, ...]]] = {
+    CalibrationStep.GYRO: (1.0,),
+    CalibrationStep.MAG: (0.0, 1.0),
+    CalibrationStep.ACCEL: (0.0, 0.0, 0.0, 0.0, 1.0),
+    CalibrationStep.LEVEL: (0.0, 0.0, 0.0, 0.0, 2.0),
+}
 _Vector = tuple[float, float, float]
 
 
@@ -95,25 +99,6 @@ def seen_cells(vectors: FloatArray) -> list[bool]:
     nearest = (finite @ _MIDDLES.T).argmax(axis=1)
     found: list[bool] = np.isin(np.arange(len(CELLS)), nearest).tolist()
     return found
-
-
-class CalibrationStep(StrEnum):
-    """The calibrations, in the recommended order."""
-
-    MOUNTING = "mounting"
-    """Set by parameters; the aircraft measures the others."""
-    GYRO = "gyro"
-    ACCEL = "accel"
-    LEVEL = "level"
-    MAG = "mag"
-
-
-PARAMS: Final[dict[CalibrationStep, tuple[float, ...]]] = {
-    CalibrationStep.GYRO: (1.0,),
-    CalibrationStep.MAG: (0.0, 1.0),
-    CalibrationStep.ACCEL: (0.0, 0.0, 0.0, 0.0, 1.0),
-    CalibrationStep.LEVEL: (0.0, 0.0, 0.0, 0.0, 2.0),
-}
 
 
 class RunState(StrEnum):
@@ -274,7 +259,7 @@ class CalibrationRun:
             return
         self.state, self.progress, self._done_us = RunState.CHECKING, 100, now_us
         if self.step is CalibrationStep.ACCEL:
-            self.sides_done = list(SIDES)
+            self.sides_done = list(SIDE_NAMES)
 
     def _fail(self, why: str) -> None:
         if self.state is not RunState.FAILED:
@@ -302,8 +287,8 @@ class CalibrationRun:
         self.side_now = None
         if abs(mean[axis]) < SIDE_SHARE * STANDARD_GRAVITY_MPS2:
             return
-        side = _POSES[axis][int(mean[axis] < 0.0)]
-        self.side_now = side
+        # By axis of body FRD: with the reaction to gravity along the axis, and against it.
+        self.side_now = side = SIDES[2 * axis + int(mean[axis] < 0.0)]
         if len(recent) == WINDOW and recent.std(axis=0).max() < 0.5:
             self._side_means.setdefault(side, mean)
 

@@ -12,9 +12,7 @@ from gateway.panel.state.calibration import (
     CELLS,
     ORIENTATIONS,
     SIDE_NAMES,
-    SIDES,
     CalibrationRun,
-    CalibrationStep,
     RunState,
 )
 from gateway.panel.state.fields import FloatArray, parameter_unit
@@ -22,6 +20,7 @@ from gateway.panel.state.parameters import ListState
 from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.widgets import DataTable, allow, choice, heading, store_parameters
 from gateway.printable import UNKNOWN, figure, printable
+from gateway.sensing.calibrating import CalibrationStep
 
 REFRESH_S: Final = 0.2
 MIN_CELLS: Final = 60
@@ -280,13 +279,13 @@ class CalibrationView:
     def _build_poses(self) -> None:
         self._poses = {}
         with ui.element("div").classes("poses"):
-            for side in SIDES:
+            for side, name in SIDE_NAMES.items():
                 with ui.element("div").classes("pose") as pose:
                     pose.props["data-side"] = side
                     picture = ui.element("img").classes("pose-picture")
                     picture.props["src"] = f"/web/poses.svg#{side}"
-                    picture.props["alt"] = f"Aircraft {SIDE_NAMES[side]}"
-                    ui.label(SIDE_NAMES[side])
+                    picture.props["alt"] = f"Aircraft {name}"
+                    ui.label(name)
                     state = ui.label("still to do").classes("state")
                 self._poses[side] = (pose, state)
 

@@ -5,7 +5,6 @@ from typing import Any, Final
 
 from nicegui import ui
 
-from gateway.clock import unix_time_us
 from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of
 from gateway.panel.state.vehicle import TimedText
 from gateway.panel.view_context import ViewContext
@@ -94,7 +93,7 @@ class EventsView:
         self._table.show({str(text.number): _row(text, self._when(text)) for text in texts})
 
     def _when(self, text: TimedText) -> datetime:
-        unix_us = unix_time_us() - self._context.now_us + text.time_us
+        unix_us = self._context.zero_unix_us + text.time_us
         return datetime.fromtimestamp(unix_us / 1e6).astimezone()
 
     def _save(self) -> None:

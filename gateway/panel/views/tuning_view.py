@@ -10,7 +10,6 @@ import numpy as np
 from nicegui import ui
 
 from gateway.analysis.metrics import rms
-from gateway.clock import unix_time_us
 from gateway.geometry.angle import wrap_180
 from gateway.panel import widgets
 from gateway.panel.dialogues import Dialogue
@@ -230,7 +229,7 @@ class ComparisonCard:
             return
         key = str(self._quantity.value)
         _, unit, field, factor = QUANTITIES[key]
-        zero_us = unix_time_us() - self._context.now_us
+        zero_us = self._context.zero_unix_us
         flown_us, flown = self._context.received.series(field)
         begin_us, end_us = self._estimates[0].time_us[[0, -1]]
         inside = (flown_us >= begin_us) & (flown_us <= end_us)

@@ -8,14 +8,13 @@ from gateway.geometry.rotation import matrix_from_euler_deg
 from gateway.panel.state.calibration import (
     CELLS,
     ORIENTATIONS,
-    SIDES,
     CalibrationRun,
-    CalibrationStep,
     RunState,
     seen_cells,
 )
+from gateway.sensing.calibrating import CalibrationStep
 from gateway.units import US_PER_S
-from gateway.vehicle.services.calibrator import SIDES as VEHICLE_SIDES
+from gateway.vehicle.services.calibrator import SIDES
 from tests.kit.vehicle_bench import G_MPS2, VehicleBench
 
 
@@ -31,7 +30,7 @@ def test_each_of_six_sides_is_reported_once_done() -> None:
     for done, (axis, sign) in enumerate((a, s) for a in range(3) for s in (1.0, -1.0)):
         pose = bias + sign * G_MPS2 * np.eye(3)[axis]
         bench.hold(2.5, accel=tuple(pose.tolist()))
-        assert bench.client.side_now == VEHICLE_SIDES[2 * axis + (sign < 0)]
+        assert bench.client.side_now == SIDES[2 * axis + (sign < 0)]
         assert len(bench.client.sides_done) >= done + 1
     assert sorted(bench.client.sides_done) == sorted(SIDES)
     bench.hold(2.1)
