@@ -89,22 +89,22 @@ def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
 
 
 def settings_of(header: TableHeader) -> AircraftSettings:
-    """Return the settings that were used to record a table."""
+    """Return the settings that were used to record a table; FlightError if they are invalid."""
     sections = {**header.settings, "calibration": header.calibration}
-    return msgspec.convert(sections, AircraftSettings)
+    try:
+        return msgspec.convert(sections, AircraftSettings)
+    except msgspec.ValidationError as error:
+        raise FlightError(
+            f"the recorded settings are of another version ({error}); "
+            "`fuse`, `play` and `report` use the current ones with --fuse-with current"
+        ) from error
 
 
 def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:
     """Choose the settings for a table: its own, or the current ones."""
     if options.choice == "current" or not table.header.settings:
         return options.current.aircraft.get(table.header.vehicle_id, options.current.default)
-    try:
-        return settings_of(table.header)
-    except msgspec.ValidationError as error:
-        raise FlightError(
-            f"the recorded settings are of another version ({error}); "
-            "`fuse`, `play` and `report` use the current ones with --fuse-with current"
-        ) from error
+    return settings_of(table.header)
 
 
 def table_of_blocks(path: Path, reader: TableReader, blocks: Iterator[TableBlock]) -> RecordedTable:

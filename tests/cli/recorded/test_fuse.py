@@ -52,6 +52,17 @@ def test_one_row_per_sample_with_position_and_true_heading(log: Path, estimator:
     assert (last["nav_pos_std_north_m"] == "") == (estimator == "paper")
 
 
+def test_change_to_settings_of_another_version_is_refused(log: Path) -> None:
+    table = log.with_name("table.csv")
+    invoke("fuse", log, "-o", table, code=0)
+    *before, last = table.read_text().splitlines(keepends=True)
+    changed = '# header: {"settings": {"estimation": {"wings": 2}}}\n'
+    table.write_text("".join([*before, changed, last]))
+    found = invoke("fuse", table, "-o", log.with_name("again.csv"), code=2)
+    assert "the recorded settings are of another version" in found.output
+    invoke("fuse", table, "-o", log.with_name("again.csv"), "--fuse-with", "current", code=0)
+
+
 def test_settings_file_overrides_facts_of_the_log(log: Path) -> None:
     config = log.with_name("c.toml")
     config.write_text('[estimation.reference]\ndeclination = "fixed"\ndeclination_deg = -20.0\n')
