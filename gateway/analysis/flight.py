@@ -28,7 +28,7 @@ from gateway.recordings.fuse import (
     samples_of_cells,
     with_estimator,
 )
-from gateway.recordings.recorded_fusion import aircraft_for, check_latency
+from gateway.recordings.recorded_fusion import check_latency, open_table
 from gateway.recordings.recorded_table import ReadOptions, RecordedTable
 from gateway.recordings.recording import open_recordings
 from gateway.recordings.table import TableBlock
@@ -205,8 +205,7 @@ def flight_of_files(
     FlightError or OSError if a file cannot be read, ValueError for fewer than two IMU samples.
     """
     recordings = open_recordings(files)
-    table = joined_rows(recordings, options)
-    aircraft = aircraft_for(recordings[0], table, options)
+    table, aircraft = open_table(recordings, options)
     if checked and recordings[0].is_own:
         check_latency(recordings[0], table, aircraft)
     fusion = FusionSettings(estimation=aircraft.estimation)
@@ -281,8 +280,7 @@ def tracks_by_estimator(
     FlightError or OSError if a file cannot be read, ValueError for fewer than two IMU samples.
     """
     recordings = open_recordings(files)
-    table = joined_rows(recordings, options)
-    aircraft = aircraft_for(recordings[0], table, options, keep=False)
+    _, aircraft = open_table(recordings, options, keep=False)
     table = joined_rows(recordings, options)
     return table.header.unix_us_at_zero or 0, _tracks_of(table.blocks, aircraft, step_us)
 

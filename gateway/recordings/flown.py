@@ -9,10 +9,9 @@ import numpy as np
 
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import Samples, samples_of
-from gateway.recordings.recorded_fusion import aircraft_for
+from gateway.recordings.recorded_fusion import open_table
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.recording import open_recordings
-from gateway.recordings.workshop.joining import joined_rows
 from gateway.records import BaroSample
 from gateway.simulator.recorded import RecordedFlight
 from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
@@ -28,9 +27,7 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
 
     Raises FlightError if it contains no flight; OSError if it cannot be read at all.
     """
-    recordings = open_recordings(files)
-    table = joined_rows(recordings, options)
-    aircraft = aircraft_for(recordings[0], table, options)
+    table, aircraft = open_table(open_recordings(files), options)
     samples = samples_of(table.blocks, aircraft.calibration)
     for remark in table.remarks:
         log.warning(remark)

@@ -40,7 +40,7 @@ PIECE: Final = 8
 """Frames generated per step, which takes one or two milliseconds."""
 
 
-class TlogFile:
+class TlogFile(Source):
     """A tlog on disk: its index, and random access.
 
     It is read, not memory-mapped: if a file shrinks, or a USB stick is pulled out, a process that
@@ -83,27 +83,18 @@ class TlogFile:
         self._size = offset
 
     def read(self, offset: int, size: int) -> bytes:
-        """Read up to `size` bytes; empty at the end, or if the medium fails."""
+        """Read up to `size` bytes; see `Source`."""
         try:
             return os.pread(self._file, max(0, min(size, self._size - offset)), offset)
         except OSError:
             return b""
-
-    @property
-    def last_us(self) -> int:
-        """Greatest time; 0 in an empty file."""
-        return self.index.last_us or 0
-
-    def prepare(self, until_us: int) -> bool:  # noqa: ARG002
-        """Return True: no preparation is needed."""
-        return True
 
     def close(self) -> None:
         """Close the file, which ends its tracks."""
         os.close(self._file)
 
 
-class FusedTlog:
+class FusedTlog(Source):
     """Frames that are generated on demand, and stored on disk for seeking back."""
 
     def __init__(
@@ -127,7 +118,7 @@ class FusedTlog:
     @property
     def last_us(self) -> int:
         """Time of the end, or of the last frame generated so far, whichever is later."""
-        return max(self._last_us or 0, self.index.last_us or 0)
+        return max(self._last_us or 0, super().last_us)
 
     def read(self, offset: int, size: int) -> bytes:
         """Read up to `size` bytes; frames that do not exist yet are generated."""
@@ -136,7 +127,7 @@ class FusedTlog:
         return os.pread(self._file.fileno(), size, offset)
 
     def prepare(self, until_us: int) -> bool:
-        """Generate a few of the frames up to a time; return whether all are available."""
+        """Generate a few of the frames up to a time; see `Source`."""
         return (self.index.last_us or 0) >= until_us or not self._make()
 
     def close(self) -> None:

@@ -21,7 +21,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from itertools import chain
 from types import MappingProxyType
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -57,26 +57,24 @@ MAX_NUMBERS: Final = 256
 """Maximum number of frames of one message and sender with different numbers that are stored."""
 
 
-class Source(Protocol):
+class Source:
     """A tlog that exists, or is generated while it is read."""
 
-    @property
-    def index(self) -> TlogIndex:
-        """Index of the part that is available so far."""
-        ...
+    index: TlogIndex
+    """Index of the part that is available so far."""
 
     @property
     def last_us(self) -> int:
         """Time of its end as far as it is known; 0 if it is empty."""
-        ...
+        return self.index.last_us or 0
 
     def read(self, offset: int, size: int) -> bytes:
-        """Read up to `size` bytes; empty at the end."""
-        ...
+        """Read up to `size` bytes; empty at the end, or if the medium fails."""
+        raise NotImplementedError
 
-    def prepare(self, until_us: int) -> bool:
+    def prepare(self, until_us: int) -> bool:  # noqa: ARG002
         """Do a part of the work for reading up to a time; return whether it is finished."""
-        ...
+        return True
 
 
 class Track:

@@ -174,6 +174,18 @@ def aircraft_for(
     return aircraft
 
 
+def open_table(
+    recordings: Sequence[RecordedFile],
+    options: ReadOptions,
+    given_s: float | None = None,
+    *,
+    keep: bool = True,
+) -> tuple[RecordedTable, AircraftSettings]:
+    """Open the rows of a flight, and choose its settings as `aircraft_for`."""
+    table = joined_rows(recordings, options)
+    return table, aircraft_for(recordings[0], table, options, given_s, keep=keep)
+
+
 def check_latency(
     recording: RecordedFile, table: RecordedTable, aircraft: AircraftSettings
 ) -> None:
@@ -302,8 +314,7 @@ class RecordedFusion:
     ) -> None:
         first, quiet = recordings[0], replace(options, progress=None)
         self._path = first.path
-        self._table = table = joined_rows(recordings, options)
-        self.aircraft = aircraft_for(first, table, options, latency_s)
+        self._table, self.aircraft = open_table(recordings, options, latency_s)
         """The settings used for the fusion."""
         if smooth or estimator is not None:
             name = SMOOTHED_ESTIMATOR if smooth or estimator is None else estimator
