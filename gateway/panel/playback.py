@@ -21,11 +21,10 @@ from gateway.live.control_socket import ControlError
 from gateway.live.terminal import own_command
 from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import ControlClient, Uplink
-from gateway.recordings.file_format import TABLE
 from gateway.recordings.files import FlightError
 from gateway.recordings.flight_facts import FlightTrackPoints
 from gateway.recordings.index import RecordingError, find_recording, parts_together
-from gateway.recordings.recording import open_recording
+from gateway.recordings.recording import open_recordings
 from gateway.recordings.summary import read_summary
 from gateway.units import US_PER_S
 from gateway.vehicle_state.senders import FIRST_GROUND_STATION
@@ -88,9 +87,10 @@ def free_ids(count: int, taken: Collection[int]) -> range:
 
 
 def _aircraft_of(parts: Sequence[Path]) -> list[RecordedAircraft]:
-    found = [read_summary(open_recording(part)) for part in parts]
+    recordings = open_recordings(parts)
+    found = [*map(read_summary, recordings)]
     begin_us = next((one.info.first_us for one in found if one.info.first_us is not None), 0)
-    origin = FUSED_AGAIN if found[0].info.kind == TABLE else RECORDED
+    origin = FUSED_AGAIN if recordings[0].is_own else RECORDED
     points: defaultdict[int, list[FlightTrackPoints]] = defaultdict(list)
     for one in found:
         for system_id, tally in one.tallies.items():
