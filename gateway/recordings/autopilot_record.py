@@ -154,16 +154,16 @@ class AutopilotLog:
         return any(topic in self.present for row in self.table.samples for topic in row.of)
 
     @property
-    def without_counterpart(self) -> dict[str, int]:
-        """Number of rows by topic, of topics that have no counterpart in MAVLink."""
-        used = self.table.topics
-        return {name: n for name, n in sorted(self.counts.items()) if n and name not in used}
-
-    @property
     def lacks(self) -> str:
-        """Text for the user that lists these topics; empty if there are none."""
-        listed = ", ".join(f"{name} {n}" for name, n in self.without_counterpart.items())
+        """Text for the user on the topics without a counterpart in MAVLink; empty if none."""
+        used, counts = self.table.topics, sorted(self.counts.items())
+        listed = ", ".join(f"{name} {n}" for name, n in counts if n and name not in used)
         return listed and f"messages without a counterpart in MAVLink: {listed}"
+
+
+def system_id_of(value: float | None) -> int:
+    """Return the system id in a parameter; 1 if it is not valid."""
+    return int(value) if value is not None and 1 <= value <= 255 else 1
 
 
 class NewestRows:

@@ -23,6 +23,8 @@ import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
 from typing import Any, Final, Protocol
 
 import msgspec
@@ -366,9 +368,10 @@ def _bound(given: Sequence[Value], log: LogFacts, factor: float) -> tuple[Read, 
     return tuple(read for value in given if (read := value.bind(log, factor)))
 
 
-def read_table(text: bytes) -> MessageTable:
-    """Read a table; raises ValueError if it has an error."""
-    raw = msgspec.toml.decode(text)
+@cache
+def table_of(name: str) -> MessageTable:
+    """Read the table of a format; raises ValueError if it has an error."""
+    raw = msgspec.toml.decode((files("gateway.recordings.formats") / f"{name}.toml").read_bytes())
     messages, samples = (
         tuple(_message(name, dict(row)) for name, row in raw[section].items())
         for section in ("messages", "samples")

@@ -382,7 +382,7 @@ PX4_EXPECTED: dict[str, dict[str, float]] = {
 def px4_records(tmp_path_factory: pytest.TempPathFactory) -> list[RecordedFrame]:
     path = flown.write(tmp_path_factory.mktemp("log") / "flight.ulg", px4_log())
     log = open_recording(path).log(OPTIONS)
-    assert log.without_counterpart == {"odd_topic": 40}
+    assert log.lacks == "messages without a counterpart in MAVLink: odd_topic 40"
     return list(RecordTranslator(log).frames())
 
 
@@ -472,6 +472,13 @@ def test_damage_of_whole_blocks_loses_no_message_around_it(tmp_path: Path, part:
     assert any(f"left out {len(damage)} bytes" in remark for remark in found.remarks)
     kept = replace(found, size=whole.size, remarks=whole.remarks)
     assert kept == whole
+
+
+@pytest.mark.parametrize("value", [math.nan, 0.0, 300.0])
+def test_invalid_system_id_in_a_parameter_is_replaced_by_1(tmp_path: Path, value: float) -> None:
+    parameter = ("PARM", (BEGIN_US, b"SYSID_THISMAV", value))
+    path = flown.write(tmp_path / "a.bin", flown.dataflash_of(FORMATS, [*rows(), parameter]))
+    assert open_recording(path).log(OPTIONS).vehicle_id == 1
 
 
 def test_log_without_rows_is_refused(tmp_path: Path) -> None:

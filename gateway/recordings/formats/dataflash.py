@@ -11,6 +11,7 @@ from typing import IO, Any, Final, TypeVar
 
 from pymavlink.DFReader import DFReader_binary, DFReader_text
 
+from gateway.recordings.autopilot_record import system_id_of
 from gateway.recordings.file_format import DATAFLASH_BEGIN, skip_to
 from gateway.recordings.files import FlightError, name_of, read_chunks, temporary_copy
 from gateway.recordings.recorded_table import ReadOptions
@@ -119,8 +120,7 @@ class DataFlash:
     def system_id(self) -> int:
         """The system id in the parameters; 1 if there is no valid one."""
         named = (self.log.params.get(name) for name in SYSTEM_IDS)
-        known = next((int(value) for value in named if value is not None), 1)
-        return known if 1 <= known <= 255 else 1
+        return system_id_of(next((value for value in named if value is not None), None))
 
     @property
     def title(self) -> str:

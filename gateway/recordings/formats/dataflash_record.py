@@ -9,8 +9,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Set
 from datetime import UTC, datetime
-from functools import cache
-from importlib.resources import files
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
@@ -31,7 +30,7 @@ from gateway.recordings.autopilot_record import (
     Text,
 )
 from gateway.recordings.formats.dataflash import DataFlash, Message
-from gateway.recordings.message_table import MessageTable, read_table
+from gateway.recordings.message_table import table_of
 from gateway.recordings.recorded_clock import LogClock
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.workshop.extracts import CIRCLES
@@ -40,6 +39,7 @@ from gateway.units import DEGE7_PER_DEG, FIX_2D, US_PER_S, counted
 from gateway.vehicle.encoding import int32
 from gateway.vehicle.plan import FENCE, MISSION, RALLY, Item
 
+table: Final = partial(table_of, "dataflash")
 TIME_COLUMNS: Final = frozenset({"TimeUS", "TimeMS"})
 INSTANCES: Final = frozenset({"I", "C", "Instance", "Inst", "IMU"})
 """Columns with the number of a sensor, filter or battery."""
@@ -110,12 +110,6 @@ def _in_era(gps_us: int) -> int:
     """Add the multiple of 1024 weeks that a GPS receiver lacks."""
     lost = -(-(FIRST_LOG_US - gps_us) // ROLLOVER_US) if gps_us < FIRST_LOG_US else 0
     return gps_us + lost * ROLLOVER_US
-
-
-@cache
-def table() -> MessageTable:
-    """Return the table of DataFlash."""
-    return read_table((files("gateway.recordings.formats") / "dataflash.toml").read_bytes())
 
 
 class _Kind:

@@ -6,8 +6,7 @@ Positions are in 1e-7 degrees or, in newer logs, in degrees. All is in body FRD 
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from functools import cache
-from importlib.resources import files
+from functools import cache, partial
 from pathlib import Path
 from statistics import median_low
 from typing import Any, Final
@@ -25,15 +24,17 @@ from gateway.recordings.autopilot_record import (
     LogRow,
     Mode,
     Text,
+    system_id_of,
 )
 from gateway.recordings.columns import LARGEST_WHOLE
 from gateway.recordings.formats.ulog import NEEDED, load
-from gateway.recordings.message_table import MessageTable, read_table
+from gateway.recordings.message_table import table_of
 from gateway.recordings.recorded_clock import FIRST_CIVIL_US, logged_times, sound_times
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.units import FIX_2D, US_PER_S, counted
 from gateway.wire.vehicle_types import CLASSES
 
+table: Final = partial(table_of, "ulog")
 Topic = Mapping[str, NDArray[Any]]
 Instance = tuple[str, int]
 """Name of a topic, and the number of its instance, from 0."""
@@ -61,12 +62,6 @@ _KINDS: Final = {"plane": "plane", "vtol": "vtol", "rover": "rover", "boat": "ro
 """Kind of vehicle by its class; all others are copters."""
 
 
-@cache
-def table() -> MessageTable:
-    """Return the table of ULog."""
-    return read_table((files("gateway.recordings.formats") / "ulog.toml").read_bytes())
-
-
 def custom_mode_of(nav_state: int) -> int:
     """Return PX4's custom mode of a navigation state; 0 for an unknown one."""
     _, main, sub = table().nav_states.get(str(nav_state), ("", 0, 0))
@@ -92,7 +87,7 @@ def open_record(path: Path, options: ReadOptions, *, sampled: bool = False) -> A
     return AutopilotLog(
         table=table(),
         entries=_entries(topics, events, zero_us),
-        vehicle_id=options.system_id or _system_id_of(log),
+        vehicle_id=options.system_id or system_id_of(log.initial_parameters.get("MAV_SYS_ID")),
         autopilot=mavlink.MAV_AUTOPILOT_PX4,
         mav_type=mav_type,
         kind=_KINDS.get(CLASSES.get(mav_type, ""), "copter"),
@@ -192,12 +187,6 @@ def _lacks(name: str, topic: Topic) -> bool:
     is_timed = "timestamp" in topic and topic["timestamp"].dtype.kind in "iu"
     fields = NEEDED.get(name, ())
     return not is_timed or not all(any(field in topic for field in one) for one in fields)
-
-
-def _system_id_of(log: Any) -> int:
-    """Return the system id in the parameters; 1 if there is no valid one."""
-    known = log.initial_parameters.get("MAV_SYS_ID", 1)
-    return known if isinstance(known, int) and 1 <= known <= 255 else 1
 
 
 def _used_columns(topic: Mapping[str, Any]) -> Topic:
