@@ -262,6 +262,11 @@ class RecordTranslator:
         self._numbers: dict[str, int] = {name: n for n, name in enumerate(log.parameters)}
         self._texts = 0
 
+    @property
+    def remarks(self) -> list[str]:
+        """Remarks for the user on the log, as far as it was read."""
+        return self._log.remarks
+
     def introduction(self) -> Iterator[bytes]:
         """Yield the frames with modes, parameters and plans at the start of the log."""
         encoder = Encoder(self._encoder.system_id)

@@ -6,13 +6,12 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Final
 
 from gateway.answers.log_answers import LogAnswers
-from gateway.recordings.autopilot_record import RecordTranslator
 from gateway.recordings.file_format import NO_RECORDING
 from gateway.recordings.files import (
     MAX_UNPACKED,
@@ -24,12 +23,12 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.index import parts_together
 from gateway.recordings.play import Source, Track
-from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.recording import Estimates, RecordedFile, estimates_of, open_recordings
+from gateway.recordings.recording import open_recordings
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.recordings.tlog_index import TlogIndex
 from gateway.recordings.tlog_source import Layout, open_tlog
+from gateway.recordings.workshop.convert import FlightToWrite, Fusing
 from gateway.vehicle_state.senders import FIRST_GROUND_STATION
 from gateway.wire.recorded_frames import RecordedFrame
 
@@ -219,44 +218,20 @@ def open_flights(
                 flight.sources.append(tlog)
                 flight.remarks += [f"{file}: {remark}" for remark in tlog.remarks]
         else:
-            estimates = estimates_of(recordings, fuse=fuse, both=both)
-            _open_made(flight, recordings, options, opened, estimates)
+            made = FlightToWrite(recordings, options, fusing=Fusing(wanted=fuse, both=both))
+            for one in made.estimates():
+                for frame in one.introduction():
+                    flight.answers.add_frame(frame, 0)
+                end_us = recordings[-1].end_us(options)
+                fused = FusedTlog(one.frames(), end_us, flight.answers)
+                opened.callback(fused.close)
+                flight.sources.append(fused)
+                flight.remarks += one.remarks
         for source, file in zip(flight.sources, parts, strict=False):
             if not source.index.count:
                 raise FlightError(f"{file}: {NO_RECORDING}")
         flights.append(flight)
     return flights
-
-
-def _open_made(
-    flight: OpenFlight,
-    recordings: Sequence[RecordedFile],
-    options: ReadOptions,
-    opened: ExitStack,
-    estimates: Estimates,
-) -> None:
-    """Begin to generate the frames of a flight that contains none."""
-
-    def add(frames: Iterator[RecordedFrame], last_us: int | None = None) -> None:
-        made = FusedTlog(frames, last_us, flight.answers)
-        opened.callback(made.close)
-        flight.sources.append(made)
-
-    if estimates != "fused":
-        for recording in recordings:
-            log = recording.log(options)
-            translator = RecordTranslator(log)
-            for frame in translator.introduction():
-                flight.answers.add_frame(frame, 0)
-            add(translator.frames())
-            flight.remarks += log.remarks
-            options = replace(options, system_id=log.beside_id, progress=None)
-    if estimates != "own":
-        fusion = RecordedFusion(recordings, options)
-        for frame in fusion.introduction():
-            flight.answers.add_frame(frame, 0)
-        add(fusion.frames(), recordings[-1].end_us(options))
-        flight.remarks += fusion.remarks
 
 
 def lay_out(

@@ -294,23 +294,25 @@ class FlightToWrite:
         self.fusions.append(fusion)
         return fusion
 
-    def _sent(self) -> Iterator[RecordedFrame]:
-        """Yield the frames that the gateway would send for all aircraft, in order of time.
+    def estimates(self) -> Iterator[RecordTranslator | RecordedFusion]:
+        """Open the sources of the MAVLink that is made of the files.
 
-        For logs of autopilots these are the frames of their own estimates, or both.
+        For logs of autopilots these are their own estimates, those of mavgate, or both.
         """
-        streams: list[Iterator[RecordedFrame]] = []
         if self._estimates != "fused":
             for recording in self.recordings:
-                log = recording.log(self.options)
-                streams.append(RecordTranslator(log).frames())
-                self.logs.append(log)
+                self.logs.append(recording.log(self.options))
+                yield RecordTranslator(self.logs[-1])
         if self._estimates == "both":
             second = self.logs[0].beside_id
             self.options = replace(self.options, system_id=second, progress=None)
         if self._estimates != "own":
-            streams += [part.fused().frames() for part in self.by_aircraft()]
-        stamper = Stamper(0)
+            for part in self.by_aircraft():
+                yield part.fused()
+
+    def _sent(self) -> Iterator[RecordedFrame]:
+        """Yield the frames that the gateway would send for all aircraft, in order of time."""
+        streams, stamper = [one.frames() for one in self.estimates()], Stamper(0)
         for record in heapq.merge(*streams, key=lambda record: record.time_us):
             yield RecordedFrame(stamper.stamp(record.time_us), record.frame)
 
