@@ -481,6 +481,12 @@ def test_invalid_system_id_in_a_parameter_is_replaced_by_1(tmp_path: Path, value
     assert open_recording(path).log(OPTIONS).vehicle_id == 1
 
 
+def test_log_without_a_whole_message_is_refused(tmp_path: Path) -> None:
+    path = flown.write(tmp_path / "a.bin", b"\xa3\x95~\0")
+    with pytest.raises(FlightError, match="formats is damaged: no message is left"):
+        open_recording(path).log(OPTIONS)
+
+
 def test_log_without_rows_is_refused(tmp_path: Path) -> None:
     path = flown.write(tmp_path / "empty.bin", flown.dataflash_of(FORMATS, []))
     with pytest.raises(FlightError, match="nothing to play"):

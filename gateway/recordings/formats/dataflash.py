@@ -78,6 +78,8 @@ class DataFlash:
 
     def _open(self, kind: Any, copy: IO[bytes]) -> Exception | None:
         """Open a copy of a log; return why it cannot be opened."""
+        if not copy.tell():
+            return ValueError("no message is left")
         self.log = log = kind.__new__(kind)
         # The fast indexer prints to the terminal directly, not through Python's stdout.
         log.init_arrays_fast = log.init_arrays
