@@ -127,7 +127,7 @@ TIMES: dict[str, list[tuple[int, int, int, bool]]] = {
         (n * S // 10, 50_000 if n % 5 == 0 else 1_000, 0, False) for n in range(1000)
     ],
     "many delays that are hardly one are normal": [
-        (n * S // 10, LEAST_DELAY_US - 1, 0, False) for n in range(1000)
+        (n * S // 25, LEAST_DELAY_US - 1, 0, False) for n in range(1000)
     ],
     "stall at the start is normal": [(0, 0, 0, False), (2 * S, 2 * S, 2 * S, False)],
     "stall is reported until a minute without one": [
