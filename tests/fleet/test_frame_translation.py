@@ -79,33 +79,6 @@ def test_sender_from_the_site_and_target_to_it_are_translated(v1: bool) -> None:
     assert (got.command, got.param7) == (400, 7)
 
 
-def follow(leader: int, kind: Any) -> Any:
-    command, params = mavlink.MAV_CMD_DO_FOLLOW, (leader, 2, 3, 4)
-    if kind is mavlink.MAVLink_command_long_message:
-        return kind(2, 1, command, 0, *params, 5, 6, 7)
-    if kind is mavlink.MAVLink_command_int_message:
-        return kind(2, 1, 3, command, 0, 0, *params, 5, 6, 7)
-    return kind(2, 1, 0, 3, command, 0, 1, *params, 5, 6, 7)
-
-
-@pytest.mark.parametrize("v1", [False, True])
-@pytest.mark.parametrize(
-    "kind",
-    [
-        mavlink.MAVLink_command_long_message,
-        mavlink.MAVLink_command_int_message,
-        mavlink.MAVLink_mission_item_message,
-        mavlink.MAVLink_mission_item_int_message,
-    ],
-)
-def test_system_named_in_a_command_is_translated(kind: Any, v1: bool) -> None:
-    both = translation()
-    there = sent(both, packed(follow(2, kind), 255, v1=v1))
-    assert (there.target_system, there.param1, there.param2, there.param4) == (1, 1, 2, 4)
-    back = shown(both, packed(follow(1, kind), 1, v1=v1))
-    assert (back.get_srcSystem(), back.param1, back.param2) == (2, 2, 2)
-
-
 @pytest.mark.parametrize("value", [0.0, -2.0, float("nan"), 255.0, 1e30])
 def test_parameter_that_names_no_vehicle_is_unchanged(value: float) -> None:
     message = mavlink.MAVLink_command_long_message(
@@ -114,13 +87,6 @@ def test_parameter_that_names_no_vehicle_is_unchanged(value: float) -> None:
     got = sent(translation(), packed(message, 255))
     assert (got.param1, got.param2, got.param4) == (1, 2, 2)
     assert got.param3 == pytest.approx(value, nan_ok=True)
-
-
-def test_controlling_systems_of_a_gimbal_are_translated() -> None:
-    message = mavlink.MAVLink_gimbal_manager_status_message(5, 0, 1, 1, 1, 255, 190)
-    got = shown(translation(), packed(message, 1))
-    assert (got.primary_control_sysid, got.secondary_control_sysid) == (2, 255)
-    assert (got.primary_control_compid, got.get_srcSystem()) == (1, 2)
 
 
 @pytest.mark.parametrize(

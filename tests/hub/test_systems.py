@@ -132,16 +132,6 @@ def test_ids_change_in_both_directions(text: str, version: int) -> None:
     assert (got.get_srcSystem(), got.target_system, got.param7) == (255, 1, 7)
 
 
-def test_fields_with_a_system_id_change_too() -> None:
-    message = mavlink.MAVLink_command_long_message(
-        11, 1, mavlink.MAV_CMD_DO_FOLLOW, 0, 12, 0, 0, 0, 0, 0, 0
-    )
-    sent = translation("1:11,2:12").to_link(frame_of(packed(message, 255)))
-    assert sent
-    got = read_back(sent.data)
-    assert (got.target_system, got.param1) == (1, 2)
-
-
 @pytest.mark.parametrize("key", [KEY, OTHER_KEY])
 def test_signed_frame_is_signed_again_with_its_own_time(key: bytes) -> None:
     signed = packed(attitude(), 1, signing=(key, 3, 123_456))
