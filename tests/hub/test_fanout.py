@@ -172,7 +172,7 @@ def test_monitor_gets_every_frame_without_a_gap(fanout: Fanout, vehicle: Sender)
     answer(fanout, vehicle.heartbeat(), [2])
     publish(fanout, vehicle.attitude())
     command = Sender(255, 190).command(9, 1)
-    fanout.deliver(frame_of(command), [2], 7)
+    fanout.deliver(frame_of(command), [1, 2], 7)
     fanout.deliver(frame_of(command), [2], 1)
     assert monitor.frames == [*other.frames[:3], command]
     assert monitor.sequences() == [0, 1, 2, 0]

@@ -4,11 +4,9 @@ import random
 import struct
 
 import pytest
-from wsproto import ConnectionType, WSConnection
-from wsproto.events import Event, RejectConnection
 from wsproto.frame_protocol import CloseReason
 
-from gateway.hub.transports.ws_protocol import MAX_MESSAGE, WsCaller, WsInput, WsServer
+from gateway.hub.transports.ws_protocol import MAX_MESSAGE, WsInput, WsServer
 
 REQUEST = (
     b"GET / HTTP/1.1\r\nHost: 127.0.0.1:56781\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -194,20 +192,3 @@ class TestMessages:
             for _ in range(chance.randint(0, 8)):
                 data[chance.randrange(len(data))] = chance.randrange(256)
             in_pieces(server, bytes(data), [chance.randint(1, 50) for _ in range(1000)])
-
-
-class TestAgainstAnotherProgram:
-    """The other end is wsproto as other programs use it."""
-
-    @staticmethod
-    def talk(peer: WSConnection, data: bytes) -> list[Event]:
-        peer.receive_data(data)
-        return list(peer.events())
-
-    def test_refusal_of_a_server_is_reported(self) -> None:
-        caller = WsCaller("localhost:56781", "/")
-        peer = WSConnection(ConnectionType.SERVER)
-        self.talk(peer, caller.hello)
-        found = caller.feed(peer.send(RejectConnection(status_code=403)))
-        assert found.ended == "the server answers HTTP 403"
-        assert not found.opened
