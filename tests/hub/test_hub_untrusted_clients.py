@@ -18,7 +18,7 @@ from tests.kit.mavlink import STATION, Sender
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
-CLIENTS, MAX_CLIENTS = 4000, 16
+CLIENTS, MAX_CLIENTS = 2000, 16
 GROWTH_LIMIT_BLOCKS = CLIENTS // 8
 """Half a block for each of a quarter: a client that is kept takes one or more."""
 

@@ -515,8 +515,11 @@ async def test_stalled_peer_loses_only_its_own_oldest_telemetry(rig: Rig, kind: 
 async def test_stalled_peer_of_an_output_loses_whole_messages(rig: Rig, kind: str) -> None:
     link = Link(rig, kind, queue_bytes=4096)
     await link.until_open()
-    while not link.hub.clients()[0].dropped:
-        link.send()
+    link.send()
+    (output,) = link.clients
+    (message,) = output.compose(rig.clock())
+    while not output.counters.dropped:
+        output.put(message)
     await link.until(lambda: link.arrived == link.hub.clients()[0].sent)
     _, second, *_ = link.far.data.split(MARKS[link.output])
     assert len(link.far.data) == link.arrived * (len(MARKS[link.output]) + len(second))
