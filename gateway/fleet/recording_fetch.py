@@ -12,8 +12,9 @@ import os
 import shutil
 import time
 from collections.abc import Callable
+from io import BufferedRandom
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import Any, Final
 
 from gateway.output import sync_folder
 from gateway.recordings.index import is_file_name
@@ -28,7 +29,6 @@ SITE_TIMEOUT_S: Final = 60.0
 """Timeout of a disconnected site."""
 DIGEST_WAIT_S: Final = 330.0
 PIECE_WAIT_S: Final = 20.0
-READ_SIZE: Final = 1 << 20
 
 Ask = Callable[[str, dict[str, Any], float], Any]
 """Sends a request to a fleet: verb, parameters, and timeout in seconds."""
@@ -89,12 +89,15 @@ class RecordingFetch:
 
     def _is_beginning(self, target: Path, name: str) -> bool:
         with target.open("rb") as file:
-            digest = _digest_of(file).hexdigest()
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
             return self._digest(name, file.tell()) == digest
 
-    def _fill(self, file: BinaryIO, name: str, size: int, advance: Callable[[int], None]) -> None:
+    def _fill(
+        self, file: BufferedRandom, name: str, size: int, advance: Callable[[int], None]
+    ) -> None:
         """Fetch until the file is complete and equals the site's."""
-        digest = _digest_of(file)
+        file.seek(0)
+        digest = hashlib.file_digest(file, "sha256")
         have = file.seek(0, os.SEEK_END)
         if have and (have > size or digest.hexdigest() != self._digest(name, have)):
             file.truncate(0)
@@ -141,11 +144,3 @@ class RecordingFetch:
                     f"site {self._site} does not answer; the same command continues from here"
                 )
             self._wait(RETRY_S)
-
-
-def _digest_of(file: BinaryIO) -> "hashlib._Hash":
-    digest = hashlib.sha256()
-    file.seek(0)
-    while piece := file.read(READ_SIZE):
-        digest.update(piece)
-    return digest

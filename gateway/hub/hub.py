@@ -173,9 +173,7 @@ class Hub(HubContext):
     def send(self, outgoing: Outgoing) -> None:
         """Send one of our own frames now: to all clients that take it, or to the one it answers."""
         now_us = self.now_us()
-        frame, client_id = outgoing.header or frame_of(outgoing.frame), outgoing.client_id
-        self._router.charge(client_id, len(frame.data))
-        self._pass_on(frame, self._numbering.number(frame), client_id, now_us)
+        self._send(self._queued(outgoing, now_us), now_us)
 
     def send_all(self, frames: Iterable[Outgoing]) -> None:
         """Send frames of ours over several turns of the loop, answers first.
@@ -227,9 +225,6 @@ class Hub(HubContext):
     def _send(self, queued: _Queued, now_us: int) -> None:
         frame, step, client_id, _ = queued
         sequence = frame.sequence if step is None else self._numbering.leave(frame, step)
-        self._pass_on(frame, sequence, client_id, now_us)
-
-    def _pass_on(self, frame: MavFrame, sequence: int, client_id: int | None, now_us: int) -> None:
         self._router.counters.published += 1
         if self._vehicles.waiting:
             self._greet(frame, sequence, now_us)

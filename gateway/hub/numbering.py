@@ -37,16 +37,6 @@ class Numbering:
         assert before is not None
         return sequence - before & SEQUENCE_MASK
 
-    def number(self, frame: MavFrame) -> int:
-        """Return the sequence number of a frame that waits in no queue."""
-        last, sequence = self._last.get(frame.origin), frame.sequence
-        if last is not None and last[0] == last[1]:
-            # Nothing was dropped or overtaken so far.
-            last[0] = last[1] = sequence
-            return sequence
-        step = self.enter(frame)
-        return sequence if step is None else self.leave(frame, step)
-
     def leave(self, frame: MavFrame, step: int) -> int:
         """Return the sequence number with which a frame is sent."""
         last = self._last.get(frame.origin)

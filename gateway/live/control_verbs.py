@@ -44,13 +44,8 @@ VehicleId = Annotated[int, msgspec.Meta(ge=1, le=255)]
 def recorder_verbs(recorder: Recorder, has_vehicle: Callable[[], bool] = lambda: True) -> Verbs:
     """Return the handlers of `record.*`, which answer when the disk has done what was asked."""
 
-    async def start() -> RecorderStatus:
-        recorder.record()
-        await recorder.settle()
-        return recorder.status()
-
-    async def stop() -> RecorderStatus:
-        recorder.stop()
+    async def settled(do: Callable[[], None]) -> RecorderStatus:
+        do()
         await recorder.settle()
         return recorder.status()
 
@@ -68,8 +63,8 @@ def recorder_verbs(recorder: Recorder, has_vehicle: Callable[[], bool] = lambda:
         return recorder.status()
 
     return {
-        "record.start": start,
-        "record.stop": stop,
+        "record.start": lambda: settled(recorder.record),
+        "record.stop": lambda: settled(recorder.stop),
         "record.status": recorder.status,
         "record.rename": rename,
         "record.note": note,
