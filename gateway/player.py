@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 from gateway.aircraft import Aircraft
@@ -178,18 +179,19 @@ class PlayerDaemon:
     ) -> list[RecordedVehicle]:
         """Build the components that answer, up to a limit: first the vehicles of all systems."""
         systems = [(flight, *ids) for flight in flights for ids in flight.system_ids.items()]
-        vehicles, others = [], []
+        vehicles: list[RecordedVehicle] = []
+        others: list[RecordedVehicle] = []
         for flight, system_id, played_as in systems:
             vehicle, *rest = flight.answers.components(system_id)
-            others += [(flight, system_id, played_as, component) for component in rest]
-            answers = self._answers_of(flight, system_id, played_as, vehicle)
+            answers = partial(self._answers_of, flight, system_id, played_as)
+            others += [
+                RecordedVehicle(played_as, answers(component), components=(component,))
+                for component in rest[: MAX_COMPONENTS - len(others)]
+            ]
             shared = (BROADCAST, *({AUTOPILOT} - {vehicle, *rest}))
             own, ids = metadata.of(played_as), (vehicle, *shared)
-            vehicles.append(RecordedVehicle(played_as, answers, own, components=ids))
-        for one in others[:MAX_COMPONENTS]:
-            answers = self._answers_of(*one)
-            vehicles.append(RecordedVehicle(one[2], answers, components=one[3:]))
-        return vehicles
+            vehicles.append(RecordedVehicle(played_as, answers(vehicle), own, components=ids))
+        return vehicles + others
 
     def _answers_of(
         self, flight: PlayedFlight, system_id: int, played_as: int, component: int

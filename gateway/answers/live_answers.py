@@ -18,7 +18,7 @@ confirmation does no harm.
 import struct
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -90,8 +90,11 @@ SEQUENCE_MASK: Final = 0xFFFF
 """Sequence numbers of MAVLink FTP have 16 bits."""
 
 
-Reader = tuple[int, tuple[int, int]]
-"""A station that reads files: its client, and its system and component."""
+class Reader(NamedTuple):
+    """A station that reads files: its client, and its system and component."""
+
+    client_id: int
+    station: tuple[int, int]
 
 
 def _answers_to(request: Packet, answer: Packet) -> bool:
@@ -230,7 +233,7 @@ class LiveAnswers:
                     self._drop_parameters()
                     self._drop_missions(ALL_KINDS)
             case "FILE_TRANSFER_PROTOCOL":
-                self._add_file_request(bytes(message.payload), (client_id, frame.origin))
+                self._add_file_request(bytes(message.payload), Reader(client_id, frame.origin))
             case "MISSION_COUNT" | "MISSION_CLEAR_ALL" | "MISSION_WRITE_PARTIAL_LIST":
                 self._drop_missions(message.mission_type)
                 self._uploader = frame.origin
@@ -327,20 +330,21 @@ class LiveAnswers:
 
     def remove_client(self, client_id: int) -> None:
         """Discard what a client was reading that has gone."""
-        self._readings = {key: one for key, one in self._readings.items() if key[0] != client_id}
-        self._asked = {key: asked for key, asked in self._asked.items() if key[0] != client_id}
+        readings = self._readings.items()
+        self._readings = {key: one for key, one in readings if key.client_id != client_id}
+        self._asked = {key: one for key, one in self._asked.items() if key.client_id != client_id}
 
     def asker(self, frame: MavFrame) -> int | None:
         """Return the client that requested the content of a frame; None if several may have."""
         reader = self._reader(frame.target, _packet_of(frame))
-        return None if reader is None else reader[0]
+        return None if reader is None else reader.client_id
 
     def _reader(self, station: tuple[int, int], packet: Packet) -> Reader | None:
         """Return the reader that a packet answers, if no other of the same id may have asked."""
         found = [
             reader
             for reader, asked in self._asked.items()
-            if reader[1] == station and any(_answers_to(each, packet) for each in asked)
+            if reader.station == station and any(_answers_to(each, packet) for each in asked)
         ]
         if len(found) > 1:
             # Each of them may get the content of the other's file.
@@ -374,7 +378,8 @@ class LiveAnswers:
             reading.size = int.from_bytes(packet.data[:4], "little")
             for other, rest in [*self._readings.items()]:
                 # The vehicle has opened another file in the session of a station of the same id.
-                if other != reader and other[1] == reader[1] and rest.session == packet.session:
+                is_of_same_id = other != reader and other.station == reader.station
+                if is_of_same_id and rest.session == packet.session:
                     del self._readings[other]
         elif packet.session != reading.session or packet.request_opcode not in READING:
             return

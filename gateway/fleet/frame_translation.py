@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from gateway.fleet.id_map import IdMap
+from gateway.fleet.id_map import IdMap, Vehicle
 from gateway.fleet.loop_detection import LoopDetection
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA
@@ -88,7 +88,7 @@ class FrameTranslation:
             self.counters[rejection] += 1
             return None
         system_id = frame.origin[0]
-        vehicle = (self._site, system_id)
+        vehicle = Vehicle(self._site, system_id)
         if not is_own:
             has_id = self.id_of(system_id) is not None
             if self._loops.is_returned(frame, vehicle, has_id=has_id, now_us=now_us):
@@ -112,7 +112,8 @@ class FrameTranslation:
         a third vehicle, or to an excluded one.
         """
         sender, target = self._id_there(frame.origin[0]), frame.target[0]
-        if target and (self._ids.vehicle_of(target) or ("",))[0] != self._site:
+        addressed = self._ids.vehicle_of(target) if target else None
+        if target and (addressed is None or addressed.site != self._site):
             return None
         signatures = self._signatures
         # The site checks for replays itself, because it has all its streams.
@@ -134,7 +135,7 @@ class FrameTranslation:
 
     def _id_there(self, own_id: int) -> int:
         vehicle = self._ids.vehicle_of(own_id)
-        return vehicle[1] if vehicle is not None and vehicle[0] == self._site else own_id
+        return vehicle.system_id if vehicle and vehicle.site == self._site else own_id
 
     def _rewritten(
         self, frame: MavFrame, sender: int, rename: Callable[[int], int]

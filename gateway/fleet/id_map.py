@@ -26,8 +26,12 @@ MAX_WAITING: Final = 4096
 LEFT_OUT: Final = 0
 """Value instead of an id for an excluded vehicle."""
 
-Vehicle = tuple[str, int]
-"""Site, and system id at the site."""
+
+class Vehicle(NamedTuple):
+    """A vehicle by its site, and its system id there."""
+
+    site: str
+    system_id: int
 
 
 class Handover(NamedTuple):
@@ -67,7 +71,7 @@ class IdMap:
 
     def id_of(self, site: str, system_id: int) -> int | None:
         """Return the id of a vehicle here, assigning one to a new vehicle; None if it has none."""
-        vehicle = (site, system_id)
+        vehicle = Vehicle(site, system_id)
         own_id = self._ids.get(vehicle)
         if own_id is not None or not system_id:
             return own_id
@@ -94,11 +98,11 @@ class IdMap:
         shares = self._shares()
         idle = [each for each in self._ids if received_us.get(each, 0) < idle_since_us]
         idle.sort(key=lambda each: received_us.get(each, 0))
-        one_of_site = {each[0]: each for each in self.unmapped}
+        one_of_site = {each.site: each for each in self.unmapped}
         for site in sorted(one_of_site, key=lambda each: shares[self._client_of(each)]):
             share = shares[self._client_of(site)]
             for former in idle:
-                client = self._client_of(former[0])
+                client = self._client_of(former.site)
                 may_grow = share < self._per_site and shares[client] > share
                 if client == self._client_of(site) or may_grow:
                     own_id = self._ids.pop(former)
@@ -114,7 +118,7 @@ class IdMap:
 
     def known_id(self, site: str, system_id: int) -> int | None:
         """Return the id of a vehicle here, if it has one."""
-        return self._ids.get((site, system_id))
+        return self._ids.get(Vehicle(site, system_id))
 
     def vehicle_of(self, own_id: int) -> Vehicle | None:
         """Return the vehicle that has an id."""
@@ -124,15 +128,15 @@ class IdMap:
         """Assign an id; its former holder gets another, if one is free. Raises ValueError."""
         if not FIRST_ID <= own_id <= LAST_ID:
             raise ValueError(f"id {own_id} is not {FIRST_ID} to {LAST_ID}")
-        holder = self._vehicles.get(own_id)
-        if holder == (site, system_id):
+        holder, vehicle = self._vehicles.get(own_id), Vehicle(site, system_id)
+        if holder == vehicle:
             return
-        former = self._ids.get((site, system_id))
+        former = self._ids.get(vehicle)
         if former is not None:
             del self._vehicles[former]
         if holder is not None:
             del self._ids[holder]
-        self._give((site, system_id), own_id)
+        self._give(vehicle, own_id)
         if holder is not None and former is not None:
             self._give(holder, former)
         elif holder is not None:
@@ -140,7 +144,7 @@ class IdMap:
 
     def leave_out(self, site: str, system_id: int) -> None:
         """Exclude a vehicle permanently; the next waiting one gets its id."""
-        vehicle = (site, system_id)
+        vehicle = Vehicle(site, system_id)
         own_id = self._ids.pop(vehicle, None)
         if own_id is not None:
             del self._vehicles[own_id]
@@ -155,7 +159,7 @@ class IdMap:
         return out + sorted(self._ids.items(), key=lambda item: item[1])
 
     def _shares(self) -> Counter[str]:
-        return Counter(self._client_of(site) for site, _ in self._ids)
+        return Counter(self._client_of(each.site) for each in self._ids)
 
     def _client_of(self, site: str) -> str:
         return self.clients.get(site, site)
@@ -233,5 +237,5 @@ def _read(file: Path) -> dict[Vehicle, int]:
             raise ValueError(f"{file}: {vehicle!r} is not SITE/SYSTEM")
         if own_id != LEFT_OUT and own_id in ids.values():
             raise ValueError(f"{file}: id {own_id} is there twice")
-        ids[site, int(system)] = own_id
+        ids[Vehicle(site, int(system))] = own_id
     return ids

@@ -65,7 +65,7 @@ class LoopDetection:
 
     def record_sent(self, frame: MavFrame, changed: MavFrame, now_us: int) -> None:
         """Store a frame of a client here, as received and as sent to a site."""
-        station = (NO_SITE, frame.origin[0])
+        station = Vehicle(NO_SITE, frame.origin[0])
         self.record_given(frame, station, now_us)
         if changed.data != frame.data:
             self.record_given(changed, station, now_us)
@@ -86,7 +86,8 @@ class LoopDetection:
         if has_id:
             return is_proven and run > MAX_CHANCE
         # Two vehicles with the same id may send equal frames, unless one id was changed.
-        was_changed = known.vehicle[1] != vehicle[1] or known.vehicle[0] == NO_SITE
+        is_other_id = known.vehicle.system_id != vehicle.system_id
+        was_changed = is_other_id or known.vehicle.site == NO_SITE
         return is_proven or was_changed or run <= MAX_CHANCE
 
     def is_returned_by_client(self, frame: bytes, now_us: int) -> bool:

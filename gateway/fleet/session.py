@@ -4,6 +4,7 @@ As a router it listens beyond loopback only with authentication: TLS that verifi
 certificates, or Zenoh's user and password. `insecure` in the settings lifts that, with a warning.
 """
 
+import asyncio
 import logging
 import re
 from collections.abc import Callable
@@ -18,10 +19,8 @@ from gateway.hub.transports.zenoh.session import (
     MAX_KEY,
     OWN,
     Connection,
-    LoopQueue,
     Payload,
     Publishers,
-    Subscription,
     is_local,
     off_loop,
     open_session,
@@ -97,8 +96,8 @@ class FleetSession:
         self._events = events
         self._now_us = now_us
         self._connection: Connection | None = None
-        self._round_trips: LoopQueue[tuple[str, int]]
-        self._subscriptions: list[Subscription] = []
+        self._asked: list[asyncio.Future[dict[str, int]]] = []
+        """The newest queries for round trips."""
         self._keys: dict[str, zenoh.KeyExpr | None] = {}
         """Declared keys; a declaration ends with its object."""
         self._trouble = ""
@@ -117,7 +116,8 @@ class FleetSession:
     @property
     def overflowed(self) -> int:
         """Messages dropped because they arrived faster than they were handled."""
-        return sum(each.dropped for each in self._subscriptions)
+        connection = self._connection
+        return 0 if connection is None else sum(each.dropped for each in connection.subscriptions)
 
     def clients(self) -> dict[str, str] | None:
         """Return the certificate name, or else the id, of each linked session; None in a client."""
@@ -143,31 +143,25 @@ class FleetSession:
 
     def close(self) -> None:
         """End the session; a thread closes it, which may take some time."""
+        for asked in self._asked:
+            asked.cancel()
         if self._connection is not None:
             self._connection.close()
             self._connection = None
 
     def ask_round_trips(self) -> None:
         """Query every site for its round trip; one query serves all sites of a pattern."""
-        import zenoh
-
         if self._connection is None or not self.is_linked:
             return
-        asked_us, trips = self._now_us(), self._round_trips
+        session, now_us = self._connection.session, self._now_us
+        keys = (site_key(pattern, "ping") for pattern in self.patterns)
+        self._asked = [off_loop(_ping, session, key, now_us) for key in keys]
+        for asked in self._asked:
+            asked.add_done_callback(self._handle_round_trips)
 
-        def record(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
-                trips.put((site_of(str(reply.ok.key_expr)), self._now_us() - asked_us))
-
-        for pattern in self.patterns:
-            self._connection.session.get(
-                site_key(pattern, "ping"),
-                record,
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-                congestion_control=zenoh.CongestionControl.DROP,
-                timeout=PING_TIMEOUT_S,
-            )
+    def _handle_round_trips(self, asked: "asyncio.Future[dict[str, int]]") -> None:
+        for site, round_trip_us in () if asked.cancelled() else asked.result().items():
+            self._events.round_trip(site, round_trip_us)
 
     async def query(self, key: str, payload: bytes, timeout_s: float) -> dict[str, bytes]:
         """Query the sites of a key at the lowest priority; return the first answer of each.
@@ -180,13 +174,8 @@ class FleetSession:
         return await off_loop(_query, self._connection.session, key, payload, timeout_s)
 
     def _declare(self, connection: Connection) -> None:
-        self._round_trips = LoopQueue(lambda trip: self._events.round_trip(*trip))
-        connection.readers.append(self._round_trips)
         for pattern in self.patterns:
-            frames = Subscription(connection.session, site_key(pattern, "*", "out"), self._handle)
-            self._subscriptions.append(frames)
-            connection.readers.append(frames)
-            connection.declared.append(frames)
+            connection.subscribe(site_key(pattern, "*", "out"), self._handle)
             connection.watch_presence(pattern, self._events.presence)
 
     def _handle(self, sample: "zenoh.Sample") -> None:
@@ -232,6 +221,24 @@ def missing_authentication(locator: str, config: "zenoh.Config") -> str:
         f"{locator} is reachable from other machines, and zenoh_config has neither TLS with client "
         "certificates (enable_mtls, root_ca_certificate) nor users (usrpwd, dictionary_file)"
     )
+
+
+def _ping(session: "zenoh.Session", key: str, now_us: Callable[[], int]) -> dict[str, int]:
+    """Return the round trip of each site that answers in time, us."""
+    import zenoh
+
+    asked_us, found = now_us(), dict[str, int]()
+    with suppress(zenoh.ZError):
+        for reply in session.get(
+            key,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.DROP,
+            timeout=PING_TIMEOUT_S,
+        ):
+            if reply.ok is not None and len(found) < MAX_KEYS:
+                found.setdefault(site_of(str(reply.ok.key_expr)), now_us() - asked_us)
+    return found
 
 
 def _query(

@@ -14,7 +14,7 @@ import msgspec
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout, OnRun
 from gateway.hub.forwarding import Forwarding
-from gateway.hub.numbering import Numbering
+from gateway.hub.numbering import Numbering, Waiting
 from gateway.hub.own_vehicles import OwnVehicles
 from gateway.hub.route import OnForeign
 from gateway.hub.router import Router
@@ -63,11 +63,6 @@ MAX_WAITING: Final = 256
 SHED_AFTER_US: Final = 150_000
 """Telemetry that has waited longer is dropped: the processor is short of time, and newer telemetry
 is waiting already."""
-
-
-_Queued = tuple[MavFrame, int | None, int | None, int]
-"""One of our own frames that waits for a turn of the loop: the frame, its step (see `Numbering`),
-the client that it answers, and since when it waits."""
 
 
 class Hub(HubContext):
@@ -147,8 +142,8 @@ class Hub(HubContext):
         """Callbacks to flush, by their wait."""
         self._numbering = Numbering()
         """Answers overtake telemetry, so frames are numbered when they leave the queues."""
-        self._answers: deque[_Queued] = deque()
-        self._telemetry: deque[_Queued] = deque()
+        self._answers: deque[Waiting] = deque()
+        self._telemetry: deque[Waiting] = deque()
         self._burst_turn: asyncio.Handle | None = None
 
     def start(self) -> None:
@@ -198,32 +193,32 @@ class Hub(HubContext):
         if self._burst_turn is None:
             self._send_some()
 
-    def _queued(self, outgoing: Outgoing, now_us: int) -> _Queued:
+    def _queued(self, outgoing: Outgoing, now_us: int) -> Waiting:
         frame, client_id = outgoing.header or frame_of(outgoing.frame), outgoing.client_id
         # Charged now, while the client that made the request is known.
         self._router.charge(client_id, len(frame.data))
-        return frame, self._numbering.enter(frame), client_id, now_us
+        return Waiting(frame, self._numbering.enter(frame), now_us, client_id)
 
     def _send_some(self) -> None:
         self._burst_turn = None
         now_us, room = self.now_us(), SENDS_AT_ONCE
         answers, telemetry = self._answers, self._telemetry
         try:
-            while telemetry and telemetry[0][3] < now_us - SHED_AFTER_US:
+            while telemetry and telemetry[0].since_us < now_us - SHED_AFTER_US:
                 telemetry.popleft()
                 self._router.counters.shed += 1
             while (answers or telemetry) and (
                 room > 0 or len(answers) + len(telemetry) > MAX_WAITING
             ):
                 queued = (answers or telemetry).popleft()
-                room -= len(self._clients) if queued[2] is None else 1
+                room -= len(self._clients) if queued.client_id is None else 1
                 self._send(queued, now_us)
         finally:
             if answers or telemetry:
                 self._burst_turn = asyncio.get_running_loop().call_soon(self._send_some)
 
-    def _send(self, queued: _Queued, now_us: int) -> None:
-        frame, step, client_id, _ = queued
+    def _send(self, queued: Waiting, now_us: int) -> None:
+        frame, step, _, client_id = queued
         sequence = frame.sequence if step is None else self._numbering.leave(frame, step)
         self._router.counters.published += 1
         if self._vehicles.waiting:

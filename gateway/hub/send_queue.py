@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from gateway.hub.numbering import Numbering
+from gateway.hub.numbering import Numbering, Waiting
 from gateway.hub.routing_table import Origin
 from gateway.wire.frame_editing import renumbered
 from gateway.wire.mavlink_messages import ids_of
@@ -49,8 +49,6 @@ BULK_BYTES: Final = 16_384
 """Least size of the bulk queue, bytes: the parameters of three aircraft."""
 URGENT_RUN: Final = 4
 """Maximum urgent frames in a row before a frame of another queue."""
-_Queue = deque[tuple[MavFrame, int | None, int]]
-"""Frames, their steps (see `Numbering`), and the time at which they were added."""
 
 
 class SendQueue:
@@ -78,10 +76,10 @@ class SendQueue:
         self._signer = signer
         self._sizes = [0, 0]
         """Waiting bytes of all but bulk, and of bulk."""
-        self._answers: _Queue = deque()
-        self._urgent: _Queue = deque()
-        self._usual: _Queue = deque()
-        self._bulk: _Queue = deque()
+        self._answers: deque[Waiting] = deque()
+        self._urgent: deque[Waiting] = deque()
+        self._usual: deque[Waiting] = deque()
+        self._bulk: deque[Waiting] = deque()
         self._run = 0
         self._bulk_turn = False
 
@@ -114,7 +112,7 @@ class SendQueue:
             while self._sizes[0] and self._sizes[0] + size > self.max_bytes:
                 self._take(self._usual or self._urgent or self._answers)
                 dropped += 1
-        queue.append((frame, self._numbering.enter(frame), now_us))
+        queue.append(Waiting(frame, self._numbering.enter(frame), now_us))
         self._sizes[queue is self._bulk] += size
         return dropped
 
@@ -122,7 +120,7 @@ class SendQueue:
         """Drop the telemetry that was added before a time; return the number of frames."""
         dropped = 0
         for queue in (self._usual, self._urgent):
-            while queue and queue[0][2] < before_us:
+            while queue and queue[0].since_us < before_us:
                 self._take(queue)
                 dropped += 1
         return dropped
@@ -151,10 +149,10 @@ class SendQueue:
         self._sizes = [0, 0]
         return count
 
-    def _take(self, queue: "_Queue") -> tuple[MavFrame, int | None]:
-        frame, step, _ = queue.popleft()
-        self._sizes[queue is self._bulk] -= len(frame.data)
-        return frame, step
+    def _take(self, queue: deque[Waiting]) -> tuple[MavFrame, int | None]:
+        taken = queue.popleft()
+        self._sizes[queue is self._bulk] -= len(taken.frame.data)
+        return taken.frame, taken.step
 
     def _encode(self, frame: MavFrame, step: int | None, now_us: int) -> bytes:
         if step is None:

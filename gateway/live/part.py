@@ -32,10 +32,12 @@ class _Table:
 class Part:
     """Data buffered until it is written to the disk, by the ending of the file name."""
 
-    def __init__(self, session: str, number: int, offset_us: int) -> None:
+    def __init__(self, session: str, number: int, offset_us: int, begin_us: int) -> None:
         self.session = session
         """Name of the session; may be set until the first bytes are taken."""
         self.number = number
+        self.begin_us = begin_us
+        """When the buffering began."""
         self.stamper = Stamper(offset_us)
         self.pending: dict[str, bytearray] = {}
         self.size = 0

@@ -94,7 +94,7 @@ class Recorder:
         self._civil = CivilClock()
         self._seen: set[int] = set()
         self._present: Part | None = None
-        self._memory: deque[tuple[int, Part]] = deque()
+        self._memory: deque[Part] = deque()
         """The data before arming, in two parts whose begins differ by half its length."""
         self._holds = settings.mode == "armed"
         self._files: PartFiles | None = None
@@ -207,7 +207,7 @@ class Recorder:
             reason=session.reason,
             folder=str(self.folder),
             mode=self._settings.mode,
-            held_s=(self._clock() - self._memory[0][0]) / US_PER_S if self._memory else 0.0,
+            held_s=(self._clock() - self._memory[0].begin_us) / US_PER_S if self._memory else 0.0,
         )
 
     @property
@@ -276,7 +276,7 @@ class Recorder:
                 part.change_settings(self._header(vehicle_id, part))
 
     def _parts(self) -> list[Part]:
-        return [part for _, part in self._memory] if self._part is None else [self._part]
+        return [*self._memory] if self._part is None else [self._part]
 
     def _hold(self) -> None:
         """Discard the oldest stretch in memory, and begin to hold the next one."""
@@ -285,11 +285,11 @@ class Recorder:
         if self._part is not None or any(p.stamper.has_jumped(self._civil) for p in self._parts()):
             self._memory.clear()
         now_us = self._clock()
-        begin_us, newest = self._memory[-1] if self._memory else (now_us - HELD_US, None)
-        is_full = newest is not None and newest.size > HELD_BYTES
-        if self._part is None and (now_us - begin_us >= HELD_US or is_full):
+        newest = self._memory[-1] if self._memory else None
+        is_full = newest and (now_us - newest.begin_us >= HELD_US or newest.size > HELD_BYTES)
+        if self._part is None and (newest is None or is_full):
             begun = session_name(now_us + (self._civil.offset_us or 0))
-            self._memory.append((now_us, self._begin_part(begun, 1)))
+            self._memory.append(self._begin_part(begun, 1))
         while len(self._memory) > 2:
             self._memory.popleft()
 
@@ -298,7 +298,7 @@ class Recorder:
         if number == 1:
             self._offsets.clear()
         if number == 1 and self._memory:
-            part = self._memory[0][1]
+            part = self._memory[0]
             part.session = session
         else:
             part = self._begin_part(session, number)
@@ -308,7 +308,7 @@ class Recorder:
 
     def _begin_part(self, session: str, number: int) -> Part:
         """Start buffering for a part, with the present state of the fusion for its head."""
-        part = Part(session, number, self._civil.offset_us or 0)
+        part = Part(session, number, self._civil.offset_us or 0, self._clock())
         if self._settings.table:
             for vehicle_id in self._seen:
                 part.prepare_table(self._header(vehicle_id, part), self._state_of(vehicle_id))
@@ -352,7 +352,7 @@ class Recorder:
         if not actions:
             now_us, disk = self._clock(), self._disk
             part = self._part
-            begin_us = self._memory[0][0] if self._memory else now_us
+            begin_us = self._memory[0].begin_us if self._memory else now_us
             actions = self._session.poll(
                 now_us,
                 begin_us + (self._civil.offset_us or 0),

@@ -42,7 +42,6 @@ class MqttOutput(Output):
     """All messages that pass the filters, of every system and component."""
 
     carriers = (EndpointKind.TCP, TLS)
-    default_rate_hz = 1.0
     wanted_ids = frozenset()
 
     def __post_init__(self) -> None:

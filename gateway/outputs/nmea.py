@@ -52,7 +52,6 @@ class NmeaOutput(Output):
         EndpointKind.TCP_LISTEN,
         EndpointKind.SERIAL,
     )
-    default_rate_hz = 1.0
 
     def compose(self, now_us: int) -> Iterable[bytes]:
         """Return the sentences for the present state as one datagram."""

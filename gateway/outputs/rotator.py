@@ -33,7 +33,6 @@ class RotatorOutput(Output):
     """Commands that point an antenna at a vehicle."""
 
     carriers = (EndpointKind.SERIAL, EndpointKind.TCP, EndpointKind.UDP)
-    default_rate_hz = 1.0
 
     @classmethod
     def check(cls, endpoint: Endpoint) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Container
+from functools import partial
 from pathlib import Path
 from unittest.mock import MagicMock
 
@@ -23,7 +24,6 @@ from gateway.hub.transports.zenoh.session import (
     MAX_MESSAGE,
     MAX_WAITING,
     OWN,
-    LoopQueue,
     Subscription,
     open_session,
     session_config,
@@ -290,34 +290,6 @@ class TestTrouble:
         assert hub.clients()[0].reason.startswith("this endpoint needs the extra fleet; to install")
 
 
-class TestLoopQueue:
-    async def test_flood_is_handled_in_turns_and_the_oldest_items_are_dropped(self) -> None:
-        taken: list[int] = []
-        queue = LoopQueue(taken.append)
-        for n in range(MAX_WAITING + 10):
-            queue.put(n)
-        most = 0
-        while len(taken) < MAX_WAITING:
-            before = len(taken)
-            await asyncio.sleep(0)
-            most = max(most, len(taken) - before)
-        assert taken == list(range(10, MAX_WAITING + 10))
-        assert queue.dropped == 10
-        assert most <= 2 * AT_ONCE
-        queue.close()
-        queue.put(0)
-        await asyncio.sleep(0)
-        assert len(taken) == MAX_WAITING
-
-    async def test_pause_delays_items_without_loss(self) -> None:
-        pauses_s, done = [1e-6, 1e-6, 0.0], asyncio.Event()
-        queue = LoopQueue(lambda _: done.set(), pause_s=lambda: pauses_s.pop(0))
-        queue.put(0)
-        async with asyncio.timeout(START_LIMIT_S):
-            await done.wait()
-        assert not pauses_s
-
-
 class TestFlood:
     """A site takes no more from its fleet at a time than from any other client."""
 
@@ -334,6 +306,15 @@ class TestFlood:
         assert (fleet.received, fleet.bytes_garbage) == (0, len(beats))
         assert before - hub.untrusted_reads.level == (MAX_MESSAGE if trusted == "no" else 0)
 
+    async def test_untrusted_fleet_is_not_read_beyond_its_quota(self, site: Site) -> None:
+        hub = await site.join("site=field&trusted=no")
+        hub.untrusted_reads.level = -1e9
+        site.visit().session.put("mavlink/field/1/in", site.sender(255, 190).heartbeat())
+        await asyncio.sleep(0.1)
+        assert hub.clients()[0].received == 0
+        hub.untrusted_reads.level = 1.0
+        await site.until(lambda: hub.clients()[0].received)
+
 
 class Flood:
     """A subscription, and messages to it that all arrive before the loop handles any."""
@@ -341,10 +322,11 @@ class Flood:
     def __init__(self) -> None:
         self.session = zenoh.open(session_config("tcp/127.0.0.1:0", "", "router"))
         self.taken: list[tuple[str, bytes]] = []
+        self.pauses_s: list[float] = []
         self.reader = Subscription(
-            self.session,
-            "flood/*",
+            partial(self.session.declare_subscriber, "flood/*"),
             lambda sample: self.taken.append((str(sample.key_expr), sample.payload.to_bytes())),
+            pause_s=lambda: self.pauses_s.pop(0) if self.pauses_s else 0.0,
         )
 
     def put(self, key: str, data: bytes, priority: zenoh.Priority = zenoh.Priority.DATA) -> None:
@@ -402,6 +384,16 @@ class TestSubscription:
         expected = [("a", data) for data in urgent] + telemetry[40:]
         assert flood.taken == [(f"flood/{key}", data) for key, data in expected]
         assert flood.reader.dropped == 40
+
+    async def test_pause_delays_messages_without_loss(self, flood: Flood) -> None:
+        flood.pauses_s = [1e-6, 60.0]
+        flood.put("a", b"1")
+        await until(lambda: flood.taken)
+        assert not flood.pauses_s
+        flood.reader.close()
+        flood.put("a", b"2")
+        await asyncio.sleep(0)
+        assert flood.taken == [("flood/a", b"1")]
 
 
 SITE = """

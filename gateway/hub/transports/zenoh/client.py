@@ -7,7 +7,7 @@ queued, so that old data never arrives as new.
 import asyncio
 import logging
 from functools import partial
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from gateway.extras import how_to_add
 from gateway.hub.endpoint import Endpoint
@@ -24,12 +24,9 @@ from gateway.hub.transports.zenoh.session import (
     ROOT,
     SECURED,
     Connection,
-    LoopQueue,
-    Payload,
     is_local,
     off_loop,
     open_session,
-    part_of_turn,
     payload_of,
     session_config,
     site_key,
@@ -38,6 +35,9 @@ from gateway.hub.transports.zenoh.site_queries import QueryAnswers, RecordingAns
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_json import frame_from_json, json_from_frame
 from gateway.wire.mavlink_splitter import MavFrame, split_datagram
+
+if TYPE_CHECKING:
+    import zenoh
 
 log = logging.getLogger(__name__)
 
@@ -154,15 +154,9 @@ class ZenohClient(Client):
             self.become("unreachable", error)
         else:
             self._connection = Connection(session)
-            frames: LoopQueue[Payload] = LoopQueue(
-                self._handle, _cost_of, lambda: self.read_pause_us() / US_PER_S
-            )
-            self._connection.readers.append(frames)
-            self._connection.declared.append(
-                session.declare_subscriber(
-                    self.in_key, lambda sample: frames.put(payload_of(sample))
-                )
-            )
+            # No more at a time than from any other client.
+            limits = {"bytes_at_once": READ_BYTES, "pause_s": self._pause_s}
+            self._connection.subscribe(self.in_key, self._handle, **limits)
             self.declare(self._connection)
             self._warn_of_open_access()
             self.tick(self.context.now_us())
@@ -178,8 +172,11 @@ class ZenohClient(Client):
                 self.name,
             )
 
-    def _handle(self, payload: Payload) -> None:
-        data, size = payload
+    def _pause_s(self) -> float:
+        return self.read_pause_us() / US_PER_S
+
+    def _handle(self, sample: "zenoh.Sample") -> None:
+        data, size = payload_of(sample)
         if not self.trusted:
             self.context.untrusted_reads.level -= min(size, MAX_MESSAGE)
         frames = self.frames_in(data) if data else b""
@@ -277,8 +274,3 @@ class ZenohJson(ZenohClient):
         publishers.put_once(key, whole)
         for field, value in fields.items():
             publishers.put_once(f"{key}/{field}", value)
-
-
-def _cost_of(payload: Payload) -> float:
-    """Return the share of the time limit of a client's turn that a message uses."""
-    return part_of_turn(payload[1], READ_BYTES)

@@ -36,8 +36,9 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import msgspec
 
@@ -71,6 +72,8 @@ MAX_MESSAGE: Final = 4096
 are dropped unread."""
 BYTES_AT_ONCE: Final = 4 * MAX_MESSAGE
 """Maximum bytes handled in one turn by a fleet, which has no sensor samples to delay."""
+LONGEST_PAUSE_S: Final = 0.05
+"""Longest pause before messages are taken from Zenoh, which bounds their number but not bytes."""
 MAX_RELIABLE: Final = 1024
 """Maximum waiting messages of a congested link that must not be dropped: a whole parameter list."""
 BATCHES: Final = 4
@@ -92,7 +95,6 @@ NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[Single\((.*)\)\]!"
 SECURED: Final = ("tls/", "quic/", "wss/")
 LOCAL: Final = "unixsock-stream"
 """The protocol that no other machine can reach."""
-Item = TypeVar("Item")
 Result = TypeVar("Result")
 Payload = tuple[bytes, int]
 """Frames of a message, and its size in bytes; no frames if it is longer than `MAX_MESSAGE`."""
@@ -192,75 +194,6 @@ def payload_of(sample: "zenoh.Sample") -> Payload:
     return (b"" if size > MAX_MESSAGE else sample.payload.to_bytes()), size
 
 
-def part_of_turn(size: int, bytes_at_once: int) -> float:
-    """Return the share of a turn of the loop that a message of this size takes."""
-    return max(1 / AT_ONCE, min(size, MAX_MESSAGE) / bytes_at_once)
-
-
-def handle_turn(
-    waiting: deque[Item], handle: Callable[[Item], None], cost: Callable[[Item], float]
-) -> None:
-    """Handle items from the front until one turn of the loop is full."""
-    spent = 0.0
-    while waiting and spent < 1.0:
-        item = waiting.popleft()
-        spent += cost(item)
-        handle(item)
-
-
-class LoopQueue(Generic[Item]):
-    """Pass items from a thread to the loop, in order; when too many wait the oldest are dropped.
-
-    `handle` is called with each item on the loop. `cost` returns the share of a turn that an item
-    takes, and `pause_s` for how many seconds nothing may be handled.
-    """
-
-    def __init__(
-        self,
-        handle: Callable[[Item], None],
-        cost: Callable[[Item], float] = lambda _: 1 / AT_ONCE,
-        pause_s: Callable[[], float] = lambda: 0.0,
-    ) -> None:
-        self._handle = handle
-        self._cost = cost
-        self._pause_s = pause_s
-        self._loop = asyncio.get_running_loop()
-        self._waiting: deque[Item] = deque(maxlen=MAX_WAITING)
-        self._is_due = False
-        self._is_closed = False
-        self.dropped = 0
-
-    def put(self, item: Item) -> None:
-        """Queue an item; called from any thread."""
-        if self._is_closed:
-            return
-        self.dropped += len(self._waiting) == MAX_WAITING
-        self._waiting.append(item)
-        if not self._is_due:
-            self._is_due = True
-            try:
-                self._loop.call_soon_threadsafe(self._drain)
-            except RuntimeError:
-                # The loop has ended.
-                self._is_closed = True
-
-    def close(self) -> None:
-        """Discard queued items and refuse new ones."""
-        self._is_closed = True
-        self._waiting.clear()
-
-    def _drain(self) -> None:
-        if pause_s := self._pause_s():
-            self._loop.call_later(pause_s, self._drain)
-            return
-        # Before the queue is read: an item that arrives from now on schedules another turn.
-        self._is_due = False
-        handle_turn(self._waiting, self._handle, self._cost)
-        if self._waiting and not self._is_due:
-            self._is_due = True
-            self._loop.call_soon(self._drain)
-
-
 class Subscription:
     """Pass the messages of a subscription to the loop; the oldest are dropped on overflow.
 
@@ -268,24 +201,30 @@ class Subscription:
     Python's lock: at thousands of messages a second that costs more than handling them. Here a
     thread waits for the first message, wakes the loop, and sleeps until the loop has handled this
     and all later messages.
+
+    `declare` makes a subscriber with a channel. `handle` is called with each message on the loop,
+    with about `bytes_at_once` in a turn; `pause_s` returns for how long nothing may be handled.
     """
 
     def __init__(
-        self, session: "zenoh.Session", key: str, handle: Callable[["zenoh.Sample"], None]
+        self,
+        declare: Callable[["zenoh.handlers.RingChannel[zenoh.Sample]"], Any],
+        handle: Callable[["zenoh.Sample"], None],
+        bytes_at_once: int = BYTES_AT_ONCE,
+        pause_s: Callable[[], float] = lambda: 0.0,
     ) -> None:
         import zenoh
 
-        self._handle = handle
+        self._handle, self._bytes_at_once, self._pause_s = handle, bytes_at_once, pause_s
         self._usual = zenoh.Priority.DATA
         self._loop = asyncio.get_running_loop()
         self._waiting: deque[zenoh.Sample] = deque()
         self._all_handled = threading.Event()
         self._is_closed = False
         # Twice the size, so that an overflow is dropped and counted here, not within Zenoh.
-        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(2 * MAX_WAITING)
-        self._subscriber: Any = session.declare_subscriber(key, ring)
+        self._subscriber = declare(zenoh.handlers.RingChannel(2 * MAX_WAITING))
         self.dropped = 0
-        threading.Thread(target=self._wait, name=key, daemon=True).start()
+        threading.Thread(target=self._wait, name="zenoh-reader", daemon=True).start()
 
     def close(self) -> None:
         """Stop handling messages."""
@@ -309,7 +248,7 @@ class Subscription:
             self._all_handled.wait()
 
     def _drain(self, sample: "zenoh.Sample | None" = None) -> None:
-        waiting = self._waiting
+        waiting, pause_s = self._waiting, self._pause_s()
         while not self._is_closed and (sample := sample or self._subscriber.try_recv()) is not None:
             if len(sample.payload) > MAX_MESSAGE:
                 # Handled at once, so that the queue is bounded in bytes.
@@ -324,15 +263,15 @@ class Subscription:
             else:
                 # Commands, parameters, missions and texts are not repeated.
                 self._handle(oldest)
-        handle_turn(waiting, self._handle, _cost_of)
+        spent = 0.0
+        while waiting and spent < 1.0 and not pause_s:
+            oldest = waiting.popleft()
+            spent += max(1 / AT_ONCE, len(oldest.payload) / self._bytes_at_once)
+            self._handle(oldest)
         if waiting:
-            self._loop.call_soon(self._drain)
+            self._loop.call_later(min(pause_s, LONGEST_PAUSE_S), self._drain)
         else:
             self._all_handled.set()
-
-
-def _cost_of(sample: "zenoh.Sample") -> float:
-    return part_of_turn(len(sample.payload), BYTES_AT_ONCE)
 
 
 class Publishers:
@@ -414,34 +353,36 @@ class Connection:
     def __init__(self, session: "zenoh.Session") -> None:
         self.session = session
         self.publishers = Publishers(session)
-        self.readers: list[LoopQueue[Any] | Subscription] = []
-        """Queues that pass messages to the loop until the session is closed."""
+        self.subscriptions: list[Subscription] = []
         self.declared: list[Any] = []
+        """All else that is declared."""
 
     @property
     def has_router(self) -> bool:
         """Whether the session is linked with a router."""
         return bool(self.session.info.routers_zid())
 
+    def subscribe(self, key: str, handle: Callable[["zenoh.Sample"], None], **how: Any) -> None:
+        """Pass the messages of a key to the loop until the session is closed."""
+        declare = partial(self.session.declare_subscriber, key)
+        self.subscriptions.append(Subscription(declare, handle, **how))
+
     def watch_presence(self, site: str, handle: Callable[[str, str, bool], None]) -> None:
         """Call back with a site, one of its sessions, and whether that session is present."""
         import zenoh
 
-        here = zenoh.SampleKind.PUT
-        presence: LoopQueue[tuple[str, str, bool]] = LoopQueue(lambda news: handle(*news))
-
         def put(sample: zenoh.Sample) -> None:
             key = str(sample.key_expr)
-            presence.put((site_of(key), key.rpartition("/")[2], sample.kind == here))
+            handle(site_of(key), key.rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT)
 
-        self.readers.append(presence)
         tokens, liveliness = site_key(site, "site", "*"), self.session.liveliness()
-        self.declared.append(liveliness.declare_subscriber(tokens, put, history=True))
+        declare = partial(liveliness.declare_subscriber, tokens, history=True)
+        self.subscriptions.append(Subscription(declare, put))
 
     def close(self) -> None:
         """End the session; a thread closes it, which may take a moment."""
-        for reader in self.readers:
-            reader.close()
+        for subscription in self.subscriptions:
+            subscription.close()
         self.publishers.close()
         off_loop(self._end)
 
@@ -453,7 +394,7 @@ class Connection:
         """
         import zenoh
 
-        self.declared += self.publishers.ended()
+        self.declared += [*self.subscriptions, *self.publishers.ended()]
         while self.declared:
             with suppress(zenoh.ZError, RuntimeError):
                 self.declared.pop().undeclare()
