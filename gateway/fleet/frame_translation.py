@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from gateway.fleet.id_map import IdMap, Vehicle
+from gateway.fleet.id_map import IdMap, SiteVehicle
 from gateway.fleet.loop_detection import LoopDetection
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA
@@ -88,7 +88,7 @@ class FrameTranslation:
             self.counters[rejection] += 1
             return None
         system_id = frame.origin[0]
-        vehicle = Vehicle(self._site, system_id)
+        vehicle = SiteVehicle(self._site, system_id)
         if not is_own:
             has_id = self.id_of(system_id) is not None
             if self._loops.is_returned(frame, vehicle, has_id=has_id, now_us=now_us):

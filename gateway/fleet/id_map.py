@@ -27,7 +27,7 @@ LEFT_OUT: Final = 0
 """Value instead of an id for an excluded vehicle."""
 
 
-class Vehicle(NamedTuple):
+class SiteVehicle(NamedTuple):
     """A vehicle by its site, and its system id there."""
 
     site: str
@@ -38,8 +38,8 @@ class Handover(NamedTuple):
     """An id that was reassigned to another vehicle."""
 
     own_id: int
-    former: Vehicle
-    holder: Vehicle
+    former: SiteVehicle
+    holder: SiteVehicle
 
 
 class IdMap:
@@ -51,15 +51,17 @@ class IdMap:
     no longer received.
     """
 
-    def __init__(self, known: Mapping[Vehicle, int] | None = None, per_site: int = LAST_ID) -> None:
+    def __init__(
+        self, known: Mapping[SiteVehicle, int] | None = None, per_site: int = LAST_ID
+    ) -> None:
         self._per_site = per_site
-        self._ids: dict[Vehicle, int] = {}
-        self._vehicles: dict[int, Vehicle] = {}
+        self._ids: dict[SiteVehicle, int] = {}
+        self._vehicles: dict[int, SiteVehicle] = {}
         self.version = 0
         """Number of changes, so that the file is written only after one."""
-        self.unmapped: set[Vehicle] = set()
+        self.unmapped: set[SiteVehicle] = set()
         """Vehicles for which no id is left."""
-        self.left_out: set[Vehicle] = set()
+        self.left_out: set[SiteVehicle] = set()
         """Vehicles excluded by the operator."""
         self.clients: dict[str, str] = {}
         """Client of each site, if known; otherwise each site counts as a separate client."""
@@ -71,7 +73,7 @@ class IdMap:
 
     def id_of(self, site: str, system_id: int) -> int | None:
         """Return the id of a vehicle here, assigning one to a new vehicle; None if it has none."""
-        vehicle = Vehicle(site, system_id)
+        vehicle = SiteVehicle(site, system_id)
         own_id = self._ids.get(vehicle)
         if own_id is not None or not system_id:
             return own_id
@@ -88,7 +90,7 @@ class IdMap:
         return free
 
     def make_room(
-        self, received_us: Mapping[Vehicle, int], idle_since_us: int
+        self, received_us: Mapping[SiteVehicle, int], idle_since_us: int
     ) -> "Handover | None":
         """Reassign an id of a vehicle that is no longer received to one that waits for an id.
 
@@ -118,9 +120,9 @@ class IdMap:
 
     def known_id(self, site: str, system_id: int) -> int | None:
         """Return the id of a vehicle here, if it has one."""
-        return self._ids.get(Vehicle(site, system_id))
+        return self._ids.get(SiteVehicle(site, system_id))
 
-    def vehicle_of(self, own_id: int) -> Vehicle | None:
+    def vehicle_of(self, own_id: int) -> SiteVehicle | None:
         """Return the vehicle that has an id."""
         return self._vehicles.get(own_id)
 
@@ -128,7 +130,7 @@ class IdMap:
         """Assign an id; its former holder gets another, if one is free. Raises ValueError."""
         if not FIRST_ID <= own_id <= LAST_ID:
             raise ValueError(f"id {own_id} is not {FIRST_ID} to {LAST_ID}")
-        holder, vehicle = self._vehicles.get(own_id), Vehicle(site, system_id)
+        holder, vehicle = self._vehicles.get(own_id), SiteVehicle(site, system_id)
         if holder == vehicle:
             return
         former = self._ids.get(vehicle)
@@ -144,7 +146,7 @@ class IdMap:
 
     def leave_out(self, site: str, system_id: int) -> None:
         """Exclude a vehicle permanently; the next waiting one gets its id."""
-        vehicle = Vehicle(site, system_id)
+        vehicle = SiteVehicle(site, system_id)
         own_id = self._ids.pop(vehicle, None)
         if own_id is not None:
             del self._vehicles[own_id]
@@ -153,7 +155,7 @@ class IdMap:
         self.unmapped.clear()
         self.version += 1
 
-    def items(self) -> list[tuple[Vehicle, int]]:
+    def items(self) -> list[tuple[SiteVehicle, int]]:
         """Return all vehicles in the order of their ids, excluded ones first."""
         out = [(vehicle, LEFT_OUT) for vehicle in sorted(self.left_out)]
         return out + sorted(self._ids.items(), key=lambda item: item[1])
@@ -167,7 +169,7 @@ class IdMap:
     def _is_free(self, own_id: int) -> bool:
         return FIRST_ID <= own_id <= LAST_ID and own_id not in self._vehicles
 
-    def _give(self, vehicle: Vehicle, own_id: int) -> None:
+    def _give(self, vehicle: SiteVehicle, own_id: int) -> None:
         self._ids[vehicle] = own_id
         self._vehicles[own_id] = vehicle
         self.unmapped.discard(vehicle)
@@ -223,19 +225,19 @@ class IdsFile:
         self._trouble = reason
 
 
-def _read(file: Path) -> dict[Vehicle, int]:
+def _read(file: Path) -> dict[SiteVehicle, int]:
     try:
         table = msgspec.json.decode(file.read_bytes(), type=dict[str, int])
     except FileNotFoundError:
         return {}
     except (OSError, msgspec.DecodeError) as error:
         raise ValueError(f"{file}: {error}") from error
-    ids: dict[Vehicle, int] = {}
+    ids: dict[SiteVehicle, int] = {}
     for vehicle, own_id in table.items():
         site, _, system = vehicle.rpartition("/")
         if not SITE_NAME.fullmatch(site) or not system.isdecimal():
             raise ValueError(f"{file}: {vehicle!r} is not SITE/SYSTEM")
         if own_id != LEFT_OUT and own_id in ids.values():
             raise ValueError(f"{file}: id {own_id} is there twice")
-        ids[Vehicle(site, int(system))] = own_id
+        ids[SiteVehicle(site, int(system))] = own_id
     return ids

@@ -11,7 +11,7 @@ from typing import Final
 
 import msgspec
 
-from gateway.fleet.id_map import Vehicle
+from gateway.fleet.id_map import SiteVehicle
 from gateway.hub.duplicates import FrameMemory
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
@@ -32,7 +32,7 @@ class _Sent(msgspec.Struct, frozen=True, gc=False):
     """A frame that was sent to the stations here."""
 
     time_us: int
-    vehicle: Vehicle
+    vehicle: SiteVehicle
     is_proof: bool
     """Whether no other vehicle may send the same frame by itself."""
 
@@ -44,16 +44,16 @@ class LoopDetection:
         self._given: FrameMemory[_Sent] = FrameMemory(SPAN_US, MAX_FRAMES)
         self._sent: FrameMemory[int] = FrameMemory(SPAN_US, MAX_FRAMES)
         """Frames changed for a site, with the time until which they may return."""
-        self._newest: dict[tuple[Vehicle, int, int], bytes] = {}
+        self._newest: dict[tuple[SiteVehicle, int, int], bytes] = {}
         """Newest payload of each message of each component of a vehicle."""
-        self._runs: dict[Vehicle, int] = {}
+        self._runs: dict[SiteVehicle, int] = {}
         """Number of successive returned frames of each vehicle."""
-        self._proven: set[Vehicle] = set()
+        self._proven: set[SiteVehicle] = set()
         """Vehicles proven to return frames, until they send a new one."""
         self.looped = 0
         """Number of frames sent to a site that a client here has returned."""
 
-    def record_given(self, frame: MavFrame, vehicle: Vehicle, now_us: int) -> None:
+    def record_given(self, frame: MavFrame, vehicle: SiteVehicle, now_us: int) -> None:
         """Store a frame of a vehicle that is sent to the ground stations here."""
         kind, payload = (vehicle, frame.origin[1], frame.message_id), frame.payload
         before = self._newest.get(kind)
@@ -65,14 +65,16 @@ class LoopDetection:
 
     def record_sent(self, frame: MavFrame, changed: MavFrame, now_us: int) -> None:
         """Store a frame of a client here, as received and as sent to a site."""
-        station = Vehicle(NO_SITE, frame.origin[0])
+        station = SiteVehicle(NO_SITE, frame.origin[0])
         self.record_given(frame, station, now_us)
         if changed.data != frame.data:
             self.record_given(changed, station, now_us)
             self._sent.turn(now_us)
             self._sent.put(changed.data, now_us + 2 * SPAN_US)
 
-    def is_returned(self, frame: MavFrame, vehicle: Vehicle, *, has_id: bool, now_us: int) -> bool:
+    def is_returned(
+        self, frame: MavFrame, vehicle: SiteVehicle, *, has_id: bool, now_us: int
+    ) -> bool:
         """Return whether a frame of a site has been here before."""
         known = self._given.get(frame.data)
         if known is None or known.vehicle == vehicle or now_us - known.time_us > 2 * SPAN_US:

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
 from gateway.fleet.frame_translation import FrameTranslation
-from gateway.fleet.id_map import LEFT_OUT, IdsFile, Vehicle
+from gateway.fleet.id_map import LEFT_OUT, IdsFile, SiteVehicle
 from gateway.fleet.loop_detection import LoopDetection
 from gateway.fleet.remote_recordings import RemoteRecordings
 from gateway.fleet.session import FleetSession, SessionEvents
@@ -309,7 +309,7 @@ class FleetServer:
         """Reassign the id of one abandoned vehicle, and remove abandoned sites."""
         if self._ids.unmapped:
             received_us = {
-                Vehicle(name, system_id): traffic.received_us
+                SiteVehicle(name, system_id): traffic.received_us
                 for name, site in self._sites.items()
                 for system_id, traffic in site.translation.traffic.items()
             }

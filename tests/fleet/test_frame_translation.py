@@ -6,7 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.fleet.frame_translation import FrameTranslation
-from gateway.fleet.id_map import LAST_ID, LEFT_OUT, IdMap, Vehicle
+from gateway.fleet.id_map import LAST_ID, LEFT_OUT, IdMap, SiteVehicle
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_signing import (
     EPOCH_2015_US,
@@ -111,7 +111,7 @@ def test_broadcast_of_a_station_is_unchanged() -> None:
 
 
 def test_frame_without_a_change_passes_byte_for_byte() -> None:
-    there = FrameTranslation("a", IdMap({Vehicle("a", 1): 1}))
+    there = FrameTranslation("a", IdMap({SiteVehicle("a", 1): 1}))
     frame = packed(attitude(), 1, key=KEY)
     assert from_site(there, frame) is frame
 

@@ -3,7 +3,7 @@
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.fleet.frame_translation import FrameTranslation
-from gateway.fleet.id_map import IdMap, Vehicle
+from gateway.fleet.id_map import IdMap, SiteVehicle
 from gateway.fleet.loop_detection import MAX_CHANCE, MAX_FRAMES, SPAN_US, LoopDetection
 from gateway.wire.mavlink_splitter import frame_of, origin_of
 from tests.kit.mavlink import Sender
@@ -51,7 +51,7 @@ def test_looped_frames_end_after_one_round_and_assign_no_id() -> None:
 
 
 def test_frame_returned_through_its_own_site_is_no_loop() -> None:
-    ring = Ring(IdMap({Vehicle("a", 1): 7}))
+    ring = Ring(IdMap({SiteVehicle("a", 1): 7}))
     given = ring.passed("a")
     assert origin_of(given)[0] == 7
     assert ring.give("a", given) is None
@@ -98,7 +98,7 @@ def test_two_equal_vehicles_with_constant_frames_keep_their_ids() -> None:
 
 
 def test_looped_vehicle_with_an_id_is_dropped_after_a_run() -> None:
-    ring = Ring(IdMap({Vehicle("b", 1): 2, Vehicle("c", 2): 3}))
+    ring = Ring(IdMap({SiteVehicle("b", 1): 2, SiteVehicle("c", 2): 3}))
     passed = 0
     for _ in range(100):
         passed += ring.give("c", ring.passed("b")) is not None
@@ -109,7 +109,7 @@ def test_looped_vehicle_with_an_id_is_dropped_after_a_run() -> None:
 
 
 def test_returned_command_ends_on_both_ways() -> None:
-    ring = Ring(IdMap({Vehicle("a", 1): 7}))
+    ring = Ring(IdMap({SiteVehicle("a", 1): 7}))
     asked = Sender(255, 190).command(7, 1)
     found = ring.sites["a"].to_site(frame_of(asked), 0)
     assert found is not None
@@ -132,7 +132,9 @@ def test_memory_is_bounded_in_time_and_number() -> None:
     numbers = (number.to_bytes(4, "little") for number in range(3 * MAX_FRAMES))
     frames = [frame_of(b"\xfd\x04" + bytes(8) + number) for number in numbers]
     for frame in frames:
-        loops.record_given(frame, Vehicle("a", 1), 0)
-    known = [loops.is_returned(each, Vehicle("c", 2), has_id=False, now_us=0) for each in frames]
+        loops.record_given(frame, SiteVehicle("a", 1), 0)
+    known = [
+        loops.is_returned(each, SiteVehicle("c", 2), has_id=False, now_us=0) for each in frames
+    ]
     assert known[-1]
     assert sum(known) <= 2 * MAX_FRAMES
