@@ -34,7 +34,7 @@ from gateway.recordings.recorded_table import ReadOptions
 from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.cli import run
 from tests.kit.mavlink import packed
-from tests.kit.recordings import SECOND_US, START_US, make_tlog
+from tests.kit.recordings import SECOND_US, START_US, write_tlog
 
 pytestmark = pytest.mark.io
 
@@ -186,51 +186,41 @@ def test_results_with_equal_times_are_sorted_by_name(tmp_path: Path) -> None:
     assert [found.location for found in read_results(tmp_path)] == [*"acmyzb"]
 
 
-def test_files_with_non_utf8_names_are_processed(batch: Path, tmp_path: Path) -> None:
-    there = tmp_path / "there"
-    there.mkdir()
-    shutil.copy(batch / FLIGHTS[0], there / os.fsdecode(b"fl\xfcg_01_v1.csv"))
-    (there / os.fsdecode(b"bad\xff.csv")).write_text("")
-    for _ in range(2):
-        text = report(there, "-o", tmp_path / "out", "--jobs", 1, code=1)
-        assert "1 of 2 recordings failed" in text
-    names = {Path(result.location).name for result in read_results(tmp_path / "out")}
-    assert names == {r"fl\xfcg_01_v1.csv", r"bad\xff.csv"}
-
-
 def test_report_folder_contains_page_and_figures(
     batch: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One section stands for all of them, which take ten seconds to draw."""
     monkeypatch.setattr("gateway.analysis.reporting.compose.SECTIONS", (ground_track,))
-    run("report", batch / FLIGHTS[0], batch / FLIGHTS[1], "-o", tmp_path)
+    run("report", batch / FLIGHTS[0], batch / FLIGHTS[1], "-o", tmp_path, "--jobs", 1)
     folder = tmp_path / "reports" / "alpha"
     assert "Flight report: alpha" in (folder / "index.html").read_text()
     assert (folder / "ground_track.svg").exists()
     assert "flight_map.svg" in {file.name for file in folder.iterdir()}
 
 
-def test_recording_without_samples_has_figures_and_is_no_failure(
-    batch: Path, tmp_path: Path
-) -> None:
+def test_odd_recordings_of_folders_are_reported_and_kept_apart(batch: Path, tmp_path: Path) -> None:
+    """They have equal names, names that are no UTF-8, or no samples."""
+    there, out = tmp_path / "there", tmp_path / "out"
+    assert "contains no recording" in report(tmp_path, "-o", out, code=2)
+    equal = ("x/log_01_v1.csv", "y/log_01_v1.csv")
+    for name, flown in zip((*equal, os.fsdecode(b"fl\xfcg_01_v1.csv")), FLIGHTS, strict=False):
+        (there / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(batch / flown, there / name)
+    (there / os.fsdecode(b"bad\xff.csv")).write_text("")
     fix = mavlink.MAVLink_gps_raw_int_message(0, 3, 470_000_000, 80_000_000, *(0,) * 5, 9)
     records = [RecordedFrame(START_US + n * SECOND_US, packed(fix, 7)) for n in range(9)]
-    (tmp_path / "fixes.tlog").write_bytes(make_tlog(records))
-    report(tmp_path / "fixes.tlog", batch / FLIGHTS[0], "-o", tmp_path / "out")
-    flights = pd.read_csv(tmp_path / "out" / "flights.csv").set_index("recording")
+    write_tlog(there / "fixes.tlog", records)
+    for _ in range(2):
+        text = report(there, there / "x", there / "y", "-o", out, "--jobs", 1, code=1)
+        assert "1 of 5 recordings failed" in text
+    names = [Path(result.location).name for result in read_results(out)]
+    odd = [r"fl\xfcg_01_v1.csv", r"bad\xff.csv", "fixes.tlog"]
+    assert sorted(names) == sorted([*(Path(name).name for name in equal), *odd])
+    assert len(list((out / "fused").glob("log-*.csv"))) == 2
+    flights = pd.read_csv(out / "flights.csv").set_index("recording")
     fixes = flights.loc["fixes.tlog", ["aircraft", "duration, s", "distance, m"]]
     assert fixes.tolist() == [7, 8, 0]
-    assert flights["failed"].isna().all()
-
-
-def test_two_recordings_with_equal_names_are_kept_apart(batch: Path, tmp_path: Path) -> None:
-    for folder, name in (("x", FLIGHTS[0]), ("y", FLIGHTS[1])):
-        (tmp_path / folder).mkdir()
-        shutil.copy(batch / name, tmp_path / folder / "log_01_v1.csv")
-    (tmp_path / "z").mkdir()
-    assert "contains no recording" in report(tmp_path / "z", "-o", tmp_path / "out", code=2)
-    report(tmp_path / "x", tmp_path / "y", "-o", tmp_path / "out")
-    assert len(list((tmp_path / "out" / "fused").glob("log-*.csv"))) == 2
+    assert flights["failed"].notna().sum() == 1
 
 
 def test_tables_are_preferred_to_tlog_of_same_recording(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def test_cluster_gives_the_results_of_this_machine(
     address: str, batch: Path, tmp_path: Path
 ) -> None:
     files = [batch / name for name in ("alpha_01_v1.csv", "gamma_01_v2.csv", "broken.csv")]
-    for out, options in (("cluster", ("--scheduler", address)), ("here", ())):
+    for out, options in (("cluster", ("--scheduler", address)), ("here", ("--jobs", 1))):
         words = ("report", "--quick", *files, "-o", tmp_path / out, *options)
         assert "1 of 3 recordings failed" in run(*words, code=1)
     for part in ("results", "fused"):
