@@ -24,7 +24,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 from statistics import median
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import msgspec
 
@@ -67,9 +67,6 @@ BROKEN = 100
 """One in this many files of the catalogue is broken."""
 COLUMNS = ("failed", "start_s", "wall_s", "cpu_s", "worker_mb", "here_mb")
 
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
-
 
 def main() -> None:
     """Run one part."""
@@ -84,7 +81,10 @@ def main() -> None:
     options = parser.parse_args()
     folder, part, flights = options.folder, options.part, options.flights
     if part == "catalogue":
-        fresh_process(catalogue, folder / f"catalogue-{options.files}", options.files)
+        found = fresh_process(catalogue, folder / f"catalogue-{options.files}", options.files)
+        title = f"catalogue of {options.files} recordings of {CATALOGUED_S:.0f} s, some broken"
+        show(title, ("work", "wall ms", "CPU ms", "flights"), found)
+        write_json(options, {"rows": found})
         return
     recordings = folder / f"flights-{options.duration:.0f}"
     make(recordings, flights, options.duration)
@@ -220,56 +220,43 @@ def simulated_rows(seed: int, duration_s: float) -> tuple[TableHeader, str]:
     return header_for(AircraftSettings(calibration=calibration), 1), rows
 
 
-def catalogue(place: Path, count: int) -> None:
+def catalogue(place: Path, count: int) -> list[tuple[object, ...]]:
     """Index many short recordings, again without changes, again with some changes, and query."""
     make(place, count, CATALOGUED_S)
     paths = sorted(place.glob("flight*.csv"))
     for number in range(count // BROKEN):
         (place / f"broken{number:05d}.csv").write_text(f"x,y\n1,{number}\n")
     (place / CATALOGUE_NAME).unlink(missing_ok=True)
-    size = sum(path.stat().st_size for path in paths)
-    print(
-        f"\ncatalogue of {count} recordings of {CATALOGUED_S:.0f} s, {size / 1e9:.2f} GB, "
-        f"and {count // BROKEN} broken files"
-    )
-    _index(place, "first index")
-    _index(place, "again, nothing new")
+    rows = [_index(place, "first index"), _index(place, "again, nothing new")]
     for path in paths[::100]:
         path.write_bytes(path.read_bytes() + b'# note: {"time_us": 1, "text": "new"}\n')
-    _index(place, "again, 1 % changed")
-    print(f"  {(place / CATALOGUE_NAME).stat().st_size / 1e6:.1f} MB in {CATALOGUE_NAME}")
+    rows.append(_index(place, "again, 1 % changed"))
     asked: dict[str, Callable[[], Any]] = {
-        query: partial(find_flights, place, query) for query in QUERIES
+        f"{query} (goal 50)": partial(find_flights, place, query) for query in QUERIES
     }
     asked["every flight there is"] = partial(find_flights, place)
     asked["the tracks of all as GeoJSON"] = lambda: geojson_of(place)["features"]
     for what, ask in asked.items():
-        times, found = [], 0
+        times_ms, found = [], 0
         for _ in range(9):
-            began = time.perf_counter()
+            began_s = time.perf_counter()
             found = len(ask())
-            times.append(time.perf_counter() - began)
-        goal = " (goal 50)" if what in QUERIES else ""
-        print(f"  {1e3 * median(times):7.1f} ms{goal:<10} {found:6} flights: {what}")
+            times_ms.append(1e3 * (time.perf_counter() - began_s))
+        rows.append((what, median(times_ms), "", found))
+    return rows
 
 
-def _index(place: Path, title: str) -> None:
+def _index(place: Path, title: str) -> tuple[object, ...]:
     began_s, before_s = time.perf_counter(), _children()[0]
     report = index_folder(place, OPTIONS, LocalProcesses(WORKERS), partial(show_progress, "index"))
     wall_s, cpu_s = time.perf_counter() - began_s, _children()[0] - before_s
-    print(
-        f"  {title:<20} {wall_s:7.2f} s wall {cpu_s:7.2f} s CPU; {report.read} read, "
-        f"{report.unchanged} unchanged, {report.broken} broken",
-        flush=True,
-    )
+    return title, 1e3 * wall_s, 1e3 * cpu_s, report.read
 
 
-def fresh_process(
-    function: Callable[Arguments, Result], *arguments: Arguments.args, **named: Arguments.kwargs
-) -> Result:
+def fresh_process(function: Callable[..., Any], *arguments: object) -> Any:
     """Call a function in a new process."""
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(function, *arguments, **named).result()
+        return pool.submit(function, *arguments).result()
 
 
 def show_progress(title: str, done: int, total: int) -> None:

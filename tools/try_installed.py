@@ -39,12 +39,7 @@ def main() -> None:
     folder = options.folder
     folder.mkdir(parents=True, exist_ok=True)
     words = options.mavgate.split()
-    print(
-        "version",
-        subprocess.run(
-            [*words, "--version"], capture_output=True, text=True, check=True
-        ).stdout.strip(),
-    )
+    print("version", run(words, "--version").strip())
     fly(words, folder)
     recorded = options.recorded or folder
     fuse(words, recorded, folder)
@@ -54,18 +49,10 @@ def main() -> None:
 
 def fly(words: list[str], folder: Path) -> None:
     """Fly the demo, and record it."""
+    options = ("--plain", "--no-panel", "--record", "--endpoint")
     with (
         socket_of_station() as station,
-        running(
-            words,
-            folder,
-            "demo",
-            "--plain",
-            "--no-panel",
-            "--record",
-            "--endpoint",
-            url_of(station),
-        ) as process,
+        running(words, folder, "demo", *options, url_of(station)) as process,
     ):
         begin_s = time.monotonic()
         wait_for(station, process)
@@ -73,9 +60,7 @@ def fly(words: list[str], folder: Path) -> None:
         wait_for(station, process, message=ATTITUDE_QUATERNION)
         begin_s, begin_cpu_s, received = time.monotonic(), cpu_s(process.pid), 0
         while time.monotonic() < begin_s + FLOWN_S:
-            received += any(
-                kind == ATTITUDE_QUATERNION for kind, _ in frames_in(station.recv(2048))
-            )
+            received += attitudes_in(station.recv(2048))
         rate = received / FLOWN_S
         print(f"attitudes_per_s {rate:.1f}")
         print(f"cpu_percent {100 * (cpu_s(process.pid) - begin_cpu_s) / FLOWN_S:.1f}")
@@ -109,9 +94,7 @@ def max_difference(first: Path, second: Path) -> float:
 def play(words: list[str], recorded: Path) -> None:
     """Play a recording as fast as possible, and count its attitudes."""
     [tlog] = sorted((recorded / "recordings").glob("*.tlog"))[:1]
-    written = sum(
-        kind == ATTITUDE_QUATERNION for kind, _ in frames_in(tlog.read_bytes(), time_size=8)
-    )
+    written = attitudes_in(tlog.read_bytes(), time_size=8)
     with socket_of_station() as station:
         command = [*words, "play", str(tlog), "--speed", "10", "--endpoint", url_of(station)]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -119,7 +102,7 @@ def play(words: list[str], recorded: Path) -> None:
         station.settimeout(1.0)
         while process.poll() is None:
             with contextlib.suppress(TimeoutError):
-                received += sum(k == ATTITUDE_QUATERNION for k, _ in frames_in(station.recv(2048)))
+                received += attitudes_in(station.recv(2048))
     print(f"attitudes_played {received} of {written}")
     expect(received == written > 0, "each recorded attitude is played")
 
@@ -204,6 +187,11 @@ def frames_in(data: bytes, *, time_size: int = 0) -> Iterator[tuple[int, bytes]]
         at += 12 + size + 13 * (data[at + 2] & 1) + time_size
 
 
+def attitudes_in(data: bytes, *, time_size: int = 0) -> int:
+    """Return the number of ATTITUDE_QUATERNION in a datagram, or in a tlog."""
+    return sum(kind == ATTITUDE_QUATERNION for kind, _ in frames_in(data, time_size=time_size))
+
+
 @contextlib.contextmanager
 def running(
     words: list[str], folder: Path, *arguments: str, config: str = ""
@@ -224,10 +212,11 @@ def running(
             process.kill()
 
 
-def run(words: list[str], *arguments: str) -> None:
-    """Run a command to its end."""
+def run(words: list[str], *arguments: str) -> str:
+    """Run a command to its end; return its output."""
     done = subprocess.run([*words, *arguments], capture_output=True, text=True, check=False)
     expect(done.returncode == 0, f"{arguments[0]}: {done.stdout}{done.stderr}")
+    return done.stdout
 
 
 def socket_of_station() -> socket.socket:
@@ -273,10 +262,8 @@ def cpu_s(pid: int) -> float:
 
 def memory_mb(pid: int) -> float:
     """Return the resident memory of a process, MB."""
-    [line] = [
-        x for x in Path(f"/proc/{pid}/status").read_text().splitlines() if x.startswith("VmRSS")
-    ]
-    return int(line.split()[1]) / 1000
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.partition("VmRSS:")[2].split()[0]) / 1000
 
 
 def expect(holds: bool, text: str) -> None:

@@ -155,7 +155,8 @@ FOUND_S = 5.0
 UBX_HZ, NMEA_HZ = 5, 1
 SPEED_CASES = [
     *((name, None) for name in GPS_MODULES),
-    *((name, baud) for name in ("u-blox M8", "u-blox M10", "NMEA") for baud in GPS_BAUDS),
+    *((name, baud) for name in ("u-blox M10", "NMEA") for baud in GPS_BAUDS),
+    *(("u-blox M8", baud) for baud in (4800, 230_400)),
     *(("u-blox, no acknowledgement", baud) for baud in (4800, 57_600, 230_400)),
 ]
 
