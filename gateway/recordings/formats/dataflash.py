@@ -73,7 +73,10 @@ class DataFlash:
             with closing(damaged), temporary_copy(path, self._messages(damaged.data_map)) as copy:
                 error = self._open(kind, copy)
         if error:
-            self.log.close()
+            # A log without any message is not mapped.
+            for part in ("data_map", "filehandle"):
+                if part in vars(self.log):
+                    getattr(self.log, part).close()
             raise FlightError(f"{path}: its list of formats is damaged: {error}") from error
 
     def _open(self, kind: Any, copy: IO[bytes]) -> Exception | None:
