@@ -159,7 +159,7 @@ def test_wrongly_mounted_compass_is_reported_and_not_used(flight: Flight, how: s
     assert scores["inclination"] < 3.0
 
 
-@pytest.mark.parametrize("leap_s", [-50, 100, 86_400])
+@pytest.mark.parametrize("leap_s", [100, 86_400])
 @pytest.mark.parametrize("since_s", [4.0, 60.0], ids=["at rest", "in flight"])
 def test_clock_jump_is_handled_as_outage(flight: Flight, leap_s: int, since_s: float) -> None:
     """The aircraft may be in any state after the jump; the filter converges again."""

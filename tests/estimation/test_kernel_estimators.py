@@ -214,6 +214,19 @@ class TestInvalidData:
             states = feed(estimator, items)
             assert not [each for each in states if NavFlags.SENSOR_FAULT in each.flags]
 
+    @pytest.mark.parametrize("jump_us", [5_000_000, -60_000_000])
+    def test_time_jump_leaves_states_finite_and_gps_in_use(
+        self, either: Estimator, jump_us: int
+    ) -> None:
+        start = 100_000_000
+        feed(either, [*still(start, 3.0), fix(start + 3_000_000), *still(start + 3_000_000, 1.0)])
+        later = start + 4_000_000 + jump_us
+        items = still(later, 3.0)
+        states = feed(either, [*items[:100], fix(later + 1_000_000), *items[100:]])
+        assert self.finite(states)
+        assert states[-1].q_nb[0] > 0.99
+        assert NavFlags.USING_GPS | NavFlags.POSITION_VALID in states[100].flags
+
     def test_stuck_gyroscope_is_reported_until_recovery(self, estimator: KernelEstimator) -> None:
         feed(estimator, still(0, 3.0))
         stuck = [replace(s, gyro_b_radps=(0.3, 0.0, 0.0)) for s in still(3_000_000, 6.0)]

@@ -21,6 +21,8 @@ LTM = b"".join(
     for n in range(30)
 )
 KINDS = st.sampled_from(["ltm", *sorted(SOURCE_BYTES)])
+TAIL, LONGEST_HEAD = 100, 40
+"""Zeros behind the data, and bytes that may seem to begin a frame that is not complete."""
 MOST_LOST = 4
 """Records of the frames that a damaged one covers or seems to begin."""
 
@@ -60,7 +62,12 @@ def test_damage_anywhere_costs_few_records(
     at = int(where * len(data))
     data[at] ^= flip
     data[at:at] = noise
-    found = [each for each in decoded(kind, bytes(data)) if not isinstance(each, Fault)]
-    lost = len(decoded(kind, flight(kind))) - len(found)
+    events, whole = decoded(kind, bytes(data), bytes(TAIL)), decoded(kind, flight(kind))
+    found = [each for each in events if not isinstance(each, Fault)]
     # A post of a phone has many records.
-    assert lost <= (0.3 * len(found) if kind == "phone" else MOST_LOST)
+    most_lost = 0.3 * len(found) if kind == "phone" else MOST_LOST
+    assert len(whole) - len(found) <= most_lost
+    if kind in ("crsf", "ltm"):
+        assert {*map(repr, found)} <= {*map(repr, whole)}, "no false record"
+        dropped = sum(each.size for each in events if isinstance(each, Fault))
+        assert dropped >= len(noise) + TAIL - LONGEST_HEAD

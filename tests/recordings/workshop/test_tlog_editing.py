@@ -84,7 +84,7 @@ def test_chosen_frames_are_kept_byte_for_byte(
 
 
 DATA = make_tlog(MIXED)
-HOLE = bytes(32 << 20)
+HOLE = bytes(4 << 20)
 DAMAGED = {
     "zeros at the end": (DATA + bytes(4096), 210, 4096),
     "cut at the end": (DATA[:-5], 209, 0),
