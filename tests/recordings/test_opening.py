@@ -13,10 +13,11 @@ from gateway.config import GatewaySettings
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
 from gateway.recordings.recorded_table import header_for
+from gateway.recordings.recording import open_recording
 from gateway.wire.recorded_frames import RecordedFrame
 from tests.kit.mavlink import STATION, Sender, read_back
 from tests.kit.recordings import START_US, STEP_US, make_records, make_tlog, write_table, write_tlog
-from tests.recordings.flights import OPTIONS, fly, make_flight, read
+from tests.recordings.flights import OPTIONS, flown_table, fly, make_flight, read
 
 pytestmark = pytest.mark.io
 
@@ -46,6 +47,17 @@ def test_recording_that_grows_is_played_as_it_was_opened(tmp_path: Path) -> None
             file.write(make_tlog(RECORDS[100:]))
         assert source.read(0, 1 << 20) == before == make_tlog(RECORDS[:100])
         assert source.read(len(before), 1 << 20) == b""
+
+
+def test_end_of_rows_is_found_without_reading_all_of_them(tmp_path: Path) -> None:
+    header, rows = read(flown_table(5))
+    header = msgspec.structs.replace(header, unix_us_at_zero=START_US)
+    table = write_table(tmp_path / "a.csv", header, rows)
+    other, log = tmp_path / "other.csv", tmp_path / "a.bin"
+    other.write_text("time_s,ax,ay,az,gx,gy,gz\n1.5,0,0,-9.8,0,0,0\n2.5,0,0,-9.8,0,0,0\n")
+    log.write_bytes(b"\xa3\x95\x80")
+    found = [open_recording(path).end_us(OPTIONS) for path in (table, other, log)]
+    assert found == [START_US + rows[-1].time_us, 2_500_000, None]
 
 
 def test_damage_is_among_the_remarks(tmp_path: Path) -> None:
