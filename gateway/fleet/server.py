@@ -31,8 +31,9 @@ from gateway.live.metrics_server import MetricsServer
 from gateway.live.other_gateways import identity_verb
 from gateway.units import US_PER_S
 from gateway.vehicle.telemetry.announcements import TEXT_BYTES, utf8
+from gateway.wire.framing import Fault
 from gateway.wire.mavlink_signing import WindowVerifier, key_from_passphrase
-from gateway.wire.mavlink_splitter import MavFrame, SplitFault, frame_of, split_datagram
+from gateway.wire.mavlink_splitter import MavFrame, frame_of, split_datagram
 
 log = logging.getLogger(__name__)
 
@@ -91,7 +92,7 @@ class SiteClient(Client):
         if self.state != "open":
             self.become("open")
         for event in split_datagram(data):
-            if isinstance(event, SplitFault):
+            if isinstance(event, Fault):
                 self.receive([event], event.size, now_us)
                 continue
             frame = self.translation.from_site(event, now_us, is_own=is_own)

@@ -21,7 +21,8 @@ from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.units import US_PER_S, counted
 from gateway.vehicle_state.senders import Senders
 from gateway.wire.frame_scan import TIME_SIZE
-from gateway.wire.mavlink_splitter import MavlinkSplitter, SplitFault
+from gateway.wire.framing import Fault
+from gateway.wire.mavlink_splitter import MavlinkSplitter
 from gateway.wire.recorded_frames import Batch
 
 PIECE: Final = 1 << 12
@@ -94,7 +95,7 @@ def file_layout(head: bytes) -> Layout:
     # In pieces, which bounds the work for bytes with many false starts of frames.
     for begin in range(0, len(head), PIECE):
         for event in splitter.feed(head[begin : begin + PIECE]):
-            if isinstance(event, SplitFault):
+            if isinstance(event, Fault):
                 gap += event.size
             else:
                 gaps[gap] += met
@@ -133,8 +134,8 @@ def _frames(data: Iterator[bytes]) -> Iterator[list[tuple[int, bytes, bytes]]]:
             rest, at = rest + piece, 0
             found: list[tuple[int, bytes, bytes]] = []
             for event in splitter.feed(piece):
-                size = event.size if isinstance(event, SplitFault) else len(event.data)
-                if isinstance(event, SplitFault):
+                size = event.size if isinstance(event, Fault) else len(event.data)
+                if isinstance(event, Fault):
                     left_out += size
                     lead = (lead + rest[at : at + size])[-2 * TIME_SIZE :]
                 else:

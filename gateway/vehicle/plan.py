@@ -26,16 +26,15 @@ MAX_ALT_M: Final = 50_000.0
 """Valid heights above mean sea level, m: from below the Dead Sea to above every balloon."""
 
 ABSOLUTE_FRAMES: Final = frozenset({mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT})
-RELATIVE_FRAMES: Final = frozenset(
-    {
-        mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-        mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
-        mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
-        mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT,
-    }
-)
+FLOAT_FRAMES: Final = {
+    mavlink.MAV_FRAME_GLOBAL_INT: mavlink.MAV_FRAME_GLOBAL,
+    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+    mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT: mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
+}
+"""The frames of MISSION_ITEM that correspond to those of integer coordinates."""
+GLOBAL_FRAMES: Final = frozenset({*FLOAT_FRAMES, *FLOAT_FRAMES.values()})
+RELATIVE_FRAMES: Final = GLOBAL_FRAMES - ABSOLUTE_FRAMES
 """Frames with heights above home; the unknown terrain is assumed to be as high as home."""
-GLOBAL_FRAMES: Final = ABSOLUTE_FRAMES | RELATIVE_FRAMES
 WANTED: Final = Geodesic.DISTANCE | Geodesic.AZIMUTH
 HomeSource = Literal["none", "gps", "operator"]
 LOCATED_FIXES = frozenset({GpsFixType.FIX_3D, GpsFixType.GNSS_AND_DEAD_RECKONING})
@@ -48,12 +47,6 @@ MAX_ITEMS: Final = {MISSION: 1000, FENCE: 500, RALLY: 100}
 ACCEPTED: Final[int] = mavlink.MAV_MISSION_ACCEPTED
 INVALID_X: Final = mavlink.MAV_MISSION_INVALID_PARAM5_X
 INVALID_Y: Final = mavlink.MAV_MISSION_INVALID_PARAM6_Y
-FLOAT_FRAMES: Final = {
-    mavlink.MAV_FRAME_GLOBAL_INT: mavlink.MAV_FRAME_GLOBAL,
-    mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT: mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT,
-    mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT_INT: mavlink.MAV_FRAME_GLOBAL_TERRAIN_ALT,
-}
-"""The frames of MISSION_ITEM that correspond to those of integer coordinates."""
 KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally"}
 LOCAL_SCALE: Final = 1e4
 """Units per metre of x and y of MISSION_ITEM_INT in a local frame."""

@@ -30,6 +30,8 @@ MAX_ENCODED: Final = MAX_CONTENT + CRC_SIZE + 1
 class FaultKind(StrEnum):
     """Reasons for which bytes of the line are dropped."""
 
+    GARBAGE = "garbage"
+    """The bytes do not begin like a frame."""
     COBS = "cobs"
     CRC = "crc"
     TOO_LONG = "too_long"

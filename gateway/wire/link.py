@@ -6,7 +6,6 @@ tracker for the receiver and one for each node, and counts everything that is lo
 
 from collections import Counter, deque
 from dataclasses import dataclass, field
-from enum import Enum
 from itertools import takewhile
 from typing import Final
 
@@ -49,14 +48,6 @@ MAX_ARRIVALS: Final = 2048
 """Twice the payloads that a node sends in a second at the radio's maximum rate."""
 
 
-class Arrival(Enum):
-    """Relation of a payload's sequence number to the previous ones."""
-
-    NEW = "new"
-    LATE = "late"
-    DUPLICATE = "duplicate"
-
-
 class SequenceCounter:
     """Distinguish new payloads from duplicates and late ones, and count the gaps."""
 
@@ -75,8 +66,8 @@ class SequenceCounter:
         self._last = None
         self.has_begun_again = False
 
-    def count(self, seq: int) -> Arrival:
-        """Count one sequence number, modulo 65536."""
+    def count(self, seq: int) -> bool:
+        """Count one sequence number, modulo 65536; return whether it is neither old nor late."""
         if self._last is None:
             return self._begin(seq)
         ahead = (seq - self._last) % SEQUENCE_MODULUS
@@ -85,26 +76,26 @@ class SequenceCounter:
             self._seen = (self._seen << ahead | 1) & ALL_SEEN
             self.lost += ahead - 1
             self.received += 1
-            return Arrival.NEW
+            return True
         behind = -ahead % SEQUENCE_MODULUS
         if behind >= LATE_WINDOW:
             self.has_begun_again = True
             return self._begin(seq)
         if self._seen >> behind & 1:
             self.duplicates += 1
-            return Arrival.DUPLICATE
+            return False
         self._seen |= 1 << behind
         self.reordered += 1
         self.received += 1
         self.lost -= 1
-        return Arrival.LATE
+        return False
 
-    def _begin(self, seq: int) -> Arrival:
+    def _begin(self, seq: int) -> bool:
         self._last = seq
         # Numbers before the first received one do not count as late payloads of this run.
         self._seen = ALL_SEEN
         self.received += 1
-        return Arrival.NEW
+        return True
 
 
 class Arrivals:
@@ -247,7 +238,7 @@ def _receive(
     if clock.runs != runs:
         node.begin_run()
     # A late payload is counted but not used: all later stages rely on growing times.
-    if node.sequence.count(header.seq) is not Arrival.NEW:
+    if not node.sequence.count(header.seq):
         # A payload newer than the newest must have a higher number.
         last_us = stamp_us if node.last_stamp_us is None else node.last_stamp_us
         node.faults["sequence"] += 0 < (stamp_us - last_us) % WRAP_US < WRAP_US // 2

@@ -15,15 +15,14 @@ A serial bridge may cut frames anywhere between its datagrams. `DatagramSplitter
 bytes of an unfinished frame, but continues to search after them: a frame that is found there is
 returned at once and shows that those bytes were not a frame.
 
-Dropped bytes in a row are reported as one fault. The signature is skipped, not checked. Each frame
+Dropped bytes in a row are reported as one fault: of the checksum (or the end) if they begin like a
+frame, else of garbage. The signature is skipped, not checked. Each frame
 is returned as a `MavFrame`, whose header is read once; routing and transports use its fields.
 """
 
 import re
 import struct
 from collections.abc import Hashable
-from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 from fastcrc.crc16 import mcrf4xx
@@ -34,6 +33,7 @@ from gateway.records import PAYLOAD_V2 as PAYLOAD_V2
 from gateway.records import START_V2 as START_V2
 from gateway.records import MavFrame as MavFrame
 from gateway.units import US_PER_S
+from gateway.wire.framing import Fault, FaultKind
 from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS, base_size
 
 START_V1: Final = 0xFE
@@ -62,24 +62,7 @@ _NO_FRAME: Final = 0
 _STARTS: Final = re.compile(rb"[\xfd\xfe]")
 
 
-class SplitFaultKind(StrEnum):
-    """Reasons for which bytes are dropped."""
-
-    GARBAGE = "garbage"
-    """The bytes do not begin like a frame."""
-    CRC = "crc"
-    """The bytes begin like a frame, but the checksum (or the end) is wrong."""
-
-
-@dataclass(frozen=True, slots=True)
-class SplitFault:
-    """A run of bytes that belongs to no frame."""
-
-    kind: SplitFaultKind
-    size: int
-
-
-Event = MavFrame | SplitFault
+Event = MavFrame | Fault
 
 
 class MavlinkSplitter:
@@ -124,7 +107,7 @@ class DatagramSplitter:
         rest, since_us = self._rests.pop(peer, (b"", now_us))
         late: list[Event] = []
         if now_us - since_us > KEPT_US:
-            late, rest = [SplitFault(SplitFaultKind.CRC, len(rest))], b""
+            late, rest = [Fault(FaultKind.CRC, len(rest))], b""
         data = rest + data
         events, unfinished = _split(data, seeks_on=True)
         if unfinished < len(data):
@@ -253,8 +236,7 @@ def _split(data: bytes, *, seeks_on: bool = False, keeps: bool = True) -> tuple[
 def _report(events: list[Event], data: bytes, begin: int, end: int) -> None:
     if end > begin:
         started = data[begin] in (START_V1, START_V2)
-        kind = SplitFaultKind.CRC if started else SplitFaultKind.GARBAGE
-        events.append(SplitFault(kind, end - begin))
+        events.append(Fault(FaultKind.CRC if started else FaultKind.GARBAGE, end - begin))
 
 
 def _measure(data: bytes, begin: int, *, takes_unknown: bool) -> int:

@@ -26,6 +26,7 @@ References
 
 from bisect import bisect_left, bisect_right
 from collections import deque
+from operator import attrgetter
 from statistics import median_low
 from typing import Final
 
@@ -62,6 +63,9 @@ RECENT: Final = 15
 """Number of newest fixes of each aircraft that are used: some seconds."""
 ENOUGH: Final = 3
 """Number of fixes before an aircraft is used: the first may have the time of the last flight."""
+
+
+_remote_us: Final = attrgetter("remote_us")
 
 
 class _Point(msgspec.Struct, frozen=True, gc=False):
@@ -228,10 +232,6 @@ def _turn(a: _Point, b: _Point, c: _Point) -> int:
     return (b.remote_us - a.remote_us) * (c.delta_us - a.delta_us) - (b.delta_us - a.delta_us) * (
         c.remote_us - a.remote_us
     )
-
-
-def _remote_us(point: _Point) -> int:
-    return point.remote_us
 
 
 class GpsTime:

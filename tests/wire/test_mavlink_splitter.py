@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.wire.frame_editing import edit_frame
+from gateway.wire.framing import Fault, FaultKind
 from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import (
     KEPT_PEERS,
@@ -16,8 +17,6 @@ from gateway.wire.mavlink_splitter import (
     Event,
     MavFrame,
     MavlinkSplitter,
-    SplitFault,
-    SplitFaultKind,
     frame_of,
     message_id_of,
     origin_of,
@@ -55,7 +54,7 @@ class TestOneFrame:
 
     def test_garbage_before_it_is_one_fault(self, frame: bytes) -> None:
         events = split_datagram(b"hello" + frame)
-        assert events[0] == SplitFault(SplitFaultKind.GARBAGE, 5)
+        assert events[0] == Fault(FaultKind.GARBAGE, 5)
         assert frames_of(events) == [frame]
 
     def test_a_cut_frame_does_not_swallow_the_next(self, frame: bytes) -> None:
@@ -82,27 +81,27 @@ def test_a_datagram_is_read_at_once_only_if_it_is_one_plain_frame(name: str) -> 
         assert read_datagram(damaged) is None
 
 
-CRC = SplitFaultKind.CRC
+CRC = FaultKind.CRC
 
 
 @pytest.mark.parametrize(
     ("data", "frames", "faults"),
     [
         (b"", [], []),
-        (V2[:-1] + bytes((V2[-1] ^ 1,)), [], [SplitFault(CRC, len(V2))]),
+        (V2[:-1] + bytes((V2[-1] ^ 1,)), [], [Fault(CRC, len(V2))]),
         # An unknown frame before garbage is dropped.
-        (UNKNOWN + b"xyz" + V2, [V2], [SplitFault(CRC, len(UNKNOWN) + 3)]),
+        (UNKNOWN + b"xyz" + V2, [V2], [Fault(CRC, len(UNKNOWN) + 3)]),
         # An unknown incompatibility flag.
-        (V2[:2] + b"\x02" + V2[3:], [], [SplitFault(CRC, len(V2))]),
+        (V2[:2] + b"\x02" + V2[3:], [], [Fault(CRC, len(V2))]),
     ],
     ids=["empty", "damaged", "unknown", "flagged"],
 )
 def test_bytes_of_no_frame_are_a_fault(
-    data: bytes, frames: list[bytes], faults: list[SplitFault]
+    data: bytes, frames: list[bytes], faults: list[Fault]
 ) -> None:
     events = split_datagram(data)
     assert frames_of(events) == frames
-    assert [event for event in events if isinstance(event, SplitFault)] == faults
+    assert [event for event in events if isinstance(event, Fault)] == faults
 
 
 STARTS = st.sampled_from([b"\xfd", b"\xfe", b"\xfd\x00\x00", b"\xfd\xff\x01"])
@@ -132,7 +131,7 @@ def test_frames_between_noise_are_all_found_and_every_byte_is_counted(
 
 
 def size_of(event: Event) -> int:
-    return event.size if isinstance(event, SplitFault) else len(event.data)
+    return event.size if isinstance(event, Fault) else len(event.data)
 
 
 @given(STREAMS, st.lists(st.integers(0, 60), max_size=20))
@@ -149,7 +148,7 @@ def test_frames_of_any_bytes_do_not_depend_on_the_chunks(data: bytes, sizes: lis
 @given(STREAMS, st.integers(0, 255))
 def test_every_frame_of_any_bytes_can_be_read(data: bytes, sequence: int) -> None:
     for frame in split_datagram(data):
-        if isinstance(frame, SplitFault):
+        if isinstance(frame, Fault):
             continue
         assert frame.origin == origin_of(frame.data)
         assert frame.message_id == message_id_of(frame.data)
@@ -171,7 +170,7 @@ def test_bytes_cut_off_a_payload_are_zeros(flags: int, payload: bytes, message_i
 def test_hostile_datagram_costs_a_bounded_number_of_checksums() -> None:
     data = (b"\xfe" * 65507)[: -len(V2)] + V2
     events = split_datagram(data)
-    assert events == [SplitFault(SplitFaultKind.CRC, len(data))]
+    assert events == [Fault(FaultKind.CRC, len(data))]
     assert len(data) > MAX_FALSE_STARTS
 
 
@@ -193,7 +192,7 @@ def test_whole_frame_after_a_lost_piece_is_returned_at_once(cut: int) -> None:
     assert splitter.feed(V2_COMMAND[:cut], 0) == []
     events = splitter.feed(V2, 1)
     assert frames_of(events) == [V2]
-    assert sum(event.size for event in events if isinstance(event, SplitFault)) == cut
+    assert sum(event.size for event in events if isinstance(event, Fault)) == cut
     assert not splitter
 
 
@@ -202,7 +201,7 @@ def test_unfinished_frame_is_dropped_after_its_time() -> None:
     assert splitter.feed(V2[:9], 0) == []
     events = splitter.feed(V2[9:], KEPT_US + 1)
     assert frames_of(events) == []
-    assert events[0] == SplitFault(SplitFaultKind.CRC, 9)
+    assert events[0] == Fault(FaultKind.CRC, 9)
 
 
 def test_pieces_of_two_peers_are_not_joined_and_their_number_is_bounded() -> None:

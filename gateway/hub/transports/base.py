@@ -20,12 +20,12 @@ from gateway.hub.systems import SystemTranslation
 from gateway.printable import reason_of
 from gateway.token_bucket import TokenBucket
 from gateway.units import US_PER_S
+from gateway.wire.framing import Fault
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import (
     START_V2,
     Event,
     MavFrame,
-    SplitFault,
     frame_of,
     read_datagram,
     to_mavlink1,
@@ -265,7 +265,7 @@ class Client:
         """Count received events of `size` bytes, and route the frames."""
         self.counters.bytes_received += size
         for event in events:
-            if isinstance(event, SplitFault):
+            if isinstance(event, Fault):
                 self.counters.bytes_garbage += event.size
             else:
                 self.receive_frame(event, now_us)

@@ -75,18 +75,12 @@ KEEPS_CLIENTS_US: Final = US_PER_S
 DEFAULT: Final = 0
 NONE: Final = -1
 HEARTBEAT: Final = mavlink.MAVLINK_MSG_ID_HEARTBEAT
-_GROUPS: Final[dict[int, tuple[int, ...]]] = {
-    stream: tuple(MESSAGE_IDS[name] for name in names)
-    for stream, names in (
-        (mavlink.MAV_DATA_STREAM_RAW_SENSORS, ("HIGHRES_IMU", "SCALED_PRESSURE")),
-        (
-            mavlink.MAV_DATA_STREAM_EXTENDED_STATUS,
-            ("SYS_STATUS", "GPS_RAW_INT", "NAV_CONTROLLER_OUTPUT"),
-        ),
-        (mavlink.MAV_DATA_STREAM_POSITION, ("GLOBAL_POSITION_INT",)),
-        (mavlink.MAV_DATA_STREAM_EXTRA1, ("ATTITUDE", "ATTITUDE_QUATERNION")),
-        (mavlink.MAV_DATA_STREAM_EXTRA2, ("VFR_HUD",)),
-    )
+_GROUPS: Final[dict[int, tuple[str, ...]]] = {
+    mavlink.MAV_DATA_STREAM_RAW_SENSORS: ("HIGHRES_IMU", "SCALED_PRESSURE"),
+    mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: ("SYS_STATUS", "GPS_RAW_INT", "NAV_CONTROLLER_OUTPUT"),
+    mavlink.MAV_DATA_STREAM_POSITION: ("GLOBAL_POSITION_INT",),
+    mavlink.MAV_DATA_STREAM_EXTRA1: ("ATTITUDE", "ATTITUDE_QUATERNION"),
+    mavlink.MAV_DATA_STREAM_EXTRA2: ("VFR_HUD",),
 }
 DATA_STREAMS: Final = _GROUPS | {mavlink.MAV_DATA_STREAM_ALL: tuple(sum(_GROUPS.values(), ()))}
 """REQUEST_DATA_STREAM's groups, as autopilots fill them."""
@@ -176,12 +170,12 @@ class IntervalService(Service):
         flood the client.
         """
         message = request.message
-        ids = DATA_STREAMS.get(message.req_stream_id, ())
         wanted_us = NONE
         if message.start_stop and message.req_message_rate:
             wanted_us = US_PER_S // message.req_message_rate
         answers: list[Answer] = []
-        for message_id in ids:
+        for name in DATA_STREAMS.get(message.req_stream_id, ()):
+            message_id = MESSAGE_IDS[name]
             common_us = self._telemetry.streams[message_id].interval_us
             faster = 0 <= wanted_us <= common_us
             answers += self._apply(request.client_id, message_id, DEFAULT if faster else wanted_us)

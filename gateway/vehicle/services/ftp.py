@@ -19,8 +19,7 @@ from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.vehicle.service import Answer, Reply, Request
-from gateway.vehicle.services.transfers import TransferService
+from gateway.vehicle.service import Answer, Reply, Request, TransferService
 
 HEADER: Final = struct.Struct("<HBBBBBxI")
 PAYLOAD_BYTES: Final = 251

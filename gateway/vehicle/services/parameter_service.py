@@ -14,7 +14,14 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import RECORDED_ONLY
 from gateway.vehicle.requested_messages import whole
-from gateway.vehicle.service import Answer, Reply, Request, SaveSettings, SettingsChange
+from gateway.vehicle.service import (
+    Answer,
+    Reply,
+    Request,
+    SaveSettings,
+    SettingsChange,
+    TransferService,
+)
 from gateway.vehicle.services.commands import ACCEPTED, IN_PROGRESS, UNSUPPORTED, Command, Outcome
 from gateway.vehicle.services.parameters import (
     Parameter,
@@ -23,7 +30,6 @@ from gateway.vehicle.services.parameters import (
     packed_parameters,
 )
 from gateway.vehicle.services.plan_service import PlanService
-from gateway.vehicle.services.transfers import TransferService
 
 MAX_LISTENERS: Final = 512
 """Maximum clients that are sent changes."""
