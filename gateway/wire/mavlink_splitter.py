@@ -176,11 +176,11 @@ def origin_of(data: bytes) -> tuple[int, int]:
     return (data[5], data[6]) if data[0] == START_V2 else (data[3], data[4])
 
 
-def message_id_of(data: bytes) -> int:
+def message_id_of(data: bytes, begin: int = 0) -> int:
     """Return the message id of a frame."""
-    if data[0] == START_V2:
-        return data[7] | data[8] << 8 | data[9] << 16
-    return data[5]
+    if data[begin] == START_V2:
+        return data[begin + 7] | data[begin + 8] << 8 | data[begin + 9] << 16
+    return data[begin + 5]
 
 
 def to_mavlink1(frame: bytes) -> bytes | None:
@@ -264,11 +264,7 @@ def _measure(data: bytes, begin: int, *, takes_unknown: bool) -> int:
 
 def _is_genuine(data: bytes, begin: int, checked: int, size: int, takes_unknown: bool) -> bool:
     """Check the checksum, which ends `checked` bytes after the start; the signature follows."""
-    if data[begin] == START_V2:
-        message_id = data[begin + 7] | data[begin + 8] << 8 | data[begin + 9] << 16
-    else:
-        message_id = data[begin + 5]
-    extra = CRC_EXTRA.get(message_id)
+    extra = CRC_EXTRA.get(message_id_of(data, begin))
     if extra is None:
         end = begin + size
         return takes_unknown and (end == len(data) or data[end] in (START_V1, START_V2))
