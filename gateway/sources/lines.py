@@ -52,10 +52,15 @@ TEXTS: Final = ("mode", "text")
 KEYS: Final = (*VECTORS, *NUMBERS, *TEXTS, "armed")
 _NOTICE: Final = 5
 """MAV_SEVERITY_NOTICE."""
-REPORTED: Final = frozenset(
-    {"attitude", "heading_rad", "airspeed_mps", "mode", "text", "armed", "rssi_dbm", "link_percent"}
-    | {"battery_v", "battery_a", "battery_mah", "battery_percent"}
-)
+STATES: Final = {
+    "attitude": "attitude_rad", "heading_rad": "heading_rad", "airspeed_mps": "airspeed_mps",
+    "mode": "mode", "armed": "armed", "link_percent": "link_quality_percent",
+}  # fmt: skip
+BATTERY: Final = {
+    "battery_v": "voltage_v", "battery_a": "current_a", "battery_mah": "used_mah",
+    "battery_percent": "remaining_percent",
+}  # fmt: skip
+"""Fields of `VehicleReport` and of `BatteryReport` by quantity."""
 
 
 class LinesDecoder(TextLines):
@@ -177,28 +182,11 @@ def _fix(values: Mapping[str, Any], node: NodeId, time_us: int) -> SourceRecord 
 
 
 def _report(values: Mapping[str, Any], node: NodeId, time_us: int) -> VehicleReport | None:
-    if REPORTED.isdisjoint(values):
-        return None
-    get = values.get
-    battery = None
-    if any(name.startswith("battery") for name in values):
-        battery = BatteryReport(
-            voltage_v=get("battery_v", NAN),
-            current_a=get("battery_a", NAN),
-            used_mah=get("battery_mah", NAN),
-            remaining_percent=get("battery_percent", NAN),
-        )
-    rssi, text = get("rssi_dbm"), get("text")
-    return VehicleReport(
-        time_us=time_us,
-        node=node,
-        attitude_rad=get("attitude"),
-        heading_rad=get("heading_rad", NAN),
-        airspeed_mps=get("airspeed_mps", NAN),
-        battery=battery,
-        mode=get("mode", ""),
-        armed=get("armed"),
-        text=None if text is None else (_NOTICE, text),
-        link_quality_percent=get("link_percent", NAN),
-        signal=None if rssi is None else RadioSignal(round(rssi), get("snr_db", NAN)),
-    )
+    fields = {field: values[name] for name, field in STATES.items() if name in values}
+    if battery := {field: values[name] for name, field in BATTERY.items() if name in values}:
+        fields["battery"] = BatteryReport(**battery)
+    if "text" in values:
+        fields["text"] = (_NOTICE, values["text"])
+    if "rssi_dbm" in values:
+        fields["signal"] = RadioSignal(round(values["rssi_dbm"]), values.get("snr_db", NAN))
+    return VehicleReport(time_us=time_us, node=node, **fields) if fields else None
