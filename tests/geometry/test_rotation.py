@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gateway.geometry.quaternion import from_euler, rotate
-from gateway.geometry.rotation import euler_deg_from_matrix, matrix_from_euler_deg
+from gateway.geometry.rotation import euler_deg_from_matrix, is_rotation, matrix_from_euler_deg
 from gateway.records import Vec3
 
 
@@ -30,3 +30,10 @@ def test_vertical_pitch_gives_angles_of_the_same_rotation(angles: Vec3) -> None:
     again = euler_deg_from_matrix(matrix)
     assert again[0] == 0.0
     np.testing.assert_allclose(matrix_from_euler_deg(again), matrix, atol=1e-9)
+
+
+@pytest.mark.parametrize(("decimals", "is_valid"), [(4, True), (1, False)])
+def test_rotation_may_be_rounded_a_little(decimals: int, is_valid: bool) -> None:
+    matrix = np.round(matrix_from_euler_deg((10.0, 20.0, 30.0)), decimals)
+    assert is_rotation(tuple(map(tuple, matrix.tolist()))) == is_valid
+    assert not is_rotation(tuple(map(tuple, (-matrix).tolist())))
