@@ -20,10 +20,8 @@ from gateway.simulator.sensors import (
     BaroSamples,
     DeviceClock,
     ImuSamples,
-    IntArray,
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.simulator.trajectory import FloatArray
 from gateway.units import DEGE7_PER_DEG
 from gateway.wire.payloads import (
     GPS_ACKNOWLEDGES,
@@ -200,24 +198,17 @@ def pack_baro(samples: BaroSamples) -> Iterator[Sent]:
 
 def gps_payloads(gps: GpsSamples, clock: DeviceClock, geoid_separation_m: float) -> Iterator[Sent]:
     """Pack GPS messages, each as a quality payload and a fix payload."""
-    h_acc_cm, v_acc_cm = _held(gps.h_acc_m), _held(gps.v_acc_m)
-    speed_acc_cmps, course_acc_cdeg = _held(gps.speed_acc_mps), _held(gps.course_acc_deg)
-    pdop_centi = _held(gps.pdop)
+    accuracies = (gps.h_acc_m, gps.v_acc_m, gps.speed_acc_mps, gps.course_acc_deg, gps.pdop)
+    hundredths = np.rint(np.column_stack(accuracies) * 100.0).clip(0, UINT16_MAX)
+    words = hundredths.astype(np.int64).tolist()
     lat_dege7, lon_dege7 = (np.rint(deg * DEGE7_PER_DEG) for deg in (gps.lat_deg, gps.lon_deg))
     vel_cmps = np.clip(np.rint(gps.vel_n_mps * 100.0), -INT16_MAX, INT16_MAX).astype(np.int64)
     for k, time_s in enumerate(gps.time_s.tolist()):
         itow_ms, node_us = int(gps.itow_ms[k]), clock.at(time_s)
         utc = UNIX_EPOCH + timedelta(microseconds=int(gps.unix_us[k]))
-        quality = GpsQualityPayload(
-            itow_ms=itow_ms,
-            h_acc_cm=int(h_acc_cm[k]),
-            v_acc_cm=int(v_acc_cm[k]),
-            speed_acc_cmps=int(speed_acc_cmps[k]),
-            course_acc_cdeg=int(course_acc_cdeg[k]),
-            pdop_centi=int(pdop_centi[k]),
-            geoid_separation_cm=round(geoid_separation_m * 100.0),
-            utc=utc if gps.time_valid[k] else None,
-        )
+        known_utc = utc if gps.time_valid[k] else None
+        values = (*words[k], round(geoid_separation_m * 100.0), known_utc)
+        quality = GpsQualityPayload(itow_ms, *values)
         north, east, down = vel_cmps[k].tolist()
         fix = GpsFixPayload(
             itow_ms=itow_ms,
@@ -231,8 +222,3 @@ def gps_payloads(gps: GpsSamples, clock: DeviceClock, geoid_separation_m: float)
         )
         yield Sent(time_s + GPS_READING_S, node_us, quality)
         yield Sent(time_s + GPS_READING_S, node_us, fix)
-
-
-def _held(values: FloatArray) -> IntArray:
-    """Convert to hundredths, saturated to 16 bits."""
-    return np.clip(np.rint(values * 100.0), 0, UINT16_MAX).astype(np.int64)
