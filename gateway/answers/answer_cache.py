@@ -141,7 +141,9 @@ class AnswerCache:
 
     def drop(self, link: int) -> None:
         """Drop all answers of a link, as after a change of its options."""
-        self._entries = {key: entry for key, entry in self._entries.items() if key[0] != link}
+        for at, system in [*self._entries]:
+            if at == link:
+                del self._entries[at, system]
 
     def remove_client(self, client_id: int) -> None:
         """Drop the downloads of a client that has gone; keep the answers that it brought."""

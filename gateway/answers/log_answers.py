@@ -35,7 +35,7 @@ import struct
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Set
 from dataclasses import dataclass, field
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
@@ -158,6 +158,14 @@ class _Course(Generic[Value]):
         return None if number < 0 and self.is_set else self.values[max(number, 0)]
 
 
+class _TransferKey(NamedTuple):
+    vehicle: int
+    kind: int
+    """Kind of mission."""
+    station: int
+    """System of the station that uploads; `_DOWNLOAD` for downloads."""
+
+
 @dataclass(slots=True)
 class _Transfer:
     """Transfers of a mission between a vehicle and a station."""
@@ -188,8 +196,7 @@ class LogAnswers:
         self.seen: set[tuple[int, int]] = set()
         """Sender and message id of each message that was seen."""
         self._vehicles: dict[int, int] = {}
-        self._transfers: dict[tuple[int, int, int], _Transfer] = {}
-        """Key: vehicle, kind of mission, and system of the station; or -1 for downloads."""
+        self._transfers: dict[_TransferKey, _Transfer] = {}
         self._set: set[tuple[int, bytes]] = set()
         """Parameters (system, name) that a station has set and whose new value is still to come."""
         self._kept = 0
@@ -258,8 +265,12 @@ class LogAnswers:
     def drop_mission(self, vehicle: int, kind: int) -> None:
         """Drop a mission, and its transfers in progress."""
         self.missions.pop((vehicle, kind), None)
-        for key in [key for key in self._transfers if key[:2] == (vehicle, kind)]:
+        for key in self._keys(vehicle, kind):
             del self._transfers[key]
+
+    def _keys(self, vehicle: int, kind: int) -> list[_TransferKey]:
+        """Return the keys of the transfers of a mission, the newest last."""
+        return [key for key in self._transfers if (key.vehicle, key.kind) == (vehicle, kind)]
 
     def _add_mission(self, frame: bytes, time_us: int, *, is_upload: bool) -> None:
         name, message = MESSAGE_NAMES[message_id_of(frame)], fields_of(frame)
@@ -288,7 +299,7 @@ class LogAnswers:
                 self._store(vehicle, each, transfer, time_us)
 
     def _transfer(self, vehicle: int, kind: int, station: int) -> _Transfer:
-        key = (vehicle, kind, station)
+        key = _TransferKey(vehicle, kind, station)
         if key not in self._transfers and len(self._transfers) >= MAX_TRANSFERS:
             del self._transfers[next(iter(self._transfers))]
         return self._transfers.setdefault(key, _Transfer())
@@ -307,12 +318,11 @@ class LogAnswers:
         self, vehicle: int, kind: int, station: int, time_us: int, *, is_accepted: bool
     ) -> None:
         """Process the vehicle's answer to an upload or to clearing a mission."""
-        transfer = self._transfers.get((vehicle, kind, station))
+        transfer = self._transfers.get(_TransferKey(vehicle, kind, station))
         if transfer is None and not station:
             # It is addressed to all; the newest upload is meant.
-            keys = [key for key in self._transfers if key[:2] == (vehicle, kind)]
-            uploads = [self._transfers[key] for key in keys if key[2] != _DOWNLOAD]
-            transfer = uploads[-1] if uploads else None
+            uploads = [key for key in self._keys(vehicle, kind) if key.station != _DOWNLOAD]
+            transfer = self._transfers[uploads[-1]] if uploads else None
         if transfer is None:
             return
         was_cleared, transfer.is_cleared = transfer.is_cleared, False

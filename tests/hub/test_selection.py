@@ -16,7 +16,7 @@ from gateway.hub.systems import HARMLESS, SystemFilter
 from gateway.panel.rest_api import RestApi
 from gateway.wire.mavlink_json import template
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
-from gateway.wire.mavlink_splitter import MavFrame, frame_of, to_mavlink1
+from gateway.wire.mavlink_splitter import MavFrame, frame_of, split_datagram, to_mavlink1
 from gateway.wire.vehicle_inputs import acts
 from tests.kit.hub import Rig, Station, receive
 from tests.kit.mavlink import STATION, every_message, packed, sent_by
@@ -58,7 +58,10 @@ class Bench:
             await vehicle.receive()
         if kind == "zenoh":
             client: Any = list(hub._clients.values())[2]
-            return hub, _each(lambda data: client._handle((data, len(data))))
+            now_us = client.context.now_us
+            return hub, _each(
+                lambda data: client.receive(split_datagram(data), len(data), now_us())
+            )
         if kind == "udp":
             station = self.rig.station(hub.listening_ports()[0])
             return hub, _rest(station) if door == "rest" else _each(station.send)

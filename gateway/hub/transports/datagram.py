@@ -140,11 +140,7 @@ class DatagramClient(Client):
         """Let Python process the next datagram if it may change the state or complete a frame."""
         self.memory.is_plain = self.state in SENDING and not self.splitter
 
-    def accept_rest(self, data: bytes, now_us: int) -> None:
-        """Process received bytes, without the compiled step."""
-        self.accept(data, now_us)
-
-    def accept(self, data: bytes, now_us: int, sender: Address | None = None) -> None:
+    def accept_rest(self, data: bytes, now_us: int, sender: Address | None = None) -> None:
         """Process one datagram of this peer; `sender` distinguishes several."""
         if self.state not in SENDING:
             self._revive()
@@ -283,7 +279,7 @@ class DatagramClient(Client):
         size = 0
         while unread and size < self.context.read_bytes and self._socket is sock:
             size += len(unread[0])
-            self.accept(unread.popleft(), self.context.now_us())
+            self.accept_rest(unread.popleft(), self.context.now_us())
         if self._socket is not sock:
             return
         if unread:
@@ -308,7 +304,7 @@ class DatagramClient(Client):
         self.limit_reads(sock, partial(self._read_each, sock), size)
 
     def _accept_from(self, data: bytes, _address: Address) -> None:
-        self.accept(data, self.context.now_us())
+        self.accept_rest(data, self.context.now_us())
 
     def _note_read_error(self, number: int | None) -> None:
         if number == errno.ECONNREFUSED:

@@ -71,7 +71,7 @@ class GroupClient(DatagramClient):
 
     def _accept_from(self, data: bytes, address: Address) -> None:
         if address[:2] != self._own_address:
-            self.accept(data, self.context.now_us(), address[:2])
+            self.accept_rest(data, self.context.now_us(), address[:2])
 
 
 def _route_source(family: int, address: tuple[object, ...]) -> tuple[Any, ...]:

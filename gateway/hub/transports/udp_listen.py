@@ -137,7 +137,7 @@ class UdpListener(Listener[DatagramPeer]):
     def _accept(self, data: bytes, address: Address, local_host: str) -> None:
         now_us = self._context.now_us()
         if client := self._by_address.get(address[:2]):
-            client.accept(data, now_us)
+            client.accept_rest(data, now_us)
             return
         events = self._splitter.feed(data, now_us, address[:2])
         first = next((event for event in events if isinstance(event, MavFrame)), None)
