@@ -7,13 +7,11 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from gateway.analysis.case import OUTAGE_S
+from gateway.analysis.flight import FloatArray
 from gateway.batch.tasks import DRIFT, HELD, FlightResult
 from gateway.units import counted
-
-FloatArray = NDArray[np.float64]
 
 WORSE: Final = 1.05
 WORSE_M: Final = 0.05

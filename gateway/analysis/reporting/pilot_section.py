@@ -16,6 +16,7 @@ from gateway.analysis.pilot import PilotFlight
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Fact, Picture, ReportTable, Section
 from gateway.printable import figure
+from gateway.recordings.recorded_clock import FIRST_CIVIL_US
 from gateway.units import FEET_PER_M, KNOTS_PER_MPS, US_PER_S
 from gateway.vehicle_state.positions import IntArray
 
@@ -25,8 +26,6 @@ EVENT_COLOURS: Final = {
     "flight": style.GREEN, "mode": style.BLUE, "gps": style.ORANGE, "link": style.RED,
 }  # fmt: skip
 EVENT_NAMES: Final = {"flight": "flight", "mode": "mode", "gps": "GPS lost", "link": "link lost"}
-FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
-"""The year 2000; an earlier begin is not civil time."""
 
 
 def the_flight(flight: PilotFlight) -> Section:

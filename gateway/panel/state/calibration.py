@@ -8,17 +8,15 @@ from enum import StrEnum
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mavlink
 from scipy.spatial import ConvexHull
 
 from gateway.panel.state.commands import command_long, result_text
-from gateway.records import NAN
+from gateway.panel.state.fields import FloatArray
+from gateway.records import NAN, Vec3
 from gateway.sensing.calibrating import CalibrationStep, fit_sphere
 from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S, UT_PER_GAUSS
 from gateway.vehicle.services.calibrator import SIDES
-
-FloatArray = NDArray[np.float64]
 
 _GOLDEN: Final = (1.0 + math.sqrt(5.0)) / 2.0
 MILLI: Final = 1e-3
@@ -66,7 +64,6 @@ PARAMS: Final[dict[CalibrationStep, tuple[float, ...]]] = {
     CalibrationStep.ACCEL: (0.0, 0.0, 0.0, 0.0, 1.0),
     CalibrationStep.LEVEL: (0.0, 0.0, 0.0, 0.0, 2.0),
 }
-_Vector = tuple[float, float, float]
 
 
 def _make_cells() -> FloatArray:
@@ -184,7 +181,7 @@ class CalibrationRun:
         """The magnetic field so far, shape (n, 3), uT, body FRD."""
         return np.array(self._before.mag).reshape(-1, 3)
 
-    def sphere(self) -> tuple[_Vector, float]:
+    def sphere(self) -> tuple[Vec3, float]:
         """Return centre and radius of the sphere of the magnetic field, uT; NaN if unknown."""
         points = self.field_points
         if not len(points):
