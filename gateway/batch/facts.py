@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from gateway.geometry.angle import wrap_180
 from gateway.recordings.flight_facts import FlightTrackPoints
 from gateway.recordings.moment import civil_time
+from gateway.recordings.recorded_clock import FIRST_CIVIL_US
 from gateway.recordings.summary import Summary, VehicleInfo
 from gateway.units import US_PER_S
 from gateway.vehicle_state.positions import LocalFrame, TrackPoint
@@ -21,8 +22,6 @@ MAX_POSITIONS: Final = 400
 
 Segments = list[list[TrackPoint]]
 """The uninterrupted parts of a track."""
-EARLIEST_US: Final = 315_532_800 * US_PER_S
-"""1980, the start of GPS time; an earlier time counts from the start of a clock."""
 
 
 def simplified(points: Sequence[TrackPoint]) -> list[TrackPoint]:
@@ -110,7 +109,7 @@ class CataloguedFlight(msgspec.Struct, frozen=True, kw_only=True):
 
 def began_text(unix_us: int | None) -> str | None:
     """Return a civil time in the form of the catalogue; None if it is out of range."""
-    moment = None if unix_us is None or unix_us < EARLIEST_US else civil_time(unix_us)
+    moment = None if unix_us is None or unix_us < FIRST_CIVIL_US else civil_time(unix_us)
     return None if moment is None else f"{moment:%Y-%m-%d %H:%M:%S}"
 
 

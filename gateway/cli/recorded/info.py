@@ -34,6 +34,7 @@ from gateway.recordings.file_format import CSV, NO_RECORDING
 from gateway.recordings.files import FlightError, Progress, read_blocks
 from gateway.recordings.index import Recording, list_recordings
 from gateway.recordings.moment import civil_time
+from gateway.recordings.recorded_clock import FIRST_CIVIL_US
 from gateway.recordings.recording import RecordedFile, open_recording
 from gateway.recordings.summary import FileInfo, VehicleInfo, read_summary
 from gateway.recordings.table import TableFault, TableHeader, TableReader, encode_block, encode_head
@@ -51,9 +52,6 @@ WHOLE: Final = ("vehicle", "duration", "gps_outages", "faults")
 """Columns of the catalogue that are shown without decimals."""
 SHOWN: Final = 8
 """Gaps and damaged ranges that are listed individually."""
-
-EARLIEST_US: Final = 366 * 86_400 * US_PER_S
-"""Earlier times, in µs since 1970, count from a start, as in other programs' logs."""
 
 Report = Callable[[str], None]
 
@@ -266,7 +264,7 @@ def _when(found: FileInfo) -> str:
     if found.header is not None:
         zero_us = found.header.unix_us_at_zero
         begin_us = None if zero_us is None or begin_us is None else zero_us + begin_us
-    if begin_us is None or 0 <= begin_us < EARLIEST_US:
+    if begin_us is None or 0 <= begin_us < FIRST_CIVIL_US:
         return ""
     moment = civil_time(begin_us)
     return ", without a valid date" if moment is None else f", from {moment:%Y-%m-%d %H:%M:%S} UTC"
