@@ -1,4 +1,4 @@
-"""Global options of the user: settings file, control socket; requests; and the file to write.
+"""Declarations of options; the user's global ones: settings file, control socket; requests.
 
 The settings import all stages, and with them NumPy. Commands that do not read settings must not
 wait for that, so they are imported where they are read.
