@@ -32,8 +32,9 @@ from gateway.batch.catalogue import (
     recordings_below,
 )
 from gateway.batch.executors import LocalProcesses, ThisProcess
-from gateway.batch.facts import CataloguedFlight, simplified
+from gateway.batch.facts import CataloguedFlight, began_text, simplified
 from gateway.pipeline import PipelineSettings
+from gateway.recordings.recorded_clock import FIRST_CIVIL_US
 from gateway.recordings.recorded_table import ReadOptions
 from gateway.vehicle_state.positions import TrackPoint
 from gateway.wire.recorded_frames import RecordedFrame
@@ -107,6 +108,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def row_of(folder: Path, path: str) -> dict:
     (found,) = find_flights(folder, f"path = '{path}'")
     return found
+
+
+def test_time_of_a_clock_that_counts_from_its_start_is_no_begin() -> None:
+    assert began_text(FIRST_CIVIL_US - 1) is None
+    assert began_text(FIRST_CIVIL_US) == "2000-01-01 00:00:00"
 
 
 def test_facts_of_a_table_are_those_of_its_flight(folder: Path) -> None:

@@ -53,6 +53,7 @@ def test_second_hour_of_flight_needs_no_more_memory() -> None:
     assert 0 < first.pop("track") <= MAX_TRACK
     assert MAX_TRACK // 2 < second.pop("track") <= MAX_TRACK
     assert first == second
+    assert second["rows"] > 0
     assert second["frames"] == pytest.approx(FUSED_SPAN_US // US_PER_S * RATE_HZ, abs=1)
 
 

@@ -169,7 +169,8 @@ def test_aircraft_are_separate_and_other_components_ignored() -> None:
     fleet.update(heartbeat(system_id=3), 0)
     assert sorted(fleet.vehicles) == [3, 4]
     assert heard == [3, 4]
-    assert fleet.vehicles[4].instant(0).lat_deg == pytest.approx(1.0)
+    now = fleet.vehicles[4].instant(0)
+    assert (now.lat_deg, now.title) == (pytest.approx(1.0), "Aircraft 4")
 
 
 def test_vehicle_is_the_component_with_an_autopilots_heartbeat() -> None:
