@@ -3,7 +3,7 @@
 import io
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout
 from itertools import chain
 from mmap import mmap
 from pathlib import Path
@@ -69,9 +69,14 @@ class DataFlash:
             error = self._open(kind, copy)
         if not self.is_text and (error or not self._printed.is_empty):
             # pymavlink's index would end at the first damage that looks like a message.
-            damaged, self._printed = self.log, _Printed()
-            with closing(damaged), temporary_copy(path, self._messages(damaged.data_map)) as copy:
-                error = self._open(kind, copy)
+            damaged = self.log
+            with temporary_copy(path, self._messages(damaged.data_map)) as copy:
+                if copy.tell():
+                    self._printed = _Printed()
+                    error = self._open(kind, copy)
+                    damaged.close()
+                else:
+                    self._skipped = 0
         if error:
             # A log without any message is not mapped.
             for part in ("data_map", "filehandle"):
@@ -81,8 +86,6 @@ class DataFlash:
 
     def _open(self, kind: Any, copy: IO[bytes]) -> Exception | None:
         """Open a copy of a log; return why it cannot be opened."""
-        if not copy.tell():
-            return ValueError("no message is left")
         self.log = log = kind.__new__(kind)
         # The fast indexer prints to the terminal directly, not through Python's stdout.
         log.init_arrays_fast = log.init_arrays

@@ -142,9 +142,10 @@ def read_param_file(path: Path) -> Contents:
 
 def read_recording(name: str, flight: FlightToWrite) -> Contents:
     """Read the compared content of a recording; raises FlightError if it has no vehicle."""
-    tallies = MessageTally(flight.senders, flight.vehicle_id)
+    vehicle_id = flight.vehicle_id  # first, as the senders of a table are those of its fusion
+    tallies = MessageTally(flight.senders, vehicle_id)
     tallies.add_all(flight.answered())
-    tally = tallies.vehicles[flight.vehicle_id]
+    tally = tallies.vehicles[vehicle_id]
     found = contents_of(name, flight.plan)
     found.figures |= figures_of(tally.facts())
     found.texts, found.is_flight = {text for _, _, text in tally.texts}, True

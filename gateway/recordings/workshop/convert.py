@@ -223,7 +223,8 @@ class FlightToWrite:
 
     def messages_of_vehicle(self, wanted: Iterable[int]) -> Iterator[VehicleMessage]:
         """Yield positions, texts and wanted messages of the vehicle, by `answered`."""
-        reader = VehicleReader(self.senders, wanted, self.vehicle_id, with_attitude=False)
+        vehicle_id = self.vehicle_id  # first, as the senders of a table are those of its fusion
+        reader = VehicleReader(self.senders, wanted, vehicle_id, with_attitude=False)
         return reader.messages(self.answered())
 
     def vehicle_messages(

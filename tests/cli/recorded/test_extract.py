@@ -18,7 +18,7 @@ from gateway.recordings import files
 from gateway.recordings.recording import open_recording
 from gateway.recordings.workshop.convert import FlightToWrite
 from gateway.recordings.workshop.extracts import parameter_text
-from tests.kit.cli import run
+from tests.kit.cli import invoke, run
 from tests.kit.mavlink import Sender
 from tests.kit.recordings import START_US, make_records, records_of, write_tlog
 from tests.recordings.flights import OPTIONS
@@ -246,3 +246,12 @@ def test_recording_from_time_zero_begins_at_its_first_record(
     flight = FlightToWrite([open_recording(path)], OPTIONS)
     assert sum(map(len, flight.answered())) == 60
     assert flight.first_us == 0
+
+
+@pytest.mark.parametrize("verb", ["extract", "diff"])
+def test_csv_is_refused_before_it_is_read(tmp_path: Path, verb: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("time;speed\n1;2\n")
+    words = ("--texts", tmp_path / "t.csv") if verb == "extract" else (path,)
+    found = invoke(verb, path, *words, code=2)
+    assert "is neither MAVLink nor the log of an autopilot" in found.output
