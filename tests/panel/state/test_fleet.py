@@ -58,12 +58,6 @@ def test_path_has_a_few_points_a_second_and_fixes_apart(vehicle: VehicleState) -
     assert [point.lat_deg for point in vehicle.fixes] == pytest.approx([47.0, 47.0001])
 
 
-def test_fix_without_position_is_left_out(vehicle: VehicleState) -> None:
-    vehicle.update(fix(0.0, 0.0, kind=mavlink.GPS_FIX_TYPE_NO_FIX, satellites=255), 0)
-    now = vehicle.instant(0)
-    assert (now.fix, len(vehicle.fixes)) == (None, 0)
-
-
 def test_satellites_that_are_not_counted_are_unknown(vehicle: VehicleState) -> None:
     assert math.isnan(vehicle.instant(0).satellites)
     vehicle.update(fix(*HERE, satellites=255), 0)
@@ -141,7 +135,8 @@ def test_chunks_of_a_text_are_joined(
 
 def test_position_before_the_first_fix_is_unknown(vehicle: VehicleState) -> None:
     vehicle.update(position(0.0, 0.0), 7)
-    vehicle.update(fix(0.0, 0.0), 7)
+    for kind in (3, mavlink.GPS_FIX_TYPE_NO_FIX):
+        vehicle.update(fix(0.0, 0.0, kind=kind, satellites=255), 7)
     now = vehicle.instant(7)
     assert math.isnan(now.lat_deg)
     assert (now.fix, len(vehicle.history), len(vehicle.fixes)) == (None, 0, 0)

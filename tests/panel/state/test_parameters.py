@@ -103,28 +103,24 @@ def test_number_of_parameters_is_bounded() -> None:
     assert len(client_of(*values).entries) == MAX_PARAMETERS
 
 
-def test_change_without_an_answer_is_refused_after_retries() -> None:
-    client = client_of(value_of("P"))
-    sent = client.change("P", 2.0, 0)
-    for second in range(1, 30):
-        sent += client.poll(second * US_PER_S)
-    assert len(sent) == MAX_ATTEMPTS
-    assert client.refused == {"P": "no answer"}
+def test_requests_without_an_answer_are_given_up_after_retries() -> None:
+    changing, loading, files = client_of(value_of("P")), ParameterClient(1), FileClient(1)
+    changes, listings = changing.change("P", 2.0, 0), loading.load(0)
+    files.read("/general.json", 0)
+    for second in range(1, 40):
+        changes += changing.poll(second * US_PER_S)
+        listings += loading.poll(second * US_PER_S)
+        files.poll(second * US_PER_S)
+    assert (len(changes), changing.refused) == (MAX_ATTEMPTS, {"P": "no answer"})
+    assert loading.state is ListState.FAILED
+    assert len(listings) < 20
+    assert (files.content, files.busy) == (None, False)
 
 
 def test_change_by_an_untrusted_client_is_refused_with_the_reason() -> None:
     client, bench = loaded(may_change=False)
     bench.run(client.change("PAPER_ALPHA_GYRO", 0.75, bench.now_us), 0.1)
     assert "may not change" in client.refused["PAPER_ALPHA_GYRO"]
-
-
-def test_loading_fails_without_an_answer() -> None:
-    client = ParameterClient(1)
-    messages = client.load(0)
-    for second in range(1, 30):
-        messages += client.poll(second * US_PER_S)
-    assert client.state is ListState.FAILED
-    assert len(messages) < 20
 
 
 def test_unknown_name_and_invalid_value_are_not_sent() -> None:
@@ -178,14 +174,6 @@ def test_missing_file_is_refused() -> None:
     files = FileClient(1)
     bench = VehicleBench(files)
     bench.run(files.read("/nothing.json", bench.now_us), 0.2)
-    assert (files.content, files.busy) == (None, False)
-
-
-def test_file_request_without_an_answer_is_given_up() -> None:
-    files = FileClient(1)
-    files.read("/general.json", 0)
-    for step in range(40):
-        files.poll(step * US_PER_S)
     assert (files.content, files.busy) == (None, False)
 
 
