@@ -227,8 +227,9 @@ class Subscription:
         threading.Thread(target=self._wait, name="zenoh-reader", daemon=True).start()
 
     def close(self) -> None:
-        """Stop handling messages."""
+        """Stop handling messages; those that wait are dropped."""
         self._is_closed = True
+        self._waiting.clear()
         self._all_handled.set()
 
     def undeclare(self) -> None:
