@@ -370,10 +370,15 @@ class Link:
         """Return the sequence numbers of the received messages of a kind."""
         return [frame[4] for frame in self.far.frames if frame[7] == message_id]
 
+    def arrived_at(self, far: Far) -> int:
+        """Return how many of the sent messages a far end has received."""
+        if self.output:
+            return far.data.count(MARKS[self.output])
+        return sum(frame[7] == ATTITUDE for frame in far.frames)
+
     @property
     def arrived(self) -> int:
-        """How many messages that were sent have arrived."""
-        return self.far.data.count(MARKS[self.output]) if self.output else len(self.numbers(30))
+        return self.arrived_at(self.far)
 
     def send(self) -> None:
         """Send one message: an attitude, or that of an output."""
@@ -557,7 +562,9 @@ async def test_taken_port_is_reported_once_and_opens_when_it_is_free(
 
 
 @pytest.mark.parametrize("kind", LISTENING)
-async def test_full_port_turns_clients_away_until_one_is_stale(rig: Rig, kind: str) -> None:
+async def test_port_serves_several_and_when_full_turns_others_away_until_one_is_stale(
+    rig: Rig, kind: str
+) -> None:
     link = Link(rig, kind, max_clients=2)
     await link.until_open()
     others = [type(link.far)(rig) for _ in range(3)]
@@ -568,6 +575,8 @@ async def test_full_port_turns_clients_away_until_one_is_stale(rig: Rig, kind: s
     link.arrive(others[0])
     await until_read(lambda: len(link.peers) == 2)
     await until_read(lambda: {peer.state for peer in link.peers} == {"open"})
+    link.send()
+    await until_read(lambda: all(link.arrived_at(far) == 1 for far in (link.far, others[0])))
     link.arrive(others[1])
     await until_read(lambda: link.port.turned_away == 1)
     first, second = (peer.client_id for peer in link.peers)

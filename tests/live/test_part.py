@@ -37,7 +37,7 @@ class Bytes:
 def taken(traffic: RecordedTraffic, recorder: Bytes, clients: dict[int, bool], seconds: int) -> int:
     """Let clients, trusted or not, send 2 MB/s each; return the bytes that are recorded."""
     before = recorder.count
-    frame = packed(mavlink.MAVLink_statustext_message(6, b"x" * 50))
+    frame = packed(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [1] * 251))
     for step in range(seconds * 100):
         for client_id, trusted in clients.items():
             incoming = Incoming(client_id, frame, trusted)

@@ -12,7 +12,6 @@ from pynmeagps import NMEAReader
 from gateway.hub.endpoint import parse_endpoint
 from gateway.units import US_PER_S
 from gateway.vehicle_state.newest import POSITION_OLD_US
-from tests.kit.hub import receive
 from tests.kit.messages import HERE, at, beat, estimator, gps
 from tests.kit.process import START_LIMIT_S, running
 from tests.outputs.conftest import OutputRig, connected
@@ -134,29 +133,11 @@ async def test_filters_of_the_endpoint_apply(outputs: OutputRig) -> None:
     assert "HDT" not in found
 
 
-async def listening(outputs: OutputRig) -> tuple[Any, int]:
-    """Open an output that waits for its clients; return its figures of the port, and the port."""
-    output = await outputs.output("nmea:tcp-listen:127.0.0.1:0")
-    outputs.hear(beat(), at())
-    return output.carrier.link.stats, output.carrier.link.port
-
-
-async def test_listening_port_serves_several_clients(outputs: OutputRig) -> None:
-    figures, port = await listening(outputs)
-    clients = [await outputs.connect(port) for _ in range(2)]
-    await outputs.until(lambda: figures().clients == 2)
-    outputs.turn()
-    for client in clients:
-        assert read(await receive(client))["RMC"].status == "A"
-    clients[0].close()
-    await outputs.until(lambda: figures().clients == 1)
-    assert outputs.shown.state == "open"
-
-
 @pytest.mark.io
 @pytest.mark.skipif(shutil.which("gpsd") is None, reason="needs gpsd")
 async def test_gpsd_reports_the_position(outputs: OutputRig) -> None:
-    (_, source), port = await listening(outputs), free_port()
+    output = await outputs.output("nmea:tcp-listen:127.0.0.1:0")
+    source, port = output.carrier.link.port, free_port()
     with running("gpsd", "-N", "-n", "-b", "-S", port, f"tcp://127.0.0.1:{source}"):
         async with asyncio.timeout(START_LIMIT_S):
             report = await first_fix(outputs, port)
