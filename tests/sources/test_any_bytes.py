@@ -5,6 +5,7 @@ from functools import cache
 from itertools import islice
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,7 +22,7 @@ LTM = b"".join(
     for n in range(30)
 )
 KINDS = st.sampled_from(["ltm", *sorted(SOURCE_BYTES)])
-TAIL, LONGEST_HEAD = 100, 40
+TAIL, LONGEST_FRAME = 200, 64
 """Zeros behind the data, and bytes that may seem to begin a frame that is not complete."""
 MOST_LOST = 4
 """Records of the frames that a damaged one covers or seems to begin."""
@@ -68,6 +69,16 @@ def test_damage_anywhere_costs_few_records(
     most_lost = 0.3 * len(found) if kind == "phone" else MOST_LOST
     assert len(whole) - len(found) <= most_lost
     if kind in ("crsf", "ltm"):
-        assert {*map(repr, found)} <= {*map(repr, whole)}, "no false record"
+        # One byte of a checksum may be right by chance.
+        assert len({*map(repr, found)} - {*map(repr, whole)}) <= 1
         dropped = sum(each.size for each in events if isinstance(each, Fault))
-        assert dropped >= len(noise) + TAIL - LONGEST_HEAD
+        assert dropped >= len(noise) + TAIL - LONGEST_FRAME
+
+
+@pytest.mark.parametrize("kind", ["crsf", "ltm"])
+def test_flipped_bit_gives_no_false_record(kind: str) -> None:
+    data, whole = flight(kind)[:300], {*map(repr, decoded(kind, flight(kind)))}
+    for at in range(len(data)):
+        damaged = data[:at] + bytes([data[at] ^ 0x40]) + data[at + 1 :]
+        found = {repr(each) for each in decoded(kind, damaged) if not isinstance(each, Fault)}
+        assert found <= whole, at
