@@ -124,7 +124,7 @@ def read_pilot_flight(files: Sequence[Path], options: ReadOptions, name: str) ->
     """
     flight = FlightToWrite(open_recordings(files), options)
     if not flight.has_messages:
-        return pilot_flight_of(joined_rows(flight.recordings, options), name)
+        return _flight_of_table(joined_rows(flight.recordings, options), name)
     found = MessageTally(flight.senders, with_attitude=True)
     found.add_all(flight.chosen())
     known = [found.vehicles[number] for number in sorted(found.vehicles)]
@@ -136,8 +136,7 @@ def read_pilot_flight(files: Sequence[Path], options: ReadOptions, name: str) ->
     return PilotFlight(name, tally, tally.positions, tally.vehicle.origin >> 8)
 
 
-def pilot_flight_of(table: RecordedTable, name: str) -> PilotFlight:
-    """Read the rows of a table."""
+def _flight_of_table(table: RecordedTable, name: str) -> PilotFlight:
     tally = RowTally()
     for block in table.blocks:
         tally.add(block)

@@ -80,7 +80,7 @@ def run_panel(
     certificate, key = tls_files(settings)
     sock = _bound(settings, or_any=attached)
     parts = make_parts(settings, recordings, connect, control_socket)
-    app = make_app(parts)
+    app = _make_app(parts)
     logging.getLogger("uvicorn.error").addFilter(without_traceback)
     logging.getLogger("nicegui").addFilter(PageErrors(parts.clock))
     limits = ConnectionLimits()
@@ -181,8 +181,7 @@ def make_parts(
     )  # fmt: skip
 
 
-def make_app(parts: PanelParts) -> FastAPI:
-    """Build the web application."""
+def _make_app(parts: PanelParts) -> FastAPI:
     app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
     pointing = pointing_router(parts.fleet, parts.clock)
     push = push_router(parts.control, parts.logins.may_attempt)

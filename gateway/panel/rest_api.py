@@ -221,8 +221,7 @@ def names_matching(pattern: str) -> frozenset[str]:
     return frozenset(name for name in CLASSES if wanted.isinstance_python(name))
 
 
-def with_header(message: Any) -> dict[str, Any]:
-    """Return a message with its sender, as JSON."""
+def _with_header(message: Any) -> dict[str, Any]:
     header = {
         "system_id": message.get_srcSystem(),
         "component_id": message.get_srcComponent(),
@@ -420,7 +419,7 @@ class RestApi:
             if message.msgname in each.names and each.systems.has(origin)
         ]
         if subscribers:
-            text = pretty(with_header(message))
+            text = pretty(_with_header(message))
             for subscriber in subscribers:
                 subscriber.push(text)
 

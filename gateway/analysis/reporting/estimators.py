@@ -84,7 +84,7 @@ def estimators(case: Case) -> Section | None:
     tracks = dict(case.tracks)
     if case.flight.recorded is not None:
         tracks["recorded in flight"] = case.flight.recorded
-    table = error_table(tracks, reference, case.flight.scored)
+    table = _error_table(tracks, reference, case.flight.scored)
     if len(case.fixes) > HOLD_OUT:
         withheld = {name: withheld_error_m(case, name) for name in case.tracks}
         table["withheld fixes, m"] = table["estimator"].map(withheld)
@@ -116,10 +116,9 @@ def estimators(case: Case) -> Section | None:
     )
 
 
-def error_table(
+def _error_table(
     tracks: dict[str, FlightTrack], reference: Reference, scored: BoolArray
 ) -> pd.DataFrame:
-    """Return a table of the errors of tracks against a reference."""
     errors = {
         name: metrics.errors_over_time(track, reference.track) for name, track in tracks.items()
     }

@@ -74,7 +74,7 @@ ok, info, fail = (partial(Diagnosis, grade) for grade in STYLES)
 Check = Callable[[config.GatewaySettings], Iterator[Diagnosis]]
 
 
-def check_settings(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
+def _check_settings(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Check the aircraft's files, the rights of secrets, and what no single setting shows."""
     file = settings_file()
     try:
@@ -98,13 +98,12 @@ def check_settings(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     yield ok("settings", f"{text}{others}")
 
 
-def check_aircraft(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
-    """Check write access to the aircraft's files."""
+def _check_aircraft(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     folder = config.aircraft_folder(settings)
     yield _writable("aircraft", folder, f"calibrations and parameters are stored in {folder}")
 
 
-def check_receiver(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
+def _check_receiver(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     """List the USB adapters, and check the receiver's port and access to it."""
     wanted, found = settings.serial.port, list_serial_ports()
     for port in found:
@@ -168,8 +167,7 @@ def _latency(device: Path) -> Iterator[Diagnosis]:
         )
 
 
-def check_kernels(_: config.GatewaySettings) -> Iterator[Diagnosis]:
-    """Check whether the compiled kernels can be loaded."""
+def _check_kernels(_: config.GatewaySettings) -> Iterator[Diagnosis]:
     try:
         load_entry_points()
     except LibraryError as error:
@@ -178,7 +176,7 @@ def check_kernels(_: config.GatewaySettings) -> Iterator[Diagnosis]:
         yield ok("kernels", "compiled")
 
 
-def check_clock(_: config.GatewaySettings) -> Iterator[Diagnosis]:
+def _check_clock(_: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether the system time is synchronised, as recordings are named by it."""
     if not shutil.which("timedatectl"):
         yield info("clock", "synchronisation unknown")
@@ -191,8 +189,7 @@ def check_clock(_: config.GatewaySettings) -> Iterator[Diagnosis]:
         yield info("clock", "not synchronised: recordings get their right times from GPS")
 
 
-def check_disk(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
-    """Check the free space for recordings."""
+def _check_disk(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     folder = folder_of(settings)
     try:
         free_mb = free_bytes_near(folder) / 1e6
@@ -216,7 +213,7 @@ def _writable(what: str, folder: Path, text: str) -> Diagnosis:
     return fail(what, f"{folder} cannot be written by {os.environ.get('USER', 'us')}")
 
 
-def check_ports(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
+def _check_ports(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether a gateway runs, otherwise whether its ports are free."""
     if running := live_sockets("run"):
         yield ok("gateway", f"runs, and listens at {', '.join(map(str, running))}")
@@ -253,8 +250,7 @@ def _trouble_of(endpoint: Endpoint) -> str:
     return ""
 
 
-def check_certificates(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
-    """Check the validity of the certificates of hub and panel."""
+def _check_certificates(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
     hub, panel = settings.hub, settings.panel
     for what, certificate, key in (
         ("hub.tls_certificate", hub.tls_certificate, hub.tls_key),
@@ -275,7 +271,7 @@ def check_certificates(settings: config.GatewaySettings) -> Iterator[Diagnosis]:
             yield made(what, f"{file}, valid until {until:%Y-%m-%d}")
 
 
-def check_extras(_: config.GatewaySettings) -> Iterator[Diagnosis]:
+def _check_extras(_: config.GatewaySettings) -> Iterator[Diagnosis]:
     """Name the missing extras, their use, and the command that installs each."""
     for extra, use in EXTRA_USES.items():
         if missing(extra):
@@ -293,15 +289,15 @@ def _write_template(text: str) -> None:
 
 
 CHECKS: Final[tuple[Check, ...]] = (
-    check_settings,
-    check_receiver,
-    check_ports,
-    check_aircraft,
-    check_disk,
-    check_kernels,
-    check_clock,
-    check_certificates,
-    check_extras,
+    _check_settings,
+    _check_receiver,
+    _check_ports,
+    _check_aircraft,
+    _check_disk,
+    _check_kernels,
+    _check_clock,
+    _check_certificates,
+    _check_extras,
 )
 
 
