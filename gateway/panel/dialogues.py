@@ -23,12 +23,12 @@ SAMPLES_US: Final = 20_000
 
 
 class Dialogue:
-    """The dialogue with one aircraft."""
+    """The dialogue with one aircraft; that with system 0, which is none, sends nothing."""
 
     def __init__(
         self, system_id: int, send: Callable[[Any], object], now_us: Callable[[], int]
     ) -> None:
-        self._send, self._now_us = send, now_us
+        self._send, self._now_us = send if system_id else lambda _: None, now_us
         self.parameters = parameters.ParameterClient(system_id)
         self.files = parameters.FileClient(system_id)
         self.metas: dict[str, parameters.ParameterMeta] = {}

@@ -117,9 +117,9 @@ class ViewContext:
         return FieldHistory() if self.vehicle is None else self.vehicle.received
 
     @property
-    def dialogue(self) -> Dialogue | None:
-        """The dialogue with the selected aircraft; None before the first."""
-        return None if self.system_id is None else self.parts.dialogues.of(self.system_id)
+    def dialogue(self) -> Dialogue:
+        """The dialogue with the selected aircraft; before the first, one that sends nothing."""
+        return self.parts.dialogues.of(self.system_id or 0)
 
     @property
     def is_playback(self) -> bool:

@@ -90,8 +90,7 @@ class CalibrationView:
         self._refresh()
 
     def _run(self) -> CalibrationRun | None:
-        dialogue = self._context.dialogue
-        run = None if dialogue is None else dialogue.calibration
+        run = self._context.dialogue.calibration
         return run if run is not None and run.step is self._step else None
 
     def _on_select(self) -> None:
@@ -102,12 +101,11 @@ class CalibrationView:
     def _refresh(self) -> None:
         """Show the present state; the guide is built again for another step or another run."""
         run, dialogue = self._run(), self._context.dialogue
-        if dialogue is not None:
-            dialogue.load()
+        dialogue.load()
         if run is not None and run.state.is_over:
             done = run.state is RunState.DONE
             self._outcomes[run.step] = ("done", "good") if done else ("failed", "bad")
-        ready = dialogue is not None and dialogue.parameters.state is ListState.COMPLETE
+        ready = dialogue.parameters.state is ListState.COMPLETE
         for step, (card, state) in self._steps.items():
             card.props.set_optional("aria-current", "step" if step is self._step else None)
             outcome, look = self._outcomes.get(step, ("", ""))
@@ -134,7 +132,7 @@ class CalibrationView:
         return card, state
 
     def _show(self, step: CalibrationStep) -> None:
-        run = self._context.dialogue.calibration if self._context.dialogue else None
+        run = self._context.dialogue.calibration
         if run is not None and not run.state.is_over and step is not run.step:
             ui.notify(f"{TITLES[run.step][0]}: cancel it first", type="warning")
             return
@@ -226,8 +224,7 @@ class CalibrationView:
             allow(button, self._why_not(ready=ready))
 
     def _orientation(self) -> str:
-        dialogue = self._context.dialogue
-        entries = {} if dialogue is None else dialogue.parameters.entries
+        entries = self._context.dialogue.parameters.entries
         now = [entries[name].value for name in MNT_NAMES if name in entries]
         near = (
             name
@@ -244,7 +241,7 @@ class CalibrationView:
         """Set the angles of both sensors, in use until the gateway ends."""
         self._context.check_may_change()
         angles, dialogue = ORIENTATIONS.get(self._choice.value), self._context.dialogue
-        if angles is None or dialogue is None:
+        if angles is None:
             ui.notify("Choose an orientation first", type="warning")
             return
         for names in (MNT_NAMES, MAG_MNT_NAMES):
@@ -303,7 +300,7 @@ class CalibrationView:
 
     def _show_residuals(self, run: CalibrationRun) -> None:
         found = [(f"{r.name} ({r.unit})", r.before, r.after) for r in run.residuals()]
-        metas = self._context.dialogue.metas if self._context.dialogue else {}
+        metas = self._context.dialogue.metas
         for name, (old, new) in self._changes().items():
             meta = metas.get(name)
             factor, unit = parameter_unit(meta.unit if meta else "")
@@ -315,8 +312,6 @@ class CalibrationView:
 
     def _changes(self) -> dict[str, tuple[float, float]]:
         dialogue = self._context.dialogue
-        if dialogue is None:
-            return {}
         entries = dialogue.parameters.entries
         return {
             name: (old, entries[name].value)
@@ -357,13 +352,13 @@ class CalibrationView:
 
     async def _start(self) -> None:
         self._context.check_may_change()
-        if (dialogue := self._context.dialogue) and not self._has_other_unanswered():
-            dialogue.calibrate(self._step)
+        if not self._has_other_unanswered():
+            self._context.dialogue.calibrate(self._step)
             self._refresh()
 
     def _has_other_unanswered(self) -> bool:
         """Return, and show, whether another calibration is neither stored nor undone."""
-        other = self._context.dialogue.unanswered if self._context.dialogue else None
+        other = self._context.dialogue.unanswered
         if other is None or other is self._step:
             return False
         # Storing this one would store the other too.
@@ -372,8 +367,7 @@ class CalibrationView:
 
     async def _cancel(self) -> None:
         self._context.check_may_change()
-        if self._context.dialogue is not None:
-            self._context.dialogue.cancel()
+        self._context.dialogue.cancel()
 
     async def _store(self) -> None:
         """Store it in the vehicle: this button is the confirmation."""
@@ -384,16 +378,14 @@ class CalibrationView:
 
     async def _undo(self) -> None:
         self._context.check_may_change()
-        if (dialogue := self._context.dialogue) is not None:
-            for name, (old, _) in self._changes().items():
-                dialogue.change(name, old)
+        for name, (old, _) in self._changes().items():
+            self._context.dialogue.change(name, old)
         self._outcomes.pop(self._step, None)
         ui.notify(f"{TITLES[self._step][0]}: as it was before", type="info")
         self._end(stored=False)
 
     def _end(self, *, stored: bool = True) -> None:
-        if self._context.dialogue is not None:
-            self._context.dialogue.calibration = None
+        self._context.dialogue.calibration = None
         if stored:
             self._outcomes[self._step] = ("stored", "good")
         self._refresh()

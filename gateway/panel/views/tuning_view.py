@@ -189,7 +189,7 @@ class ComparisonCard:
 
     def _collect(self) -> None:
         """Request the samples when the view is opened, before they are needed."""
-        if self._context.dialogue is not None and self._context.may_change:
+        if self._context.may_change:
             self._context.dialogue.ask_for_samples()
 
     def _refresh(self) -> None:
@@ -201,10 +201,9 @@ class ComparisonCard:
         self._collecting.set_visibility(bool(reason))
 
     async def _compare(self) -> None:
-        vehicle, dialogue = self._context.vehicle, self._context.dialogue
-        if vehicle is None or dialogue is None:
+        if (vehicle := self._context.vehicle) is None:
             return
-        values = dialogue.parameters.values
+        values = self._context.dialogue.parameters.values
         self._is_fusing = True
         self._refresh()
         self._summary.set_text("Fusing …")
@@ -317,10 +316,9 @@ class TuningView:
     def _refresh(self) -> None:
         widgets.allow(self._button, self._context.why_fixed)
         dialogue = self._context.dialogue
-        if dialogue is None:
+        if not (system_id := dialogue.parameters.system_id):
             self._state.set_text("")
             return
-        system_id = dialogue.parameters.system_id
         if self._loaded_id != system_id:
             self._loaded_id = system_id
             dialogue.load()
@@ -344,16 +342,15 @@ class TuningView:
     def _draw(self, _: Any = None) -> None:
         """Build the visible rows; keep the present ones, with typed text, if they are the same."""
         dialogue = self._context.dialogue
-        names = [] if dialogue is None else self._wanted(dialogue)
-        metas = {} if dialogue is None else {name: dialogue.metas.get(name) for name in names}
-        known = 0 if dialogue is None else len(dialogue.parameters.entries)
+        names, known = self._wanted(dialogue), len(dialogue.parameters.entries)
+        metas = {name: dialogue.metas.get(name) for name in names}
         state = (self._context.system_id, known > 0, metas)
         if state == self._drawn:
             return
         self._drawn = state
         self._list.clear()
         self._rows = {}
-        if dialogue is None:
+        if self._context.system_id is None:
             with self._list:
                 ui.label("No aircraft is received.").classes("empty")
             return
@@ -384,8 +381,7 @@ class TuningView:
         return [name for _, name in sorted(found)]
 
     def _reload(self) -> None:
-        if self._context.dialogue is not None:
-            self._context.dialogue.load(again=True)
+        self._context.dialogue.load(again=True)
 
     async def _store(self) -> None:
         await widgets.store_parameters(self._context, "All parameters are stored")
