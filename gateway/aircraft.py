@@ -196,7 +196,7 @@ class Aircraft:
             calibration = msgspec.convert(msgspec.to_builtins(fresh), NodeCalibration)
         except ValueError as error:
             text = StatusText(WARNING, f"Calibration refused: {error}")
-            self.perform(self.vehicle.say(text, now_us), now_us, out)
+            self.perform(self.vehicle.announce(text, now_us), now_us, out)
             return
         self._change("calibration", calibration, out)
         self.perform(self.vehicle.apply_settings("calibration", calibration), now_us, out)

@@ -68,7 +68,7 @@ KINDS: Final = {
 
 
 class GatewaySettings(Settings, frozen=True):
-    """The settings file: a section for each part, with the defaults where it says nothing."""
+    """The settings file: a section for each part, with the defaults of what it lacks."""
 
     serial: SerialSettings = SerialSettings()
     hub: HubSettings = HubSettings()

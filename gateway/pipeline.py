@@ -254,9 +254,9 @@ class Pipeline:
         for aircraft in self._all_aircraft():
             aircraft.vehicle.remove_client(client_id)
 
-    def say(self, status: StatusText, now_us: int) -> Outputs:
+    def announce(self, status: StatusText, now_us: int) -> Outputs:
         """Send a text from all aircraft."""
-        return self._each(now_us, lambda vehicle: vehicle.say(status, now_us))
+        return self._each(now_us, lambda vehicle: vehicle.announce(status, now_us))
 
     def mark(self, location: Location | None, vehicle_id: int | None, now_us: int) -> Outputs:
         """Mark a location for one aircraft, or for all, or clear the mark.

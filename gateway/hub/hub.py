@@ -230,7 +230,7 @@ class Hub(HubContext):
             self._fanout.clear()
         self._fanout.publish(frame, sequence, now_us)
 
-    def say(self, messages: Iterable[Any]) -> bool:
+    def announce(self, messages: Iterable[Any]) -> bool:
         """Send messages of this gateway as a component of each vehicle that it only routes.
 
         Returns whether there is one.

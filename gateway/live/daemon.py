@@ -154,7 +154,7 @@ class Daemon:
                 lambda: self._operation.own_ids | self._hub.routed_vehicles(), self._hub.endpoints
             ),
             recorder_verbs(
-                self._recorder, lambda: bool(self._pipeline.aircraft) or self._hub.say(())
+                self._recorder, lambda: bool(self._pipeline.aircraft) or self._hub.announce(())
             ),
             mark_verbs(self._operation.mark),
             serial_verbs(self._serial, is_simulated=self._receiver is not None),

@@ -199,10 +199,10 @@ class Operation:
         """Announce an event to the ground stations."""
         status = StatusText(WARNING if is_trouble else INFO, text)
         if self._pipeline.aircraft:
-            self.perform(self._pipeline.say(status, self._now_us()))
+            self.perform(self._pipeline.announce(status, self._now_us()))
         else:
-            said = self._announcer.say(status, self._now_us())
-            self._hub.say([reply.message for reply in said if isinstance(reply, Reply)])
+            found = self._announcer.announce(status, self._now_us())
+            self._hub.announce([reply.message for reply in found if isinstance(reply, Reply)])
 
     def announce_plans(self, vehicle_id: int, trouble: str | None) -> None:
         """Announce why the plans of an aircraft are not stored, or that they are again."""
@@ -210,7 +210,7 @@ class Operation:
         if trouble is not None:
             status = StatusText(WARNING, f"Mission, mark and home not stored: {trouble}")
         aircraft = self._pipeline.find(vehicle_id)
-        self._perform_for(aircraft, aircraft.vehicle.say(status, self._now_us()))
+        self._perform_for(aircraft, aircraft.vehicle.announce(status, self._now_us()))
 
     def perform(self, out: Outputs) -> None:
         """Carry out the results of the pure stages, frames first."""

@@ -109,7 +109,7 @@ class Replay:
         if isinstance(row, TableNote):
             yield from self._wait(row.time_us)
             now_us = self._now_us or 0
-            yield now_us, self._pipeline.say(StatusText(INFO, NOTE + row.text), now_us)
+            yield now_us, self._pipeline.announce(StatusText(INFO, NOTE + row.text), now_us)
             return
         if isinstance(row, FusionState):
             self._pipeline.restore(row)

@@ -239,7 +239,7 @@ class RecordedVehicle:
 
     def _explain(self, request: Request, now_us: int) -> list[Answer]:
         """Return the text for a station that requests a change."""
-        found = self._texts.say(THE_PAST, now_us)
+        found = self._texts.announce(THE_PAST, now_us)
         return [request.reply(each.message) for each in found if isinstance(each, Reply)]
 
     def _recorded(self, message_id: int, _now_us: int) -> Any:

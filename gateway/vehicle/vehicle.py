@@ -123,7 +123,7 @@ class Vehicle:
         self._refusal_texts = Announcer(REFUSALS_AT_ONCE, REFUSAL_INTERVAL_US)
         self._rejection_due_us = 0
         self.plan = PlanService(
-            system_id, self.telemetry, self._announcements.say, stored or StoredPlan()
+            system_id, self.telemetry, self._announcements.announce, stored or StoredPlan()
         )
         self._published_home = self.telemetry.home
         home = self.plan.home_parameters()
@@ -198,7 +198,7 @@ class Vehicle:
         had_home = self.telemetry.home is not None
         found = self.telemetry.on_gps(fix)
         if self.telemetry.home is not None and not had_home:
-            found += self._announcements.say(StatusText(INFO, "Home set by GPS"), now_us)
+            found += self._announcements.announce(StatusText(INFO, "Home set by GPS"), now_us)
         found += self.plan.on_fix(fix, now_us)
         found += self._announcements.on_fix(now_us)
         return self._finish(found)
@@ -217,7 +217,7 @@ class Vehicle:
         if report.home is not None:
             found += self._on_home(Location(*report.home), report.time_us)
         if report.text is not None:
-            found += self._announcements.say(StatusText(*report.text), now_us)
+            found += self._announcements.announce(StatusText(*report.text), now_us)
         return self._finish(found)
 
     def _on_home(self, home: Location, time_us: int) -> list[Answer]:
@@ -299,7 +299,7 @@ class Vehicle:
         name = known.name.removeprefix("MAV_CMD_") if known else request.message.get_type()
         status = StatusText(NOTICE, f"Refused {name} of system {request.system_id}: {reason}")
         answers = service.refuse(request, result)
-        answers += self._refusal_texts.say(status, now_us)
+        answers += self._refusal_texts.announce(status, now_us)
         return self._finish(answers)
 
     def introduction(self) -> list[Outgoing]:
@@ -345,7 +345,7 @@ class Vehicle:
         ack = read_command(request).ack(ACCEPTED if stored else FAILED)
         saved = StatusText(INFO, f"Settings saved: {text}")
         status = saved if stored else StatusText(WARNING, f"Settings not saved: {text}")
-        return self._finish([ack, *self._announcements.say(status, now_us)])
+        return self._finish([ack, *self._announcements.announce(status, now_us)])
 
     def put_mark(self, location: Location | None, now_us: int) -> list[Action]:
         """Mark a location (its height may be NaN), or clear the mark.
@@ -354,9 +354,9 @@ class Vehicle:
         """
         return self._finish(self.plan.put_mark(location, now_us))
 
-    def say(self, text: StatusText, now_us: int) -> list[Action]:
+    def announce(self, text: StatusText, now_us: int) -> list[Action]:
         """Announce an event of the gateway, such as a recording that stopped."""
-        return self._finish(self._announcements.say(text, now_us))
+        return self._finish(self._announcements.announce(text, now_us))
 
     def apply_settings(self, section: str, settings: Settings) -> list[Action]:
         """Apply a section that was changed elsewhere, and send the parameters that differ."""
@@ -365,7 +365,7 @@ class Vehicle:
         return self._finish(self._parameters.update(section, settings))
 
     def _explain(self, text: str, now_us: int) -> list[Answer]:
-        return self._announcements.say(StatusText(NOTICE, text), now_us)
+        return self._announcements.announce(StatusText(NOTICE, text), now_us)
 
     def _reconfigure(self, settings: VehicleSettings) -> None:
         self.health.silent_us = round(settings.node_silent_s * 1e6)

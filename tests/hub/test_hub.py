@@ -43,7 +43,7 @@ async def world(rig: Any) -> Any:
 async def test_text_of_a_router_is_sent_as_a_component_of_each_vehicle(world: Any) -> None:
     foreign = len(world.foreign)
     for number in range(2):
-        assert world.world.say([dialect.MAVLink_statustext_message(6, b"Note: here")])
+        assert world.world.announce([dialect.MAVLink_statustext_message(6, b"Note: here")])
         for station in (world.first, world.second):
             frame = frame_of(await station.receive())
             assert (frame.origin[0], frame.message_id, frame.sequence) == (42, 253, number)
@@ -218,7 +218,7 @@ async def test_frames_of_the_gateway_itself_have_no_gap_at_any_client(rig: Any) 
         for station in stations[2 : 3 + step // 20]:
             station.send(station.sender.heartbeat())
         await rig.quiet_some()
-        hub.say([dialect.MAVLink_statustext_message(6, b"text")])
+        hub.announce([dialect.MAVLink_statustext_message(6, b"text")])
         rig.tick(hub, 0.5)
         await rig.quiet_some()
         for key, station in enumerate(stations):

@@ -298,7 +298,7 @@ class TestHub:
             each.received()
         return hub, first, second, seat
 
-    async def say(self, rig: Any, *frames: tuple[Any, Any, int, int]) -> None:
+    async def send(self, rig: Any, *frames: tuple[Any, Any, int, int]) -> None:
         for station, message, system, component in frames:
             station.send(packed(message, system, component))
             await rig.quiet_some()
@@ -324,25 +324,25 @@ class TestHub:
                 rig.publish(hub, packed(*row[1:]))
                 await rig.quiet()
             else:
-                await self.say(rig, (named[row[0]], *row[1:]))
+                await self.send(rig, (named[row[0]], *row[1:]))
 
     @pytest.mark.parametrize("message", [ODOMETRY, attitude()], ids=["input", "telemetry"])
     async def test_compiled_route_ends_when_an_excluded_vehicle_is_received(
         self, rig: Any, message: Any
     ) -> None:
         hub, first, second, seat = await self.open(rig, "systems=1", "")
-        await self.say(rig, (first, heartbeat(), 1, 1))
+        await self.send(rig, (first, heartbeat(), 1, 1))
         if message is ODOMETRY:
-            await self.say(rig, (second, GCS, 255, STATION))
+            await self.send(rig, (second, GCS, 255, STATION))
         for each in (second, seat):
             each.received()
-        await self.say(rig, *[(first, message, 1, 1)] * 3)
+        await self.send(rig, *[(first, message, 1, 1)] * 3)
         number = message.get_msgId()
         assert self.origins(second) == [(1, number)] * 3
         if hub.forwarding.is_compiled:
             [source, *_] = hub._clients.values()
             assert any(route.is_compiled for route in source.routes.values())
-        await self.say(rig, (second, heartbeat(), 2, 1), (first, message, 1, 1))
+        await self.send(rig, (second, heartbeat(), 2, 1), (first, message, 1, 1))
         passes = message is not ODOMETRY and self.origins(seat)[-1] == (1, number)
         assert self.origins(second) == []
         assert passes == (message is not ODOMETRY)
@@ -366,14 +366,14 @@ class TestHub:
             0, 1, 0, 0, 0, [0] * 3, [0] * 3, [1, 0, 0, 0], [0] * 3, [0] * 3, 0
         )
         radio = mavlink.MAVLink_radio_status_message(0, 0, 100, 0, 0, 0, 0)
-        await self.say(rig, (first, radio, 51, 68), (first, drone, 3, 1))
+        await self.send(rig, (first, radio, 51, 68), (first, drone, 3, 1))
         first.received()
         rig.publish(hub, rig.vehicle.attitude())
         for message in (heartbeat(), attitude(), follow):
-            await self.say(rig, (second, message, 2, 1))
+            await self.send(rig, (second, message, 2, 1))
         expected = [(1, 30), (2, 0), (2, 30), (2, 144)] if passing is None else passing
         assert self.origins(first) == expected
-        await self.say(rig, (seat, GCS, 255, STATION), (seat, command(3), 255, STATION))
+        await self.send(rig, (seat, GCS, 255, STATION), (seat, command(3), 255, STATION))
         assert self.origins(first)[:1] == [(255, 0)]
 
     @pytest.mark.parametrize("options", ["", "budget=9000", "systems=3", "name=radio"])
@@ -381,7 +381,7 @@ class TestHub:
         self, rig: Any, options: str
     ) -> None:
         hub, first, second, _ = await self.open(rig, options, "")
-        await self.say(rig, (first, heartbeat(), 3, 1), (second, heartbeat(), 2, 1))
+        await self.send(rig, (first, heartbeat(), 3, 1), (second, heartbeat(), 2, 1))
         for _ in range(12):
             second.send(*(packed(attitude(), 2, 1) for _ in range(30)))
             await rig.quiet_some()
@@ -410,15 +410,15 @@ class TestHub:
         hub, first, second, _ = await self.open(rig, "", "name=radio")
         for number in range(30):
             rig.clock.now_us += 100_000
-            await self.say(rig, (first, attitude(60_000 + 100 * number), 1, 1))
-            await self.say(rig, (second, attitude(500_000 + 100 * number), 1, 1))
+            await self.send(rig, (first, attitude(60_000 + 100 * number), 1, 1))
+            await self.send(rig, (second, attitude(500_000 + 100 * number), 1, 1))
         notes = [client.note for client in hub.clients()]
         url = f"udp:127.0.0.1:{second.port}?name=radio&as=2"
         assert notes[0] == notes[2] == ""
         assert notes[1].endswith(f"; write {url}")
         hub.apply(type(hub.settings)(endpoints=(*hub.settings.endpoints[::2], url)))
         rig.clock.now_us += 40_000_000
-        await self.say(rig, (first, attitude(), 1, 1), (second, heartbeat(), 1, 1))
+        await self.send(rig, (first, attitude(), 1, 1), (second, heartbeat(), 1, 1))
         assert [client.note for client in hub.clients()] == ["", "", ""]
 
     async def test_two_links_to_one_vehicle_are_no_clash(self, rig: Any) -> None:
@@ -426,14 +426,14 @@ class TestHub:
         for time_ms in range(60_000, 63_000, 100):
             rig.clock.now_us += 100_000
             # Each port of an autopilot has frames and sequence numbers of its own.
-            await self.say(rig, (first, attitude(time_ms + 1), 1, 1))
-            await self.say(rig, (second, attitude(time_ms), 1, 1))
+            await self.send(rig, (first, attitude(time_ms + 1), 1, 1))
+            await self.send(rig, (second, attitude(time_ms), 1, 1))
         assert [client.note for client in hub.clients()] == ["", "", ""]
 
     async def test_clients_without_options_keep_their_compiled_routes(self, rig: Any) -> None:
         hub, first, second, _ = await self.open(rig, "", "as=2", station="systems=1")
-        await self.say(rig, (first, heartbeat(), 1, 1), (second, heartbeat(), 1, 1))
-        await self.say(rig, *[(each, attitude(), 1, 1) for each in (first, second)] * 2)
+        await self.send(rig, (first, heartbeat(), 1, 1), (second, heartbeat(), 1, 1))
+        await self.send(rig, *[(each, attitude(), 1, 1) for each in (first, second)] * 2)
         clients = list(hub._clients.values())
         compiled = [
             any(route.is_compiled for route in client.routes.values()) for client in clients

@@ -42,7 +42,7 @@ from gateway.vehicle.telemetry.telemetry import Telemetry
 
 NUMBERS: Final = {"lat_deg": "lat_deg", "lon_deg": "lon_deg", "alt_m": "alt_amsl_m"}
 """Parameters of home, and the fields of `Location` that they set."""
-Say = Callable[[StatusText, int], list[Answer]]
+Announce = Callable[[StatusText, int], list[Answer]]
 ROI_MODES: Final = {
     mavlink.MAV_CMD_DO_SET_ROI_LOCATION: mavlink.MAV_ROI_LOCATION,
     mavlink.MAV_CMD_DO_SET_ROI_NONE: mavlink.MAV_ROI_NONE,
@@ -111,10 +111,12 @@ class PlanService:
     parameter.
     """
 
-    def __init__(self, vehicle_id: int, telemetry: Telemetry, say: Say, stored: StoredPlan) -> None:
+    def __init__(
+        self, vehicle_id: int, telemetry: Telemetry, announce: Announce, stored: StoredPlan
+    ) -> None:
         self._vehicle_id = vehicle_id
         self._telemetry = telemetry
-        self._say = say
+        self._announce = announce
         self.mark = Mark(stored.mark, stored.mark_of)
         self.missions = MissionService(self._on_items, self._explain, self._empty_mission)
         self.missions.items = {kind: getattr(stored, name) for kind, name in KINDS.items()}
@@ -239,7 +241,7 @@ class PlanService:
         return self._telemetry.home.location.alt_amsl_m if self._telemetry.home else NAN
 
     def _explain(self, text: str, now_us: int) -> list[Answer]:
-        return self._say(StatusText(INFO, text), now_us)
+        return self._announce(StatusText(INFO, text), now_us)
 
     def _on_items(self, kind: int) -> list[Answer]:
         if kind != FENCE:

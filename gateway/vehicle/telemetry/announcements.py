@@ -4,7 +4,7 @@ Theory of operation. Every topic ("link", "GPS fix", a flag of the estimator) ha
 a change of state is announced. After that the topic is held for `HOLD_US`; further changes in this
 time are merged: at the end of the hold its state is announced if it differs from the last one
 announced. A flapping topic thus causes at most one text in `HOLD_US`, and the last text is always
-right. Single events that have no state go through `say`, at most `BUCKET` at once and one more
+right. Single events that have no state go through `announce`, at most `BUCKET` at once and one more
 every `REFILL_US`.
 
 One cause gives one text, and its end one more. A topic that follows from others (`CAUSES`) is
@@ -130,7 +130,7 @@ class Announcer:
         self._pending[topic] = known
         return self._announce(topic, now_us)
 
-    def say(self, text: StatusText, now_us: int) -> list[Answer]:
+    def announce(self, text: StatusText, now_us: int) -> list[Answer]:
         """Announce a single event, unless there were too many recently."""
         return chunks(text, self._number()) if self._bucket.take(now_us) else []
 
@@ -277,5 +277,5 @@ class Announcements(Announcer):
             text = status_text(is_often, often, f"{name} no longer restarts", CRITICAL)
             found += self.track(Finding(f"restarts {node}", is_often, text), now_us)
             if is_new and not is_often:
-                found += self.say(StatusText(WARNING, f"{name} restarted"), now_us)
+                found += self.announce(StatusText(WARNING, f"{name} restarted"), now_us)
         return found

@@ -188,9 +188,9 @@ def test_change_within_the_hold_time_is_announced_at_its_end() -> None:
 
 def test_single_events_are_limited_in_rate() -> None:
     announcer = Announcer()
-    assert sum(len(announcer.say(GOOD, 0)) for _ in range(100)) == BUCKET
-    assert len(announcer.say(GOOD, 500_000)) == 1
-    assert announcer.say(GOOD, 500_001) == []
+    assert sum(len(announcer.announce(GOOD, 0)) for _ in range(100)) == BUCKET
+    assert len(announcer.announce(GOOD, 500_000)) == 1
+    assert announcer.announce(GOOD, 500_001) == []
 
 
 SIZES = (1, 49, 50, 51, 99, 100, 101, 199)
@@ -199,7 +199,7 @@ TEXTS = ["Höhe über 120 m: größer", "aü" * 40, "罗" * 100, *("a" * size fo
 
 @pytest.mark.parametrize("text", TEXTS)
 def test_long_texts_are_sent_in_chunks_as_utf_8_and_cut_between_characters(text: str) -> None:
-    found = [answer.message for answer in Announcer().say(StatusText(INFO, text), 0)]
+    found = [answer.message for answer in Announcer().announce(StatusText(INFO, text), 0)]
     assert [m.chunk_seq for m in found] == list(range(len(found)))
     size = len(text.encode())
     assert {m.id == 0 for m in found} == {size <= 50}
