@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 
 import msgspec
@@ -68,6 +69,27 @@ EMPTY = {
 """Formats of DataFlash logs without a sample."""
 
 
+Make = Callable[..., None]
+
+
+def made_once(make: Make) -> Make:
+    """Keep the files that a function makes, and write them again for later cases."""
+    kept: dict[tuple[str, ...], dict[Path, bytes]] = {}
+
+    @wraps(make)
+    def write(folder: Path, *arguments: str) -> None:
+        if arguments not in kept:
+            make(folder, *arguments)
+            # The newest is the last recording.
+            files = sorted(filter(Path.is_file, folder.rglob("*")), key=os.path.getmtime)
+            kept[arguments] = {path.relative_to(folder): path.read_bytes() for path in files}
+        for name, data in kept[arguments].items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_bytes(data)
+
+    return write
+
+
 def log(folder: Path, name: str = "log.csv", **odd: str) -> Path:
     """Write a tracker's log of a second, every tenth row of which has an odd cell."""
     lines = [NAMES]
@@ -92,6 +114,7 @@ def table(folder: Path, head: str = "unix_us_at_zero=0", name: str = "table.csv"
     return write_table(folder / name, header, [TableRow(1000, state=state_at(1000))])
 
 
+@made_once
 def flight(folder: Path) -> None:
     """Write a tlog of 10 s, and a table of 20 s with all sensors."""
     write_tlog(folder / "flight.tlog", RECORDS)
@@ -104,6 +127,7 @@ def mixed(folder: Path) -> None:
     write_tlog(folder / "a.tlog", sorted(found, key=lambda record: record.time_us))
 
 
+@made_once
 def autopilots(folder: Path) -> None:
     """Write `flight.bin`, with plans, and `flight.ulg`, each with defaults of its parameters."""
     test_autopilot_record.write_with_plans(folder / "flight.bin")
@@ -111,6 +135,7 @@ def autopilots(folder: Path) -> None:
     flown.write(folder / "flight.ulg", test_autopilot_record.px4_log() + default)
 
 
+@made_once
 def half_minute(folder: Path, speed: str = "") -> None:
     """Write half a minute of flight, or of a receiver at rest."""
     made = rows(raw=False)
@@ -129,15 +154,19 @@ def short(folder: Path) -> None:
 
 def recordings(folder: Path) -> None:
     """Write recordings `alps` (tlog and tables of two parts) and `lake` (a tlog of system 7)."""
-    below = folder / "recordings"
-    below.mkdir()
+    recorded(below := folder / "recordings")
+    (folder / "gateway.toml").write_text(f'[recording]\nfolder = "{below}"\n')
+
+
+@made_once
+def recorded(below: Path) -> None:
+    below.mkdir(exist_ok=True)
     write_tlog(below / "alps_01.tlog", make_records(4000))
     header, flown = read(flown_table(12))
     header = msgspec.structs.replace(header, unix_us_at_zero=START_US)
     write_table(below / "alps_01_v1.csv", header, flown[: len(flown) // 2])
     write_table(below / "alps_02_v1.csv", header, flown[len(flown) // 2 :])
     write_tlog(below / "lake_01.tlog", make_records(30, system_id=7))
-    (folder / "gateway.toml").write_text(f'[recording]\nfolder = "{below}"\n')
 
 
 def packed(path: Path, head: bytes, piece: bytes, mb: int) -> Path:
@@ -149,6 +178,7 @@ def packed(path: Path, head: bytes, piece: bytes, mb: int) -> Path:
     return path
 
 
+@made_once
 def zipped(folder: Path, fault: str) -> None:
     """Write `log.csv.gz`: cut, damaged, a bomb, or no gzip file (and `log.csv`, which is one)."""
     path = folder / "log.csv.gz"
@@ -181,6 +211,7 @@ def compared(folder: Path) -> None:
     test_diff.write_both(folder)
 
 
+@made_once
 def mission(folder: Path) -> None:
     """Write `flight.tlog` with parameters, mission, fence, texts and images."""
     extracts.written(folder, extracts.flight())
@@ -214,6 +245,7 @@ def recent_log(
     return lines
 
 
+@made_once
 def dataflash(folder: Path, kind: str) -> None:
     """Write a DataFlash log of text: of old or recent firmware, or with a fault."""
     first = recent_log()
