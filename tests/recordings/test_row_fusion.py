@@ -32,7 +32,8 @@ def flown() -> tuple[TableRow, ...]:
     rows: list[TableRow] = []
     for number, row in enumerate(read(flown_table(DURATION_S))[1]):
         if row.baro and number % 2:
-            rows.append(TableRow(row.time_us, row.baro))
+            # The autopilot's state is left out where there is no sample.
+            rows.append(replace(row, time_us=row.baro.time_us, gps=None, raw=None, imu=None))
         rows.append(replace(row, baro=None) if number % 2 else row)
     return tuple(rows)
 
@@ -83,7 +84,7 @@ def test_repeated_or_decreasing_times_are_fused_bit_equally() -> None:
 
 def test_lines_between_rows_stay_there_and_settings_are_followed() -> None:
     lines, settings = flown(), settings_for("eskf")
-    other = msgspec.structs.replace(settings, estimation=EstimationSettings())
+    other = settings_for("paper")
     mark, header = TableNote(1, "here"), header_for(other, 1)
     begun = Aircraft(1, settings).fusion_state
     lines = [begun, *lines[:500], mark, header, *lines[500:900]]
