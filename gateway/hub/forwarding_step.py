@@ -103,7 +103,7 @@ class ClientState:
     """File to send to."""
     way: int
     """Mode of sending."""
-    is_plain: int
+    is_forwardable: int
     """Whether its frames may be forwarded without Python."""
     largest: int
     """Size of its largest recent datagram."""
@@ -223,7 +223,7 @@ def _walk(work: Any, client: Any, headers: Any, outbox: Any) -> None:
         end = work.at * MAX_DATAGRAM + headers[work.at].length
         while begin < end:
             size = frame_size(data, begin, end)
-            found = _route_of(work, client, data, begin) if size and client.is_plain else 0
+            found = _route_of(work, client, data, begin) if size and client.is_forwardable else 0
             if found == 0:
                 work.frame = size
                 work.status |= HAND_OVER

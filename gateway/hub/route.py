@@ -126,10 +126,10 @@ class Route:
     def enter(self, forwarding: Forwarding, key: bytes) -> None:
         """Let the compiled step forward such frames, unless it needs more than their headers."""
         seed = CRC_EXTRA.get(self.message_id)
-        is_plain = self._rejects is None and self.message_id not in EXAMINED
+        is_header_enough = self._rejects is None and self.message_id not in EXAMINED
         if (
             seed
-            and is_plain
+            and is_header_enough
             and len(key) == KEY_SIZE_V2
             and len(self.targets.direct) < step.MAX_FAILED
         ):

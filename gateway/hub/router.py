@@ -390,8 +390,8 @@ class Router:
             rejects = partial(self._is_rejected, client, path) if is_shared else None
             route = self._fanout.make_route(frame, client, path, rejects, reaches)
             is_kept = client.endpoint.cache and self._cache.reads(message_id)
-            is_plain = self._rejects is None or not client.may_return
-            is_examined = not (telemetry and is_plain) or is_kept
+            is_accepted = self._rejects is None or not client.may_return
+            is_examined = not (telemetry and is_accepted) or is_kept
             self._fanout.keep_route(route, client, frame.key, is_examined=bool(is_examined))
         route.forward(frame, now_us, is_checked=True)
 

@@ -55,13 +55,12 @@ class TlogFile(Source):
     ) -> None:
         self.path = path
         source = open_tlog(path)
-        is_plain = source.layout is Layout.TLOG and not is_packed(path)
-        if is_plain:
+        if source.layout is Layout.TLOG and not is_packed(path):
             self._file = open_descriptor(path)
         else:
-            # Only a plain tlog allows random access.
-            with temporary_copy(path, source.chunks(None, unpacked_limit)) as plain:
-                self._file = os.dup(plain.fileno())
+            # Only an uncompressed tlog allows random access.
+            with temporary_copy(path, source.chunks(None, unpacked_limit)) as copy:
+                self._file = os.dup(copy.fileno())
         self.index = TlogIndex(source.timeline)
         self._size = sys.maxsize
         for batch in map(source.timeline.apply, TlogScanner().feed_all(self._all(progress))):

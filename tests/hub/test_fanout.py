@@ -248,7 +248,7 @@ def test_frames_of_the_compiled_step_are_counted_when_their_route_is_settled(
     frames = [vehicle.attitude() for _ in range(3)]
     route = fanout.make_route(frame_of(frames[0]), source, path, None)
     fanout.keep_route(route, source, frame_of(frames[0]).key)
-    source.memory.is_plain = 1
+    source.memory.is_forwardable = 1
     step = forwarding.step(source.memory, reads=False)
     for now_us, frame in enumerate(frames, start=70):
         forwarding.load(frame, now_us)

@@ -302,7 +302,7 @@ class Client:
         """Process a frame without a compiled route, or all that is left of a datagram."""
         forwarding = self.context.forwarding
         data, size = forwarding.rest(), forwarding.work.frame
-        frame = read_datagram(data[:size]) if size and self.memory.is_plain else None
+        frame = read_datagram(data[:size]) if size and self.memory.is_forwardable else None
         if frame is None:
             forwarding.skip()
             self.accept_rest(data, now_us)

@@ -138,7 +138,7 @@ class DatagramClient(Client):
 
     def _update_plain(self) -> None:
         """Let Python process the next datagram if it may change the state or complete a frame."""
-        self.memory.is_plain = self.state in SENDING and not self.splitter
+        self.memory.is_forwardable = self.state in SENDING and not self.splitter
 
     def accept_rest(self, data: bytes, now_us: int, sender: Address | None = None) -> None:
         """Process one datagram of this peer; `sender` distinguishes several."""

@@ -86,7 +86,7 @@ class SerialClient(QueuedClient):
             self.become("unreachable", error)
             return
         self._port = port
-        self.memory.input, self.memory.is_plain = port.fileno(), 1
+        self.memory.input, self.memory.is_forwardable = port.fileno(), 1
         self._splitter.reset()
         self.become("open")
         self.loop.add_reader(port.fileno(), self._on_readable, port)

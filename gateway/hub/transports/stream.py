@@ -165,7 +165,7 @@ class StreamClient(QueuedClient):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         self._socket = sock
         self.memory.input = sock.fileno()
-        self.memory.is_plain, self.memory.way = 1, STREAM
+        self.memory.is_forwardable, self.memory.way = 1, STREAM
         self._splitter.reset()
         self._read = partial(self._on_readable, sock)
         self.loop.add_reader(sock, self._read)

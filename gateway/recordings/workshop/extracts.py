@@ -11,7 +11,6 @@
 import json
 import math
 import re
-import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -26,6 +25,7 @@ from gateway.answers.log_answers import (
     VehicleAnswers,
 )
 from gateway.vehicle.plan import FENCE, MISSION, RALLY, Item, read_item
+from gateway.vehicle.services.parameters import INTEGER_CODES, decode_value
 from gateway.vehicle_state.positions import Position, named_position
 from gateway.vehicle_state.senders import RecordedSender
 from gateway.wire.recorded_frames import fields_of
@@ -34,8 +34,6 @@ END_US: Final = 1 << 62
 UNKNOWN_INTS: Final = ((1 << 31) - 1, -(1 << 31))
 """Unknown coordinates of MISSION_ITEM_INT: that of the specification, and a converted NaN."""
 _NOT_IN_NAMES: Final = re.compile(r"[^\x21-\x7e]|[,#]|^[=+@-]")
-_INTEGERS: Final = {1: "<Bxxx", 2: "<bxxx", 3: "<Hxx", 4: "<hxx", 5: "<I", 6: "<i"}
-"""Encoding of an integer in the four bytes of a value, by MAV_PARAM_TYPE."""
 POLYGONS: Final = {
     mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION: True,
     mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION: False,
@@ -80,8 +78,8 @@ class RecordedPlan:
         for name, frame in sorted(self._answers.parameters().items()):
             fields = fields_of(frame)
             value, kind = float(fields["param_value"]), fields["param_type"]
-            if is_bytewise and kind in _INTEGERS:
-                value = float(struct.unpack(_INTEGERS[kind], struct.pack("<f", value))[0])
+            if is_bytewise and kind in INTEGER_CODES:
+                value = decode_value(value, kind)
             found.append(RecordedParameter(name, value, kind))
         return found
 
