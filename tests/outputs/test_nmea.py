@@ -106,6 +106,7 @@ async def test_quality_follows_the_type_of_the_fix(
 
 async def test_one_vehicle_of_several_is_sent(outputs: OutputRig) -> None:
     output = await outputs.udp("nmea")
+    assert await outputs.sends_nothing(), "no vehicle yet"
     for system in (9, 7):
         outputs.hear(beat(), at(lat_deg=float(system)), system=system)
     outputs.hear(at(lat_deg=3.0), system=7, component=154)
