@@ -187,6 +187,12 @@ class TlsFar(TcpFar):
         name = None if is_server else "127.0.0.1"
         super().use(context.wrap_socket(peer, is_server, False, server_hostname=name))
 
+    def shut(self) -> None:
+        if isinstance(self.peer, ssl.SSLSocket):
+            with contextlib.suppress(OSError):
+                self.peer.unwrap()
+        super().shut()
+
 
 class MqttFar(TcpFar):
     """A broker that acknowledges everything."""
@@ -635,6 +641,13 @@ async def test_closed_hub_leaves_no_client_and_no_task(any_link: Link) -> None:
         return any("gateway" in repr(task) for task in others)
 
     await any_link.rig.until(lambda: not is_left())
+
+
+@pytest.mark.parametrize("url", ["udp:127.0.0.1:1", "tcp:127.0.0.1:1", "zenoh:tcp/[::1]:1?site=a"])
+async def test_endpoint_closed_while_it_opens_leaves_no_task(rig: Rig, url: str) -> None:
+    rig.hub(url).close()
+    await rig.quiet()
+    assert asyncio.all_tasks() == {asyncio.current_task()}
 
 
 @pytest.mark.parametrize("kind", ALL)

@@ -245,11 +245,6 @@ class TestTrouble:
         await rig.tick_until(hub, lambda: hub.clients()[0].state == "unreachable")
         assert hub.clients()[0].reason.startswith(reason.format(locator=locator))
 
-    async def test_site_that_closes_while_it_opens_leaves_no_task(self, rig: Rig) -> None:
-        rig.hub("zenoh:tcp/127.0.0.1:1?site=field").close()
-        await rig.quiet()
-        assert asyncio.all_tasks() == {asyncio.current_task()}
-
     def test_port_in_use_is_reported_in_one_line(self) -> None:
         with socket.create_server(("127.0.0.1", 0)) as taken:
             config = session_config(f"tcp/127.0.0.1:{taken.getsockname()[1]}", "", "router")
