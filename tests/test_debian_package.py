@@ -32,7 +32,9 @@ SOURCE_TIME_S = 1_700_000_000
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two wheels of the same sources, made in two folders."""
-    skipped = shutil.ignore_patterns(".*", "build", "dist", "__pycache__", "tests", "firmware")
+    # Another test may make the images at the same time.
+    made_files = ("build", "dist", "__pycache__", "images")
+    skipped = shutil.ignore_patterns(".*", *made_files, "tests", "firmware")
     words = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w"]
     made = list[Path]()
     for name in ("first", "second"):
