@@ -85,6 +85,18 @@ async def test_every_frame_reaches_the_reader(play: Play) -> None:
     assert (port.written, port.dropped) == (2000, 0)
 
 
+async def test_frames_keep_their_times(play: Play) -> None:
+    loop = asyncio.get_running_loop()
+    port = play(frames(6, rate_hz=50.0))
+    reader = Reader(port.path)
+    begin_s = loop.time()
+    port.start()
+    for k in range(6):
+        await reader.until(k + 1)
+        assert loop.time() - begin_s >= k / 50.0
+    reader.close()
+
+
 async def test_frames_without_a_reader_are_dropped(play: Play) -> None:
     port = play(frames(3000))
     port.start()
